@@ -22,20 +22,20 @@ class ResourceError(InputError):
 
 
 def unreadable(path: Path, error: OSError | ValueError) -> InputError:
-    """The error for a file that the system refuses to read; a ValueError is of its name."""
+    """Return the error for a file that the system refuses to read; a ValueError is of its name."""
     kind = ResourceError if isinstance(error, OSError) and is_passing(error) else InputError
     return kind(f"{path}: cannot be read ({getattr(error, 'strerror', None) or error})")
 
 
 def is_passing(error: Exception) -> bool:
-    """True for an error that may not come again when the same is tried again."""
+    """Return True for an error that may not come again when the same is tried again."""
     if isinstance(error, OSError):
         return error.errno not in LASTING
     return isinstance(error, ResourceError) or not isinstance(error, InputError)
 
 
 def text_of(error: OSError | InputError) -> str:
-    """An error in one line: of the system's, the file and what went wrong."""
+    """Return an error in one line: of the system's, the file and what went wrong."""
     if isinstance(error, OSError) and error.filename is not None and error.strerror:
         return f"{error.filename}: cannot be used ({error.strerror})"
     if isinstance(error, OSError) and error.strerror:  # of a stream or pipe, which have no name
@@ -44,5 +44,5 @@ def text_of(error: OSError | InputError) -> str:
 
 
 def printable(text: str) -> str:
-    """A text on one line: control characters and bytes of names that are no text are escaped."""
+    """Return a text on one line: control characters and bytes of names that are no text are escaped."""
     return UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)

@@ -60,7 +60,7 @@ class OpenedScan:
         return self.prepared.warnings
 
     def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the frame of `points`."""
+        """Return a pose of the world in the frame of `points`."""
         return self.prepared.from_world(pose)
 
     def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
@@ -141,7 +141,7 @@ class OpenedScan:
             raise InputError("`refine_focal`: not an option of the preset paper")
 
     def gps_prior_of(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
-        """The photo's GPS position in the scan; None if it has none, or a position is given anyway."""
+        """Return the photo's GPS position in the scan; None if it has none, or a position is given anyway."""
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
         if photo.gps is None or not crs or settings.prior.near_world is not None:
             return None

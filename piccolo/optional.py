@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def import_optional(what: Path | str, module_name: str, extra: str = "formats") -> ModuleType:
-    """The module that `what` needs, or a ResourceError that says how to install it."""
+    """Return the module that `what` needs, or a ResourceError that says how to install it."""
     try:
         return import_module(module_name)
     except ImportError as error:
@@ -23,6 +23,6 @@ def import_optional(what: Path | str, module_name: str, extra: str = "formats") 
 
 
 def new_figure(**options: Any) -> "Figure":
-    """An empty figure that belongs to no window, by matplotlib, whose import takes half a second."""
+    """Return an empty figure that belongs to no window, by matplotlib, whose import takes half a second."""
     figure: Figure = import_optional("a plot", "matplotlib.figure", "tools").Figure(**options)
     return figure

@@ -189,7 +189,10 @@ class Result:
 
 
 def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any) -> Result:
-    """The result of a localization; `about` are the fields of Result that say what it is of and how made."""
+    """Return the result of a localization.
+
+    `about` are the fields of Result that say what it is of and how made.
+    """
     apart = "pose", "warnings", "cameras"
     values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in apart}
     return Result(best_pose=found.pose, warnings=warnings + found.warnings, **values, **about)
@@ -203,7 +206,7 @@ class Failure(NamedTuple):
 
 
 def failure_of(error: Exception) -> Failure:
-    """The failure of a photo; an error of none, but of the program, is raised."""
+    """Return the failure of a photo; an error of none, but of the program, is raised."""
     if isinstance(error, OSError | InputError):
         return Failure(text_of(error), is_passing(error))
     if is_shortage(error):
@@ -214,7 +217,7 @@ def failure_of(error: Exception) -> Failure:
 def unreadable_result(
     error: str, cloud: str | tuple[str, ...], pano: str, is_passing: bool = False, **more: Any
 ) -> Result:
-    """The result of a photo that can't be read, or could not at the moment; `more` as in Result."""
+    """Return the result of a photo that can't be read, or could not at the moment; `more` as in Result."""
     status = FAILED if is_passing else UNREADABLE
     return Result(status, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
 
@@ -228,7 +231,7 @@ def _pose_from_json(document: dict[str, Any]) -> Pose:
 
 
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
-    """A pose in all its forms, POSE_FIELDS."""
+    """Return a pose in all its forms, POSE_FIELDS."""
     if pose is None:
         return None
     quaternion = quaternion_wxyz(pose.R_cam_from_world).tolist()
@@ -276,14 +279,14 @@ def _in(scan: str | None) -> str:
 
 
 def _paths(value: object) -> tuple[str, ...]:
-    """A list of paths; TypeError for anything else."""
+    """Return a list of paths; TypeError for anything else."""
     if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
         raise TypeError("a cloud that is neither a path nor a list of paths")
     return tuple(value)
 
 
 def read_results(paths: Sequence[Path]) -> list[Result]:
-    """The results in files of JSON lines, their poses checked.
+    """Return the results in files of JSON lines, their poses checked.
 
     Raises InputError if a line is no result, or a file has none.
     """
@@ -309,7 +312,10 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
 
 
 def _checked_result(text: str) -> Result:
-    """A result of one line; refused are names and numbers that can't be written, and a pose that is none."""
+    """Return a result of one line.
+
+    Refused are names and numbers that can't be written, and a pose that is none.
+    """
     result = Result.from_json(text)
     texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
     for label, value in texts.items():

@@ -119,7 +119,7 @@ class Walk:
         return self._now(self.tracker.frames[-1], number)
 
     def accept(self, taken: Taken, frame: Frame) -> None:
-        """A frame that was found earlier, or that can't be read."""
+        """Add a frame that was found earlier, or that can't be read."""
         self.taken.append(taken)
         self.tracker.accept(frame)
 
@@ -176,7 +176,7 @@ class Walk:
         return replace(read_photo(taken.picture, self.read_options), focal_prior=None)
 
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
-        """The result of a frame; one that can't be read keeps its place in the walk."""
+        """Return the result of a frame; one that can't be read keeps its place in the walk."""
         about = self.about
         photo = taken.photo
         digest = self.tracker.scan_map.scan_sha256 or None
@@ -197,6 +197,6 @@ class Walk:
 
 
 def localization_in(result: Result) -> Localization:
-    """The localization of which a result is made."""
+    """Return the localization of which a result is made."""
     names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras"}
     return Localization(pose=result.best_pose, **{name: getattr(result, name) for name in names})

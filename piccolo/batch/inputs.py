@@ -17,14 +17,14 @@ MAX_KINDS = 5  # of files left out that are named
 
 
 def is_from_stdin(words: Sequence[str]) -> bool:
-    """True if names come on standard input, so that nobody knows how many."""
+    """Return True if names come on standard input, so that nobody knows how many."""
     return STDIN in words
 
 
 def panoramas_of(
     words: Iterable[str], stdin: TextIO, left_out: Counter[str], is_panorama: Callable[[Path], bool] = is_cube
 ) -> Iterator[Path]:
-    """The panoramas that words name, in order: a picture, a folder, `@list.txt`, or `-` for lines of `stdin`.
+    """Yield the panoramas that words name, in order: a picture, a folder, `@list.txt`, or `-` for lines of `stdin`.
 
     A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
     pictures in it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.
@@ -69,7 +69,10 @@ def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool])
 
 
 def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[Path, bool]]:
-    """A folder and those in it, and whether each is one panorama; by a link only what has no other name."""
+    """Yield a folder and those in it, and whether each is one panorama.
+
+    By a link only what has no other name.
+    """
     waiting = deque([top])
     seen = set[tuple[int, int]]()
     while waiting:

@@ -38,7 +38,7 @@ class Task(NamedTuple):
 
     @contextmanager
     def placed(self, folder: Path) -> Iterator[Path]:
-        """The panorama's path here: relative to a folder, or written from the files."""
+        """Yield the panorama's path here: relative to a folder, or written from the files."""
         if self.files is None:
             yield folder / self.pano
             return
@@ -51,7 +51,7 @@ class Task(NamedTuple):
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
-    """The content of a photo's file, or of all files in its folder; none of what can't be read."""
+    """Return the content of a photo's file, or of all files in its folder; none of what can't be read."""
     with suppress(OSError):
         paths = sorted(pano.rglob("*")) if pano.is_dir() else [pano]
         return {str(path.relative_to(pano.parent)): path.read_bytes() for path in paths if path.is_file()}
@@ -96,7 +96,7 @@ class Localizer:
         return Task(pano, self.settings_of(pano), calibration, files)
 
     def settings_of(self, pano: Path) -> Settings:
-        """The settings of one panorama: its own prior, if it has one."""
+        """Return the settings of one panorama: its own prior, if it has one."""
         if self.priors is None or not isinstance(self.settings, CoarseToFineSettings):
             return self.settings
         return replace(self.settings, prior=self.priors.prior_of(pano, self.settings.prior))

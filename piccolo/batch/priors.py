@@ -65,7 +65,7 @@ def _prior_from(row: Mapping[str, float], within: tuple[str, ...], general: Prio
 
 
 def read_priors(path: Path, general: Prior) -> PriorTable:
-    """The priors in a CSV file; cells may be empty, `general` fills what they leave open.
+    """Return the priors in a CSV file; cells may be empty, `general` fills what they leave open.
 
     Columns: name (the panorama's path as given, or its file name), x, y, z [m] in the scan's frame (without z
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
@@ -98,7 +98,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
 
 
 def _numbers(where: str, row: Mapping[str, str | None]) -> dict[str, float]:
-    """The cells that are not empty, as finite numbers."""
+    """Return the cells that are not empty, as finite numbers."""
     numbers = {}
     for column, text in row.items():
         if text is None or not text.strip():

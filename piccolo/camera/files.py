@@ -37,7 +37,7 @@ OPENSFM: dict[str, tuple[str, str]] = {
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The cameras in a file that take one picture, as `read_cameras`; InputError if they are a rig."""
+    """Return the cameras in a file that take one picture, as `read_cameras`; InputError if they are a rig."""
     calibration = read_cameras(path)
     if calibration.is_rig:
         raise InputError(f"{path}: found a rig, each camera with an image of its own: give it as --rig")
@@ -45,7 +45,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def read_cameras(path: Path) -> Calibration:
-    """The cameras in a file, told by its content.
+    """Return the cameras in a file, told by its content.
 
     Raises InputError if it can't be read, is of no format known, or holds what is no camera.
     """
@@ -57,7 +57,7 @@ def read_cameras(path: Path) -> Calibration:
 
 
 def read_rig(path: Path) -> Calibration:
-    """The cameras of a rig in COLMAP's rig_config.json or our own JSON.
+    """Return the cameras of a rig in COLMAP's rig_config.json or our own JSON.
 
     COLMAP's file does not say how large a picture is: its cameras fit a picture of any size, as they are.
     """
@@ -88,7 +88,7 @@ def document_of(mounts: Sequence[Mount]) -> dict[str, object]:
 
 
 def mounts_of(document: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """The cameras of our own JSON; one of DAMAGE if it is none."""
+    """Return the cameras of our own JSON; one of DAMAGE if it is none."""
     if document["format"] != FORMAT:
         raise ValueError(f"format {document['format']!r}, not {FORMAT!r}")
     return tuple(map(_mount_of, document.get("cameras", [document])))
@@ -145,7 +145,7 @@ def _of_document(path: Path, document: Any) -> Calibration:
 
 
 def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
-    """A camera of camera_models.json (opensfm/io.py, https://opensfm.org/docs/geometry.html).
+    """Return a camera of camera_models.json (opensfm/io.py, https://opensfm.org/docs/geometry.html).
 
     Lengths there are parts of the larger side, from the picture's middle.
     """
@@ -167,7 +167,7 @@ def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
 
 
 def _of_colmap(path: Path, text: str) -> Calibration:
-    """The cameras of cameras.txt: lines of id, model, width, height, parameters."""
+    """Return the cameras of cameras.txt: lines of id, model, width, height, parameters."""
     mounts = []
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()
@@ -185,7 +185,7 @@ def _of_colmap(path: Path, text: str) -> Calibration:
 
 
 def _of_colmap_rig(path: Path, document: Sequence[Any]) -> Calibration:
-    """The one rig of rig_config.json (https://colmap.github.io/rigs.html): axes right, down, forward."""
+    """Return one rig of rig_config.json (https://colmap.github.io/rigs.html): axes right, down, forward."""
     if len(document) != 1:
         raise InputError(f"{path}: found {len(document)} rigs, wanted one")
     mounts = []

@@ -109,7 +109,7 @@ class Distortion(NamedTuple):
         return math.sqrt(min(real[real > 0.0], default=math.inf))
 
     def apply(self, x: Array, y: Array) -> tuple[Array, Array]:
-        """The distorted (x', y') of (x, y), arrays of one shape."""
+        """Return the distorted (x', y') of (x, y), arrays of one shape."""
         r2 = x * x + y * y
         xy = 2.0 * x * y
         g, _ = self.radial(r2)
@@ -119,7 +119,7 @@ class Distortion(NamedTuple):
         )
 
     def jacobian(self, x: Array, y: Array) -> tuple[Array, Array, Array, Array]:
-        """Derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy at (x, y), arrays of one shape."""
+        """Return derivatives dx'/dx, dx'/dy, dy'/dx, dy'/dy at (x, y), arrays of one shape."""
         g, by_r2 = self.radial(x * x + y * y)
         both = 2.0 * x * y * by_r2 + 2.0 * (self.p1 * x + self.p2 * y)
         return (
@@ -130,14 +130,14 @@ class Distortion(NamedTuple):
         )
 
     def keeps_sides(self, x: Array, y: Array) -> NDArray[np.bool_]:
-        """True where the distortion does not turn the picture inside out."""
+        """Return True where the distortion does not turn the picture inside out."""
         a, b, c, d = self.jacobian(x, y)
         return np.asarray(a * d - b * c > 0.0)
 
     def invert(
         self, x_distorted: Array, y_distorted: Array, radii: Array
     ) -> tuple[Array, Array, NDArray[np.bool_]]:
-        """The (x, y) whose distortion is (x', y'), and where it was found, arrays of one shape.
+        """Return the (x, y) whose distortion is (x', y'), and where it was found, arrays of one shape.
 
         By Newton, from the inverse of the radial part, which grows over `radii` (N,), the last its limit.
         """
@@ -230,7 +230,7 @@ class Camera:
         return max(float(np.sqrt(steps[0] * steps[1])), MIN_FOCAL)
 
     def scaled(self, width: int, height: int) -> "Camera":
-        """The same camera with its picture at another size; InputError if that has another shape."""
+        """Return the same camera with its picture at another size; InputError if that has another shape."""
         if (width, height) == (self.width, self.height):
             return self
         across = width / self.width
@@ -244,7 +244,7 @@ class Camera:
         return replace(self, width=width, height=height, params=params)
 
     def scaled_to_width(self, width: int) -> "Camera":
-        """The same camera with its picture at another width [px]."""
+        """Return the same camera with its picture at another width [px]."""
         return self.scaled(width, max(1, round(width * self.height / self.width)))
 
     def pixels(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
@@ -277,7 +277,7 @@ class Camera:
         return np.stack([u, v], axis=-1), is_in
 
     def rays(self, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
+        """Return unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
             ray = rays_of(u, v * (0.5 * self.width / self.height), self.width)
@@ -306,7 +306,7 @@ class Camera:
         return np.asarray(np.arctan(2.0 * math.tan(omega / 2.0) * np.tan(angle)) / omega)
 
     def _angle(self, radius: Array) -> Array:
-        """The inverse of `_radius`."""
+        """Return the inverse of `_radius`."""
         if self.lens == EQUIDISTANT:
             return radius
         if self.lens == PERSPECTIVE:
@@ -317,12 +317,12 @@ class Camera:
 
 
 def pinhole(width: int, height: int, focal: float) -> Camera:
-    """An ideal photo of this size and focal length [px], its axis in the middle."""
+    """Return an ideal photo of this size and focal length [px], its axis in the middle."""
     return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2.0, height / 2.0))
 
 
 def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:
-    """An ideal photo of this size, `lens` pinhole or fisheye, whose `width` shows a field of view [deg].
+    """Return ideal photo of this size, `lens` pinhole or fisheye, whose `width` shows a field of view [deg].
 
     Raises InputError for a field that the lens can't have.
     """

@@ -44,7 +44,7 @@ def sphere_width(mounts: Sequence[Mount]) -> int:
 
 
 def sphere_of(views: Sequence[View], width: int) -> Pixels:
-    """The picture of the sphere, `width` x width / 2, a multiple of MIN_SPHERE_WIDTH.
+    """Return the picture of the sphere, `width` x width / 2, a multiple of MIN_SPHERE_WIDTH.
 
     Where several cameras show the same, the one is taken whose axis is nearest; how far they are from each
     other is left aside.
@@ -65,7 +65,7 @@ def sphere_of(views: Sequence[View], width: int) -> Pixels:
 
 
 def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:
-    """The same area-averaged, if it is finer at the axis than a sphere of this width, or too large."""
+    """Return the same area-averaged, if it is finer at the axis than a sphere of this width, or too large."""
     camera = view.mount.camera
     largest = MAX_SIDE / max(camera.width, camera.height)
     factor = min(1.0, width / (2.0 * math.pi * camera.resolution), largest)

@@ -20,7 +20,7 @@ Rows = tuple[tuple[float, ...], ...]
 
 
 def rows(R: Array) -> Rows:
-    """A matrix as tuples, which compare and hash."""
+    """Return a matrix as tuples, which compare and hash."""
     return tuple(tuple(row) for row in R.tolist())
 
 
@@ -48,7 +48,7 @@ class Mount:
         return np.array(self.R_lens_from_cam, dtype=np.float64)
 
     def pose(self, pose: Pose) -> Pose:
-        """The camera's own pose, of the whole's."""
+        """Return the camera's own pose, of the whole's."""
         center_world = pose.center_world + pose.R_cam_from_world.T @ np.array(self.center_cam)
         return Pose(self.rotation @ pose.R_cam_from_world, center_world)
 
@@ -57,7 +57,7 @@ class Mount:
         return replace(self, camera=camera)
 
     def turned(self, R_cam_from_new: Array) -> "Mount":
-        """The same camera in a frame that is turned about the origin."""
+        """Return the same camera in a frame that is turned about the origin."""
         R = self.rotation @ R_cam_from_new
         center = R_cam_from_new.T @ np.array(self.center_cam)
         return replace(self, R_lens_from_cam=rows(R), center_cam=tuple(center.tolist()))
@@ -94,7 +94,7 @@ class Calibration:
         return float(np.linalg.norm([mount.center_cam for mount in self.mounts], axis=1).max())
 
     def for_picture(self, width: int, height: int) -> tuple[Mount, ...]:
-        """The cameras of one picture of this size [px].
+        """Return the cameras of one picture of this size [px].
 
         Raises InputError if none fits, or several of a choice do.
         """
@@ -124,14 +124,14 @@ class Calibration:
         return self.mounts
 
     def images_in(self, folder: Path) -> list[Path]:
-        """The picture of each camera of a rig in the folder of one instant, in order.
+        """Return the picture of each camera of a rig in the folder of one instant, in order.
 
         Raises InputError if a camera has none or several.
         """
         return [self._image_in(folder, mount) for mount in self.mounts]
 
     def is_instant(self, folder: Path) -> bool:
-        """True for a folder that holds one picture of each camera."""
+        """Return True for a folder that holds one picture of each camera."""
         try:
             return len(self.images_in(folder)) == len(self.mounts)
         except InputError:
@@ -148,7 +148,7 @@ class Calibration:
 
 
 def _names_in(folder: Path) -> Sequence[str]:
-    """The files of a folder and of those in it, as their names below it have slashes."""
+    """Return the files of a folder and of those in it, as their names below it have slashes."""
     try:
         entries = sorted(folder.iterdir())
         inner = [file for entry in entries if entry.is_dir() for file in sorted(entry.iterdir())]

@@ -68,7 +68,7 @@ def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
 
 
 def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
-    """The scenes of some rooms, or all."""
+    """Return the scenes of some rooms, or all."""
     counts = Counter(spec.name for spec in specs)
     if twice := [name for name, count in counts.items() if count > 1]:
         raise InputError(f"--from: found the scene {twice[0]} twice")

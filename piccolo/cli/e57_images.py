@@ -25,7 +25,7 @@ SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
 
 def image_json(index: int, image: E57Image) -> dict[str, object]:
-    """The JSON object of an image."""
+    """Return the JSON object of an image."""
     pose = image.pose and {
         "quaternion_wxyz_world_from_image": quaternion_wxyz(image.pose.R_cam_from_world.T).tolist(),
         "center_world": image.pose.center_world.tolist(),

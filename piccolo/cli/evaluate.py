@@ -154,7 +154,7 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
 
 
 def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
-    """The files beside a run, by option."""
+    """Return the files beside a run, by option."""
     return {f"--{name}": getattr(arguments, name) for name in ("csv", "markdown", "errors", "risk")}
 
 

@@ -51,7 +51,7 @@ def check_execution(arguments: argparse.Namespace) -> None:
 
 
 def is_remote(arguments: argparse.Namespace) -> bool:
-    """True if a cluster that others have begun does the work."""
+    """Return True if a cluster that others have begun does the work."""
     return arguments.dask not in (None, LOCAL)
 
 
@@ -99,7 +99,10 @@ def executing(
     cluster: Cluster | None,
     open_scan: Callable[[Localizer, int], OpenedScan],
 ) -> Iterator[tuple[Executor, Localizer]]:
-    """An executor, and the localizer for it; `open_scan` prepares the scan before, with so many threads."""
+    """Yield an executor, and the localizer for it.
+
+    `open_scan` prepares the scan before, with so many threads.
+    """
     is_kept = localizer.cache.is_used
     with ExitStack() as stack:
         if not is_kept and (cluster or num_jobs > 1):  # others will open what is prepared here

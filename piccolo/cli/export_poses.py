@@ -63,7 +63,7 @@ def _takers(option: str) -> str:
 
 
 def options_from(arguments: argparse.Namespace) -> Options:
-    """The options given; one that the format does not take is refused."""
+    """Return the options given; one that the format does not take is refused."""
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     form = FORMATS[arguments.format]
     if foreign := [name for name in OPTIONS if name in given and name not in form.options]:
@@ -76,7 +76,7 @@ def options_from(arguments: argparse.Namespace) -> Options:
 
 
 def notes_on(selection: Selection) -> Iterable[str]:
-    """Notes for the user: what was left out, and what may be mixed up."""
+    """Yield notes for the user: what was left out, and what may be mixed up."""
     if selection.left_out:
         num_left_out = sum(selection.left_out.values())
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
@@ -86,7 +86,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
 
 
 def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:
-    """Notes on results of other content than the clouds chosen have, which are refused without --force."""
+    """Yield notes on results of other content than the clouds chosen have, which are refused without --force."""
     for cloud in dict.fromkeys(result.cloud for result in results if result.cloud_name in arguments.cloud):
         paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
         if all(path.is_file() for path in paths):

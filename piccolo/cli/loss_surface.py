@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
-    """The pose found and the true one of the panorama, as far as files are given."""
+    """Return the pose found and the true one of the panorama, as far as files are given."""
     name = arguments.pano.name
     known: KnownPoses = {}
     if arguments.truth:
@@ -74,7 +74,7 @@ def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
 
 
 def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
-    """The poses to try over all of the cloud, in the frame of the points."""
+    """Return the poses to try over all of the cloud, in the frame of the points."""
     points = cloud.points
     ends = [np.percentile(c, [0.5, 99.5]) for c in (points.x, points.y)]
     places = np.array([*np.transpose(ends), *(pose.center_world[:2] for pose in known.values())], np.float64)
@@ -96,7 +96,7 @@ def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPose
 
 
 def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses) -> dict[str, object]:
-    """The surface's part of the JSON on stdout."""
+    """Return the surface's part of the JSON on stdout."""
     row, column = surface.lowest()
     lowest = np.array([grid.x[column], grid.y[row], surface.height[row, column]])
     pose = cloud.to_world(Pose(grid.R_cam_from_local[surface.rotation[row, column]], lowest))

@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def is_building(arguments: argparse.Namespace) -> bool:
-    """True if the rooms are to be joined."""
+    """Return True if the rooms are to be joined."""
     return bool(arguments.storeys or arguments.walk)
 
 
@@ -118,7 +118,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
 
 
 def walk_options(arguments: argparse.Namespace, variant: str) -> WalkOptions:
-    """The options of walks of a variant."""
+    """Return the options of walks of a variant."""
     a = arguments
     return WalkOptions(a.frame_rate, variant, a.people, a.blur, a.bad_frames, a.width)
 

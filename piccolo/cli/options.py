@@ -48,7 +48,9 @@ DEFAULT_EVERY = "0.5s"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
-    text = "coloured scan in any format of docs/USAGE.md, one file or several; or a map by tools/prepare_map.py"
+    text = (
+        "coloured scan in any format of docs/USAGE.md, one file or several; or a map by tools/prepare_map.py"
+    )
     add_cloud_options(parser, text)
     group = parser.add_argument_group("panorama")
     text = (

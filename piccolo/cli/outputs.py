@@ -41,7 +41,7 @@ def check_distinct(outputs: Outputs, inputs: Iterable[Path] = ()) -> None:
 
 
 def _are_one(path: Path, other: Path) -> bool:
-    """True if what is written to one would replace the other, or stands in it."""
+    """Return True if what is written to one would replace the other, or stands in it."""
     if is_stdout(path) or is_stdout(other):
         return is_stdout(path) and is_stdout(other)
     if path.exists() and other.exists() and path.samefile(other):
@@ -61,7 +61,7 @@ def _identity(path: Path) -> tuple[int, int] | None:
 
 
 def _files_of(inputs: Iterable[Path]) -> Iterator[Path]:
-    """The inputs, of folders their pictures; those that can't be read are left to their readers."""
+    """Yield the inputs, of folders their pictures; those that can't be read are left to their readers."""
     for path in inputs:
         if os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK):  # noqa: PTH112  # Path's raises for long
             yield from (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)

@@ -25,7 +25,7 @@ def shown(values: Iterable[Any], is_quiet: bool, **form: Any) -> Iterator[Any]:
 
 
 def progress_bar(is_quiet: bool) -> Progress:
-    """A function that wraps values in a progress bar, or in nothing."""
+    """Return a function that wraps values in a progress bar, or in nothing."""
 
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         title = f"prepare, {STEPS[label]} of {len(STEPS)}: {label}" if label in STEPS else label
@@ -36,7 +36,7 @@ def progress_bar(is_quiet: bool) -> Progress:
 
 
 def warn_once(is_quiet: bool) -> Callable[[str], None]:
-    """A function that prints a warning, once however often it comes, or nothing."""
+    """Return a function that prints a warning, once however often it comes, or nothing."""
     printed: set[str] = set()
 
     def warn(warning: str) -> None:

@@ -129,12 +129,12 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
 
 
 def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
-    """The outputs by option."""
+    """Return the outputs by option."""
     return {name: getattr(arguments, name[2:].replace("-", "_")) for name in SUFFIXES}
 
 
 def is_folder(path: Path) -> bool:
-    """True for an output that is to be a folder of pictures."""
+    """Return True for an output that is to be a folder of pictures."""
     return not path.suffix and not is_stream(path)
 
 
@@ -153,12 +153,12 @@ def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
 
 
 def photo_of(arguments: argparse.Namespace, name: str) -> Path:
-    """The panorama that a pose's file names."""
+    """Return the panorama that a pose's file names."""
     return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
 
 def poses_from(arguments: argparse.Namespace) -> list[Shot]:
-    """The poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
+    """Return poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
     given = read_calibration(arguments.camera).mounts if arguments.camera else ()
     if len(given) > 1:
         raise InputError(f"{arguments.camera}: found {len(given)} cameras, wanted one")
@@ -202,7 +202,7 @@ def read_pose_matrix(path: Path) -> Pose:
 
 
 def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:
-    """The picture of a pose by its one camera, if it has one; a rig's is the sphere."""
+    """Return the picture of a pose by its one camera, if it has one; a rig's is the sphere."""
     return Shot(pano, mounts[0].pose(pose), mounts[0].camera) if len(mounts) == 1 else Shot(pano, pose, None)
 
 

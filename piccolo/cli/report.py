@@ -57,7 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def settings_from(arguments: argparse.Namespace) -> ReportSettings:
-    """What the options ask for; those that make no sense are refused."""
+    """Return what the options ask for; those that make no sense are refused."""
     check_least(arguments, jobs=1)
     if not (arguments.out or arguments.plan):
         raise UsageError("--out, --plan: found none of them, wanted one or both")

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def file_name(condition: Condition) -> str:
-    """The file of a condition: its name without characters that a path must not have."""
+    """Return the file of a condition: its name without characters that a path must not have."""
     words = f"{condition.name}_{condition.preset}".replace("%", "percent")
     return "".join(c if c.isalnum() else "_" for c in words) + ".jsonl"
 
@@ -60,7 +60,7 @@ def file_name(condition: Condition) -> str:
 def run_condition(
     condition: Condition, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
 ) -> tuple[list[QueryResult], int]:
-    """The results under one condition, and how many queries could not be localized."""
+    """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
     reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
     transformed = []

@@ -104,7 +104,7 @@ def every_of(text: str, max_speed: float) -> tuple[float, float]:
 
 @contextmanager
 def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Iterator[WalkInputs]:
-    """The frames of a walk; those of a video are files until the end."""
+    """Yield the frames of a walk; those of a video are files until the end."""
     if arguments.video is None:
         times = times_of(panoramas, arguments.times)
         numbers = times or [float(k) for k in range(len(panoramas))]

@@ -20,7 +20,7 @@ MAX_LENGTH = 20_000  # characters of a system's description; what is longer is l
 
 
 def crs_of(paths: Sequence[Path]) -> str:
-    """The system that the first of a scan's files names, as WKT or EPSG:code; empty if it names none.
+    """Return the system that the first of a scan's files names, as WKT or EPSG:code; empty if it names none.
 
     LAS and LAZ: the OGC WKT record, or the GeoTIFF keys. E57: coordinateMetadata.
     """
@@ -48,7 +48,7 @@ def _of_las(path: Path) -> str:
 
 
 def check_crs(crs: str) -> Any:
-    """The system that a text names, by pyproj, its heights left aside; InputError if there is none."""
+    """Return the system that a text names, by pyproj, its heights left aside; InputError if there is none."""
     pyproj = import_optional("GPS in photos", "pyproj", "tools")
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()

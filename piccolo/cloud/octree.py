@@ -26,13 +26,13 @@ class Octree(NamedTuple):
     leaf_size: float  # [m]
 
     def level(self, size: float) -> NDArray[np.float32]:
-        """The nodes of the level whose voxels are nearest to `size` [m]."""
+        """Return the nodes of the level whose voxels are nearest to `size` [m]."""
         level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
         return self.nodes[self.level_start[level] : self.level_start[level + 1]]
 
 
 def build_octree(voxels: Voxels) -> Octree:
-    """The octree whose leaves are the voxels."""
+    """Return the octree whose leaves are the voxels."""
     codes = voxels.codes
     firsts: list[NDArray[np.int32]] = []  # of each level but the finest: its nodes' first children there
     for _ in range(NUM_LEVELS - 1):
@@ -70,7 +70,7 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
 
 @inline_kernel
 def uniform_level(least_distance, level, low, high):
-    """The level at which all below a node, its children of `level`, is drawn if it is from low to high away.
+    """Return the level at which all below a node, its children of `level`, is drawn if it is from low to high away.
 
     0 if there is none.
     """
@@ -95,7 +95,10 @@ def take_all(nodes, first, last, center, found, directions, count):
 
 @inline_kernel
 def take_far(nodes, first, last, center, least, found, directions, count, stack, top):
-    """The same with those at least so far, squared [m^2]; the others go on the stack. Returns both counts."""
+    """Return the same with those at least so far, squared [m^2].
+
+    The others go on the stack. Returns both counts.
+    """
     x, y, z = directions[0], directions[1], directions[2]
     for node in range(first, last):
         i = np.uintp(node)
@@ -169,7 +172,7 @@ def collect(tree, center, voxel_per_range, found, directions):
 
 @inline_kernel
 def level_of(tree, node):
-    """The level of a node, 0 for the coarsest voxels."""
+    """Return the level of a node, 0 for the coarsest voxels."""
     level = 0
     while node >= tree.level_start[level + 1]:
         level += 1

@@ -24,7 +24,7 @@ WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
 def open_cloud(
     paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Progress = no_progress
 ) -> CloudStream:
-    """The coloured cloud in one or several files, before its points are read.
+    """Return the coloured cloud in one or several files, before its points are read.
 
     Raises InputError if a file is missing, has a damaged header, no colours, or is no format that is read
     here. Reading the points raises it where the data break or fail the checks of `PointValidator`.
@@ -34,7 +34,7 @@ def open_cloud(
 
 
 def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
-    """The coloured cloud in a file, checked, in metres, in Morton order.
+    """Return the coloured cloud in a file, checked, in metres, in Morton order.
 
     The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
     metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
@@ -44,7 +44,7 @@ def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
 
 
 def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
-    """The points of a file in any format that is read here."""
+    """Return the points of a file in any format that is read here."""
     try:
         format_ = _format_of(path)
         if settings.labels and not format_.has_labels:
@@ -56,7 +56,7 @@ def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _format_of(path: Path) -> CloudFormat:
-    """The format of a file: by its first bytes, then by its name's end."""
+    """Return the format of a file: by its first bytes, then by its name's end."""
     if not path.exists():
         raise InputError(f"{path}: no such file, {WANTED}")
     if not path.is_file():

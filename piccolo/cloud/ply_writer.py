@@ -46,7 +46,7 @@ def vertex_rows(
 def header(
     dtype: np.dtype[Any], num_vertices: int, comments: Sequence[str] = (), more: Sequence[str] = ()
 ) -> bytes:
-    """The header of binary vertices; its size does not depend on their number.
+    """Return the header of binary vertices; its size does not depend on their number.
 
     `more` are the lines of the elements that follow the vertices.
     """
@@ -76,7 +76,7 @@ class PlyWriter:
 def writing_ply(
     path: Path, dtype: np.dtype[Any], comments: Sequence[str] = (), more: Sequence[str] = ()
 ) -> Iterator[PlyWriter]:
-    """A writer of `path`, which is there when all is written and counted, and not after an error."""
+    """Yield a writer of `path`, which is there when all is written and counted, and not after an error."""
     with replacing(path) as file:
         writer = PlyWriter(file, dtype.newbyteorder("<"))
         file.write(header(writer.dtype, 0, comments, more))
@@ -92,7 +92,10 @@ def write_ply(path: Path, rows: Rows) -> None:
 
 
 def needs_double(box: Array, T_target_from_source: Array, scale: float) -> bool:
-    """True if float32 would lose over MAX_LOSS of a moved box (2, 3) [m]; T is in units of `scale` metres."""
+    """Return True if float32 would lose over MAX_LOSS of a moved box (2, 3) [m].
+
+    T is in units of `scale` metres.
+    """
     corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
     farthest = float(np.abs(transform_points(corners / scale, T_target_from_source)).max())
     return float(np.spacing(np.float32(farthest))) * scale > 2.0 * MAX_LOSS

@@ -39,7 +39,7 @@ IN_METRES = CloudSettings()
 
 
 def R_z_from_axis(up: UpAxis, of_file: UpAxis) -> Array:
-    """The rotation (3, 3) that turns a named axis to z; for auto that of the file."""
+    """Return the rotation (3, 3) that turns a named axis to z; for auto that of the file."""
     name = of_file if up == "auto" else up
     sign = -1.0 if name.startswith("-") else 1.0
     return np.round(rotation_to_z(sign * np.eye(3)["xyz".index(name[-1])])) + 0.0

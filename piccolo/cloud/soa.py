@@ -26,7 +26,7 @@ class PackedPoints:
         return len(self.x)
 
     def take(self, indices: NDArray[np.integer] | slice) -> "PackedPoints":
-        """The points at `indices`, in that order."""
+        """Return the points at `indices`, in that order."""
         return PackedPoints(self.x[indices], self.y[indices], self.z[indices], self.rgbx[indices])
 
     def subsample(self, count: int) -> "PackedPoints":
@@ -46,7 +46,7 @@ class LocalCloud:
     warnings: tuple[str, ...]
 
     def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the frame of `points`; one too far for float32 is an InputError."""
+        """Return a pose of the world in the frame of `points`; one too far for float32 is an InputError."""
         center_world = pose.center_world
         if not np.abs(center_world - self.origin_world).max() < FARTHEST:
             found = f"found a camera at {center_world.tolist()}"
@@ -55,7 +55,7 @@ class LocalCloud:
         return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
 
     def to_world(self, pose: Pose) -> Pose:
-        """A pose of the frame of `points` in the world."""
+        """Return a pose of the frame of `points` in the world."""
         R = self.R_local_from_world
         return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
 

@@ -40,7 +40,7 @@ class PointValidator:
     brightest: int = 0
 
     def filter(self, raw: RawCloud) -> Chunk:
-        """The finite points of a chunk, after they have been counted."""
+        """Return the finite points of a chunk, after they have been counted."""
         points = raw.points_world
         colors = raw.colors
         is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
@@ -69,14 +69,14 @@ class PointValidator:
             raise InputError(f"{self.path}: {found}; numbers without a declared range are 0-255, not 0-1")
 
     def warnings(self) -> tuple[str, ...]:
-        """A line if points were left out."""
+        """Return a line if points were left out."""
         if self.num_dropped:
             return (f"{self.path}: {self.num_dropped} points with NaN or infinite coordinates left out",)
         return ()
 
 
 def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
-    """A line if points (N, 3), in Morton order, look like millimetres or are too far apart for float32.
+    """Return line if points (N, 3), in Morton order, look like millimetres or are too far apart for float32.
 
     Millimetres: 98 % of the points span more than 2,000 along at least two axes.
     """
@@ -104,7 +104,7 @@ class Cloud:
     up: UpAxis = "z"  # the axis that points up by the files
 
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
-        """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
         table = VoxelTable("cloud")
         table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
         voxels = table.finish()
@@ -172,7 +172,7 @@ class CloudStream:
         return [line for source, validator in pairs for line in (*source.warnings, *validator.warnings())]
 
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
-        """The points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
         validators: list[PointValidator] = []
         table = VoxelTable(self.label)
         for points_world, colors in self.chunks(validators):
@@ -201,7 +201,7 @@ class CloudStream:
 
 
 def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
-    """A cloud in memory: points (N, 3), colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
+    """Return a cloud in memory: points (N, 3), colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
     if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")

@@ -36,7 +36,7 @@ def surface_variance(octree: Octree) -> Array:
 
 
 def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
-    """Normals (C, 3) of the planes through the leaves of cells, and variances (C,) across them [m^2].
+    """Return normals (C, 3) of the planes through the leaves of cells, and variances (C,) across them [m^2].
 
     The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; of two sheets at +-b
     and noise of variance s^2, E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. What counts is b^2 and a part of s^2.
@@ -73,7 +73,7 @@ def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, NDArray[np.in
 
 
 def fitted_tensor(normals: Array, variances: Array) -> Array:
-    """The positive tensor T (3, 3) with n T n nearest to each variance (C,) along its normal n (C, 3)."""
+    """Return positive tensor T (3, 3) with n T n nearest to each variance (C,) along its normal n (C, 3)."""
     rows, columns = np.triu_indices(3)
     twice = np.where(rows == columns, 1.0, 2.0)
     design = normals[:, rows] * normals[:, columns] * twice

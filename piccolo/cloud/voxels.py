@@ -50,7 +50,7 @@ SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
 
 @inline_kernel
 def spread_bits(cell):
-    """The lowest 21 bits of an int64, each followed by two zeros."""
+    """Return the lowest 21 bits of an int64, each followed by two zeros."""
     bits = cell & 0x1FFFFF
     bits = (bits | (bits << 32)) & 0x1F00000000FFFF
     bits = (bits | (bits << 16)) & 0x1F0000FF0000FF
@@ -75,7 +75,7 @@ def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
+    """Return indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
 
     The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell coordinates and then
     colours decide, so only points that are alike in every bit are left in the order of the input.
@@ -112,7 +112,9 @@ class Voxels(NamedTuple):
 def join_voxels(
     first: NDArray[np.float32], second: NDArray[np.float32], origin: NDArray[np.float64]
 ) -> Voxels:
-    """The voxels of two clouds' nodes (N, 6) about one origin (3,), as of Voxels; both may have some voxels.
+    """Return the voxels of two clouds' nodes (N, 6) about one origin (3,), as of Voxels.
+
+    Both may have some voxels.
 
     Those that one of them has stay as they are, bit by bit; the others have the means of both means.
     """
@@ -130,7 +132,7 @@ def join_voxels(
 
 @inline_kernel
 def first_slot(x, y, z, num_slots):
-    """The slot of an index (2^k,) from which a cell is looked for."""
+    """Return the slot of an index (2^k,) from which a cell is looked for."""
     # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     return (mixed ^ (mixed >> 17)) & (num_slots - 1)
@@ -138,7 +140,7 @@ def first_slot(x, y, z, num_slots):
 
 @inline_kernel
 def find_slot(index, rows, x, y, z):
-    """The slot that names a cell's row, or the free one where it belongs."""
+    """Return the slot that names a cell's row, or the free one where it belongs."""
     slot = first_slot(x, y, z, len(index))
     while index[slot] != 0:
         row = rows[index[slot] - 1]
@@ -244,7 +246,10 @@ class VoxelTable:
         check_memory(num_bytes, f"{self.label}: a table of more than {self.num_voxels} voxels of 2 cm", THIN)
 
     def finish(self) -> Voxels:
-        """The means; those too far from the rest for a Morton code are left out. The table is spent."""
+        """Return the means; those too far from the rest for a Morton code are left out.
+
+        The table is spent.
+        """
         num = self.num_voxels
         self.index = np.zeros(0, np.int32)
         check_memory(num * SORTED_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
@@ -273,7 +278,7 @@ class VoxelTable:
         return Voxels(codes[order], nodes, origin, warnings)
 
     def _without_far(self, rows: NDArray[np.int32]) -> tuple[NDArray[np.int32], tuple[str, ...]]:
-        """The rows of voxels near to the rest, and a line if others were left out."""
+        """Return the rows of voxels near to the rest, and a line if others were left out."""
         is_near = np.ones(len(rows), dtype=np.bool_)
         for column in rows[:, :COUNT].T:
             middle = int(np.partition(column, len(column) // 2)[len(column) // 2])

@@ -108,7 +108,7 @@ class ArrayArchive:
                 raise ValueError(f"{info.filename} with a wrong checksum")
 
     def array(self, name: str) -> NDArray[Any]:
-        """A member's array, as long as its header says."""
+        """Return a member's array, as long as its header says."""
         info = self.members[name]
         begin = self._begin(info)
         head = self.content[begin : begin + min(MAX_HEAD_SIZE, info.file_size)]

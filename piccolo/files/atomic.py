@@ -19,7 +19,7 @@ WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}
 
 
 def is_stdout(path: Path) -> bool:
-    """True for -, /dev/stdout, and any other name of what stdout is; not for /dev/null."""
+    """Return True for -, /dev/stdout, and any other name of what stdout is; not for /dev/null."""
     try:
         is_same = sys.stdout is not None and os.path.samestat(path.stat(), os.fstat(1))
     except OSError:  # there is no such file, or no stdout
@@ -28,7 +28,7 @@ def is_stdout(path: Path) -> bool:
 
 
 def is_stream(path: Path) -> bool:
-    """True for what is written to as it is: stdout, a FIFO or a character device."""
+    """Return True for what is written to as it is: stdout, a FIFO or a character device."""
     return is_stdout(path) or path.is_fifo() or path.is_char_device()
 
 
@@ -67,7 +67,7 @@ def _check_folder_of(path: Path) -> None:
 
 
 def _target_of(path: Path) -> Path:
-    """The file that a path stands for, there or not: of links their target, which is replaced, not they."""
+    """Return the file that a path stands for, there or not: of links their target, which is replaced, not they."""
     if not path.is_symlink():
         return path
     try:
@@ -84,13 +84,13 @@ def temporary_prefix(name: str) -> str:
 
 
 def _temporary_beside(target: Path) -> Path:
-    """A name in the target's folder that nobody else has."""
+    """Return a name in the target's folder that nobody else has."""
     return target.with_name(temporary_prefix(target.name) + secrets.token_hex(8))
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A file to write and to seek in, under a temporary name in the same folder, renamed at the end.
+    """Yield a file to write and to seek in, under a temporary name in the same folder, renamed at the end.
 
     Nobody sees half a file, and after an error nothing is left. An existing file gives its mode and owner to
     the new one; its other hard links keep the old content. What is_stream gets the whole content at the end.
@@ -161,7 +161,7 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """A folder to fill under a temporary name beside `path`, which is new or empty, renamed to it at the end.
+    """Yield a folder to fill under a temporary name beside `path`, which is new or empty, renamed to it at the end.
 
     Nobody sees it half full, and after an error nothing is left.
     """

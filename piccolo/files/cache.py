@@ -51,7 +51,7 @@ def digest_of_sources(folders: tuple[str, ...]) -> str:
 
 @cache
 def cache_root() -> Path:
-    """The folder for everything this program keeps between runs (XDG base directory specification), made now.
+    """Return the folder for everything this program keeps between runs (XDG base directory specification), made now.
 
     Where it can't be written, or others may write to it, a folder of the user's own among the temporary files
     takes its place; what lies there may hold code. OSError where that can't be trusted either.
@@ -74,26 +74,29 @@ def cache_root() -> Path:
 
 
 def make_writable(folder: Path) -> Path:
-    """The folder, made if need be, private then; OSError if no file can be written into it."""
+    """Return the folder, made if need be, private then; OSError if no file can be written into it."""
     folder.mkdir(PRIVATE, parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         return folder
 
 
 def is_own(status: os.stat_result, forbidden: int) -> bool:
-    """True for the user's own folder without the `forbidden` permissions."""
+    """Return True for the user's own folder without the `forbidden` permissions."""
     return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & forbidden
 
 
 def own_names(ending: str) -> re.Pattern[str]:
-    """The names of our files in a folder, by digest, and of those that a killed process was writing."""
+    """Return names of our files in a folder, by digest, and of those that a killed process was writing."""
     name = f"{32 * '0'}.{ending}"
     either = f"{re.escape(name)}|{re.escape(temporary_prefix(name))}[0-9a-f]{{16}}"
     return re.compile(either.replace(32 * "0", "[0-9a-f]{32}"))
 
 
 def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:
-    """A folder for files of ours, made and marked if it is new; stale files of a marked one are deleted."""
+    """Return a folder for files of ours, made and marked if it is new.
+
+    Stale files of a marked one are deleted.
+    """
     folder.mkdir(mode, parents=True, exist_ok=True)
     tag = folder / TAG
     if not any(folder.iterdir()):
@@ -105,7 +108,10 @@ def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:
 
 @cache
 def private_folder(name: str, files: re.Pattern[str]) -> Path | None:
-    """A folder of the user's cache that nobody else can write to, made now; None where that can't be."""
+    """Return a folder of the user's cache that nobody else can write to, made now.
+
+    None where that can't be.
+    """
     with suppress(OSError):
         folder = own_folder(cache_root() / name, files, PRIVATE)
         return folder if is_own(folder.stat(), WRITABLE) else None
@@ -140,13 +146,13 @@ TICK_NS = 50_000_000  # the clock of files moves on every 1 to 10 ms
 
 
 def key_of(what: str, status: os.stat_result) -> str:
-    """A name for `what` of a file of this status: another as soon as it changes."""
+    """Return a name for `what` of a file of this status: another as soon as it changes."""
     identity = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
     return hashlib.sha256(repr((what, identity)).encode()).hexdigest()[:32]
 
 
 def _path_of(what: str, status: os.stat_result) -> Path | None:
-    """The file in which `what` is kept of a file of this status."""
+    """Return the file in which `what` is kept of a file of this status."""
     folder = private_folder("facts", FACT_NAME)
     return folder and folder / f"{key_of(what, status)}.fact"
 
@@ -172,7 +178,7 @@ def remember(what: str, status: os.stat_result, fact: str) -> None:
 
 
 def sha256_of_files(paths: Sequence[Path], remembers: bool = False) -> str:
-    """A file's digest as sha256sum prints it; of several the digest of theirs, sorted, a line each.
+    """Return a file's digest as sha256sum prints it; of several the digest of theirs, sorted, a line each.
 
     With `remembers`, a file that has stayed as it was when it was last read is not read again.
     """
@@ -195,7 +201,7 @@ def _sha256_of_file(path: Path, remembers: bool) -> str:
 
 
 def sha256_of_arrays(*arrays: NDArray[Any]) -> str:
-    """The digest of arrays: of type, shape and bytes of each."""
+    """Return the digest of arrays: of type, shape and bytes of each."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(f"{array.dtype.str} {array.shape} ".encode())

@@ -20,7 +20,10 @@ _held: ContextVar[dict[Path, bytes] | None] = ContextVar("held", default=None)  
 
 
 def read_bytes(path: Path, wanted: str, max_size: float = math.inf) -> bytes:
-    """The content of a file of at most `max_size` bytes; `wanted` says in an error what it should hold."""
+    """Return the content of a file of at most `max_size` bytes.
+
+    `wanted` says in an error what it should hold.
+    """
     held = _held.get()
     if held is not None and path in held:
         return held[path]
@@ -57,7 +60,7 @@ def reading_once() -> Iterator[None]:
 
 
 def read_text(path: Path, wanted: str, max_size: int = MAX_SIZE) -> str:
-    """The text of a UTF-8 file."""
+    """Return the text of a UTF-8 file."""
     try:
         return read_bytes(path, wanted, max_size).decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -65,7 +68,7 @@ def read_text(path: Path, wanted: str, max_size: int = MAX_SIZE) -> str:
 
 
 def read_json(path: Path, wanted: str, max_size: int = MAX_SIZE) -> Any:
-    """What a JSON file holds."""
+    """Return what a JSON file holds."""
     text = read_text(path, wanted, max_size)
     try:
         return json.loads(text)
@@ -75,7 +78,7 @@ def read_json(path: Path, wanted: str, max_size: int = MAX_SIZE) -> Any:
 
 @contextmanager
 def document_of(text: str, form: str, label: str) -> Iterator[Any]:
-    """The JSON object in `text`, which says that it is of the format `form`; `label` begins an error.
+    """Yield the JSON object in `text`, which says that it is of the format `form`; `label` begins an error.
 
     Within this, what damaged fields raise is an InputError too.
     """
@@ -103,5 +106,5 @@ def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> li
 
 
 def describe(error: Exception) -> str:
-    """What one of DAMAGE says: errors of our own in words, a missing key with its kind."""
+    """Return what one of DAMAGE says: errors of our own in words, a missing key with its kind."""
     return str(error) if isinstance(error, ValueError) else repr(error)

@@ -13,7 +13,7 @@ BLOCK = 1 << 20  # [byte] read at a time
 
 
 def whole_size(path: Path, begins: bytes, what: str) -> int:
-    """The size [byte] of a file of lines up to the end of its last whole one; 0 if there is no file.
+    """Return the size [byte] of a file of lines up to the end of its last whole one; 0 if there is no file.
 
     A last line that is torn, as it was being written, begins with `begins`. Raises InputError if the end of
     the file is no beginning of such a line: it is not `what`.
@@ -35,7 +35,7 @@ def whole_size(path: Path, begins: bytes, what: str) -> int:
 
 
 def whole_lines(path: Path, size: int, begin: int = 0) -> Iterator[bytes]:
-    """The lines in the first `size` bytes of a file, from one that begins at `begin`."""
+    """Yield the lines in the first `size` bytes of a file, from one that begins at `begin`."""
     if size > begin:
         with path.open("rb") as file:
             file.seek(begin)
@@ -98,7 +98,7 @@ class LineFile:
 
 @contextmanager
 def locked(path: Path) -> Iterator[LineFile]:
-    """A file of lines, made if there is none, and then removed at the end if nothing is in it.
+    """Yield a file of lines, made if there is none, and then removed at the end if nothing is in it.
 
     Raises InputError if another process is writing the file.
     """

@@ -26,14 +26,14 @@ class _OneBlasThread(ContextDecorator):
         self._limiter: Any = None
 
     def __enter__(self) -> None:
-        """The first one in takes the threads."""
+        """Take the threads, if this is the first one in."""
         with self._lock:
             self._depth += 1
             if self._depth == 1:
                 self._limiter = _controller().limit(limits=1)
 
     def __exit__(self, *_: object) -> None:
-        """The last one out gives them back."""
+        """Give the threads back, if this is the last one out."""
         with self._lock:
             self._depth -= 1
             if self._depth == 0:

@@ -41,7 +41,7 @@ _opening = threading.Lock()
 
 @contextmanager
 def connected(address: str, num_processes: int, num_threads: int) -> Iterator["Cluster"]:
-    """The cluster of a scheduler's address or file; or of so many processes here, if it is "local".
+    """Yield the cluster of a scheduler's address or file; or of so many processes here, if it is "local".
 
     Raises InputError if dask.distributed is missing, or no scheduler or worker of this version answers.
     """
@@ -66,7 +66,7 @@ def connected(address: str, num_processes: int, num_threads: int) -> Iterator["C
 
 
 def _scheduler_at(address: str) -> str:
-    """The URL of the scheduler at an address or in the file that it has written, where something listens."""
+    """Return the URL of the scheduler at an address or in the file that it has written, where something listens."""
     try:
         if Path(address).is_file():
             address = str(json.loads(Path(address).read_bytes())["address"])
@@ -81,7 +81,7 @@ def _scheduler_at(address: str) -> str:
 
 @contextmanager
 def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> Iterator[str]:
-    """The address of a scheduler in this process, with workers in others that end with it."""
+    """Yield the address of a scheduler in this process, with workers in others that end with it."""
     # In place of Dask's own, of which MALLOC_TRIM_THRESHOLD_ makes large arrays slow.
     environment = dict.fromkeys(LIBRARIES, str(num_threads))
     import_optional("--dask", "dask", "distributed").config.set({ENVIRONMENT: environment})
@@ -130,7 +130,7 @@ class Cluster:
             raise InputError(f"--dask {self.address}: {text}")
 
     def has_files(self, paths: Sequence[Path]) -> bool:
-        """True if all workers see the files."""
+        """Return True if all workers see the files."""
         return all(self._client.run(_are_files, [str(path) for path in paths]).values())
 
     def send_file(self, path: Path) -> None:

@@ -88,7 +88,7 @@ def _free_of_cgroups() -> Iterator[float]:
 
 
 def is_shortage(error: BaseException) -> bool:
-    """True for what NumPy, OpenCV or Python raise where memory, or room for a thread, has run out."""
+    """Return True for what NumPy, OpenCV or Python raise where memory, or room for a thread, has run out."""
     if isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:
         return True
     if isinstance(error, SystemError):  # C code that gave up without saying why, under `ulimit -v`
@@ -103,13 +103,13 @@ def _of_process(column: int) -> float:
 
 
 def _number_after(path: Path, name: str) -> float:
-    """The number in the line of a file that begins with `name`; 0 without."""
+    """Return the number in the line of a file that begins with `name`; 0 without."""
     lines = (line.split() for line in _text(path).splitlines())
     return next((float(words[1]) for words in lines if words[:1] == [name]), 0.0)
 
 
 def _text(path: Path) -> str:
-    """A file's text, empty where there is none."""
+    """Return a file's text, empty where there is none."""
     try:
         return path.read_text()
     except OSError:

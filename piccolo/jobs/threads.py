@@ -114,7 +114,7 @@ class Workers:
 
     @contextmanager
     def beside(self, *functions: Callable[[], object]) -> Iterator[None]:
-        """A context in which an idle core calls functions, in order, that keep what they work out.
+        """Yield a context in which an idle core calls functions, in order, that keep what they work out.
 
         At its end, those that have not begun are left. What they raise is left to who asks for the value.
         """
@@ -147,7 +147,7 @@ class Once(Generic[Value]):
         self._value: Value
 
     def __call__(self) -> Value:
-        """The value. What the function raises is raised, and it is asked again by the next."""
+        """Return the value. What the function raises is raised, and it is asked again by the next."""
         with self._lock:
             if self._function is not None:
                 self._value = self._function()

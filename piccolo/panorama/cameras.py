@@ -43,7 +43,7 @@ class Cameras(NamedTuple):
 
 
 def cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
-    """The cameras of a picture, by the options or by EXIF.
+    """Return the cameras of a picture, by the options or by EXIF.
 
     Raises InputError if a calibration does not fit, or a pinhole is asked for and nothing tells its field.
     """
@@ -81,12 +81,12 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
 
 
 def _is_sphere(mounts: tuple[Mount, ...]) -> bool:
-    """True for one camera that takes the whole sphere as it is stored here."""
+    """Return True for one camera that takes the whole sphere as it is stored here."""
     return mounts == (Mount(mounts[0].camera),) and MODELS[mounts[0].camera.model][0] == SPHERE
 
 
 def _calibrated(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
-    """The calibration at the picture's size; of the stored picture, if only that has its shape."""
+    """Return the calibration at the picture's size; of the stored picture, if only that has its shape."""
     try:
         return calibration.for_picture(*picture.size)
     except InputError as error:
@@ -128,7 +128,7 @@ def views_of(
 
 
 def rig_cameras(path: Path, pictures: list[Picture], rig: Calibration) -> list[tuple[Mount, ...]]:
-    """The camera of each picture of a rig, at the picture's size.
+    """Return the camera of each picture of a rig, at the picture's size.
 
     Raises InputError if a picture has another shape than its camera.
     """

@@ -55,12 +55,14 @@ WANTED = "wanted six faces of a cube named as skybox0..5, px nx py ny pz nz or r
 
 
 def face_pixels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A face (size, size, 4) as it is resampled."""
+    """Return a face (size, size, 4) as it is resampled."""
     return np.dstack([rgb, is_valid.astype(np.uint8) * 255])
 
 
 def equirectangular(faces: Faces) -> Pixels:
-    """The picture of the full sphere, four times as wide as a face; bilinear, also across the cube's edges.
+    """Return the picture of the full sphere, four times as wide as a face.
+
+    Bilinear, also across the cube's edges.
 
     A pixel is valid if all four that go into it are.
     """
@@ -80,7 +82,7 @@ def equirectangular(faces: Faces) -> Pixels:
 
 
 def _padded(faces: Faces, letter: str) -> NDArray[np.uint8]:
-    """A face with a rim of one pixel from the faces around it, for interpolation across the edge."""
+    """Return a face with a rim of one pixel from the faces around it, for interpolation across the edge."""
     size = len(faces[letter])
     padded = cv2.copyMakeBorder(faces[letter], 1, 1, 1, 1, cv2.BORDER_CONSTANT)
     ends = np.array([0, size + 1])
@@ -109,7 +111,7 @@ def _sampled(faces: Faces, directions: NDArray[np.float32], rim: int) -> NDArray
 
 
 def read_cube_folder(folder: Path) -> Picture:
-    """The panorama of the six square pictures in a folder, one cube's faces.
+    """Return the panorama of the six square pictures in a folder, one cube's faces.
 
     Raises InputError if the folder holds no complete cube or several, or the faces are not squares of one
     size.
@@ -122,7 +124,7 @@ def read_cube_folder(folder: Path) -> Picture:
 
 
 def is_cube(folder: Path) -> bool:
-    """True for a folder of few pictures among which are the six faces of one cube."""
+    """Return True for a folder of few pictures among which are the six faces of one cube."""
     if sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) > MAX_CUBE_FILES:
         return False
     try:
@@ -132,7 +134,7 @@ def is_cube(folder: Path) -> bool:
 
 
 def face_paths(folder: Path) -> dict[str, Path]:
-    """The files of a folder's one complete cube, by the letters of their faces.
+    """Return the files of a folder's one complete cube, by the letters of their faces.
 
     Each scheme's files are told apart by the rest of their names.
     """
@@ -156,7 +158,9 @@ def face_paths(folder: Path) -> dict[str, Path]:
 
 
 def cube_of_cells(path: Path, picture: Picture, order: str | None) -> Picture | None:
-    """The panorama of a picture that is a cross, or by `order` a grid of six faces; None if it is neither.
+    """Return the panorama of a picture that is a cross, or by `order` a grid of six faces.
+
+    None if it is neither.
 
     A cross, 4:3 or 3:4, is known by its empty cells. A grid, 6:1, 1:6, 3:2 or 2:3, is known by `order` alone,
     the letters of its faces from left to right, then downwards.
@@ -199,13 +203,16 @@ def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
 
 
 def _cell(picture: Picture, size: int, row: int, column: int) -> NDArray[np.uint8]:
-    """The square (size, size, 4) in a row and column of such."""
+    """Return the square (size, size, 4) in a row and column of such."""
     place = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
     return face_pixels(picture.rgb[place], picture.is_valid[place])
 
 
 def _is_empty(pixels: NDArray[np.uint8]) -> bool:
-    """True for a cell of one colour or of alpha 0 only; its rim may have a little of the neighbours."""
+    """Return True for a cell of one colour or of alpha 0 only.
+
+    Its rim may have a little of the neighbours.
+    """
     rim = max(len(pixels) // 32, 1)
     inner = pixels[rim:-rim, rim:-rim].reshape(-1, 4)
     is_constant = (inner.max(axis=0).astype(int) - inner.min(axis=0)).max() <= MAX_EMPTY_RANGE

@@ -58,7 +58,7 @@ def gpano_fields(xmp: bytes) -> dict[str, str]:
 
 
 def _number(fields: dict[str, str], name: str, largest: float = MAX_NUMBER) -> float | None:
-    """The number in a field; None if it is missing, no number, not finite or out of range."""
+    """Return the number in a field; None if it is missing, no number, not finite or out of range."""
     try:
         value = float(fields[name])
     except (KeyError, ValueError):
@@ -72,7 +72,9 @@ def attitude(fields: dict[str, str]) -> GPano:
 
 
 def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
-    """The part of the sphere that a picture of `aspect` (width by height) shows; full if nothing is said.
+    """Return the part of the sphere that a picture of `aspect` (width by height) shows.
+
+    Full if nothing is said.
 
     The fields count pixels of the picture as it was made: only their ratios are used, so that a picture made
     smaller since is placed right. None if the fields make no sense or are of a picture of another shape.
@@ -124,7 +126,7 @@ def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:
 
 
 def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
-    """A picture with as many pixels a degree in both directions, centred on the horizon."""
+    """Return a picture with as many pixels a degree in both directions, centred on the horizon."""
     wide, high = fov_deg / 360.0, fov_deg / 180.0 * height / width  # fractions of the sphere's picture
     return CropRegion((1.0 - wide) / 2.0, (1.0 - high) / 2.0, wide, high)
 
@@ -152,7 +154,9 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
 
 
 def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], region: CropRegion) -> Pixels:
-    """The picture at its place in the full sphere, the rest not valid; itself if it is the full sphere.
+    """Return the picture at its place in the full sphere, the rest not valid.
+
+    Itself if it is the full sphere.
 
     Its edges come to whole pixels: it is moved by half a pixel at most. Over the seam it is continued.
     """

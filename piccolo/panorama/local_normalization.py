@@ -118,7 +118,7 @@ def interpolation_along(num, num_wider):
 
 @inline_kernel
 def as_texel_channel(value, mean, gain, shift):
-    """A channel's bits of a texel: its normalised value in levels."""
+    """Return a channel's bits of a texel: its normalised value in levels."""
     level = np.int32(zscore(value, mean, gain) * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
     return np.int32(min(level, np.int32(255)) << np.int32(shift))
 

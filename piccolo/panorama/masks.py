@@ -79,13 +79,13 @@ def black_borders(
 
 
 def _filtered(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The least (cv2.erode) or largest (cv2.dilate) of the depths (columns,) within RIM of each."""
+    """Return the least (cv2.erode) or largest (cv2.dilate) of the depths (columns,) within RIM of each."""
     column = depth[:, None].astype(np.float32)  # whole numbers that small are exact
     return np.asarray(which(column, np.ones((2 * RIM + 1, 1), np.uint8))[:, 0], np.int64)
 
 
 def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Number of near black pixels from the edge (row 0) inwards, of the columns that are black there."""
+    """Return number of near black pixels from the edge (row 0) inwards, of the columns that are black there."""
     depth = np.zeros(len(is_black), dtype=np.int64)
     for begin in range(0, len(inwards), BAND):
         band = np.ascontiguousarray(inwards[begin : begin + BAND])
@@ -126,7 +126,7 @@ def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -
 
 
 def _edge_circle(cap: NDArray[np.float32]) -> int:
-    """Number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
+    """Return number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
     pairs = (cap[1:] + cap[:-1]) / 2.0
     is_step = (cv2.absdiff(pairs[2:], pairs[:-2]) > MIN_STEP) @ np.ones(3, np.bool_)
     fraction = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # fraction[k]: k rows are inside
@@ -149,7 +149,7 @@ def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _detail_circle(cap: NDArray[np.float32]) -> int:
-    """Number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
+    """Return number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
     grey = cv2.transform(cap, np.full((1, 3), 1.0 / 3.0))
     east, west = _neighbors_around()
     second = grey.ravel()[east] + grey.ravel()[west] - 2.0 * grey
@@ -167,7 +167,7 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
 
 
 def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
-    """True if all is black outside of the two circles inscribed in the halves, but not within them.
+    """Return True if all is black outside of the two circles inscribed in the halves, but not within them.
 
     A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
     around. Circles down to 0.9 of the halves' height are found.
@@ -190,7 +190,7 @@ def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
 
 
 def find_mask(mask: Path, pano: Path) -> Path | None:
-    """The mask's file: `mask` itself, or in the folder `mask` the one named as the panorama, or None."""
+    """Return mask's file: `mask` itself, or in the folder `mask` the one named as the panorama, or None."""
     if not mask.is_dir():
         return mask
     return next((file for suffix in SUFFIXES if (file := mask / (pano.stem + suffix)).is_file()), None)
@@ -216,7 +216,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
 
 
 def mask_pole(is_valid: NDArray[np.bool_], pole: str, half_angle_deg: float) -> NDArray[np.bool_]:
-    """Validity (H, W) without the rows whose centre is nearer than that to the `pole`, zenith or nadir."""
+    """Return validity (H, W) without the rows whose centre is nearer than that to the `pole`, zenith or nadir."""
     height = len(is_valid)
     from_zenith = (np.arange(height) + 0.5) * 180.0 / height
     from_pole = from_zenith if pole == "zenith" else from_zenith[::-1]

@@ -49,7 +49,10 @@ class Panorama:
     focal_prior: FocalPrior | None = None  # of one camera whose focal length is not exact
 
     def retaken(self, camera: Camera, width: int) -> "Panorama":
-        """The panorama, `width` x width / 2, by another calibration of its camera; it has a focal_prior."""
+        """Return the panorama, `width` x width / 2, by another calibration of its camera.
+
+        It has a focal_prior.
+        """
         assert self.focal_prior is not None
         mount = self.cameras[0].with_camera(camera)
         rgb, is_valid = sphere_of([self.focal_prior.view._replace(mount=mount)], width)
@@ -99,7 +102,7 @@ class ReadOptions:
         return self.calibration if self.calibration is not None and self.calibration.is_rig else None
 
     def refined(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
-        """The same with the camera that a result refined, as a calibration of the picture as it is stored."""
+        """Return the same with the camera that a result refined, as a calibration of the picture as it is stored."""
         if len(cameras) != 1:
             return self
         given = self.calibration
@@ -134,12 +137,12 @@ def _check_number(option: str, value: float | None, largest: float) -> None:
 
 
 def shrink(panorama: Panorama, width: int) -> Panorama:
-    """The panorama area-averaged to `width` x width / 2, or itself if it is no larger."""
+    """Return the panorama area-averaged to `width` x width / 2, or itself if it is no larger."""
     return panorama if panorama.rgb.shape[1] <= width else resize(panorama, width)
 
 
 def resize(panorama: Panorama, width: int) -> Panorama:
-    """The panorama at `width` x width / 2: area-averaged where that is smaller, interpolated where larger.
+    """Return panorama at `width` x width / 2: area-averaged where that is smaller, interpolated where larger.
 
     Pixels that do not count stay out of the averages; a pixel counts if half of its area does.
     """

@@ -74,7 +74,7 @@ def _digest(files: list[Path]) -> str:
 
 
 def photo_of(path: Path, rig: Calibration | None = None) -> PhotoFacts:
-    """What a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
+    """Return what a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
 
     InputError if the file is missing or no picture. Metadata that are damaged count as missing.
     """
@@ -94,7 +94,10 @@ def photo_of(path: Path, rig: Calibration | None = None) -> PhotoFacts:
 
 
 def _exif_chunk(content: bytes) -> bytes:
-    """The EXIF in a PNG file, before or behind the pixels; empty if there is none, or for another file."""
+    """Return the EXIF in a PNG file, before or behind the pixels.
+
+    Empty if there is none, or for another file.
+    """
     begin = len(PNG_MAGIC) if content.startswith(PNG_MAGIC) else len(content)
     while begin + 8 <= len(content):
         end = begin + 8 + int.from_bytes(content[begin : begin + 4])
@@ -105,7 +108,7 @@ def _exif_chunk(content: bytes) -> bytes:
 
 
 def photo_of_array(rgb: NDArray[np.uint8]) -> PhotoFacts:
-    """The same of pixels (H, W, 3): their digest and size."""
+    """Return the same of pixels (H, W, 3): their digest and size."""
     height, width = rgb.shape[:2]
     return PhotoFacts(sha256_of_arrays(rgb), (width, height), None, None)
 
@@ -150,7 +153,7 @@ class ExifFocal(NamedTuple):
 
 
 def focal_of(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | None:
-    """The focal length of a picture of this size [px]; None if EXIF does not say, or what can't be."""
+    """Return the focal length of a picture of this size [px]; None if EXIF does not say, or what can't be."""
     diagonal = math.hypot(*size)
     film = _number(exif, Base.FocalLengthIn35mmFilm)
     film = film if film and MIN_FILM <= film <= MAX_FILM else None
@@ -170,7 +173,7 @@ def focal_of(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | N
 
 
 def _is_zoom(exif: Mapping[int, object]) -> bool:
-    """True if the lens has several focal lengths, or a part of the picture was enlarged."""
+    """Return True if the lens has several focal lengths, or a part of the picture was enlarged."""
     lens = exif.get(Base.LensSpecification)
     has_range = isinstance(lens, tuple) and len(lens) > 1 and lens[0] != lens[1]
     return has_range or (_number(exif, Base.DigitalZoomRatio) or 1.0) > 1.0
@@ -195,7 +198,7 @@ def elevation_deg(exif: Mapping[int, object]) -> float | None:
 
 
 def _number(exif: Mapping[int, object], tag: int, least: float = 0.0) -> float | None:
-    """The finite number in a tag; None if it is missing, no number or less than `least`."""
+    """Return the finite number in a tag; None if it is missing, no number or less than `least`."""
     try:
         value = float(cast(SupportsFloat, exif[tag]))
     except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):

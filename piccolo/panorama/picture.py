@@ -97,7 +97,7 @@ class Picture:
 
 
 def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)) -> Picture:
-    """The picture in a file; grey becomes RGB, of 16 bits the upper 8 are kept (v >> 8).
+    """Return the picture in a file; grey becomes RGB, of 16 bits the upper 8 are kept (v >> 8).
 
     Raises InputError if the file is missing or damaged, of no format read here, or its size is out of range.
     """
@@ -120,7 +120,7 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
 
 
 def read_labels(path: Path, labels: Labels) -> Picture:
-    """The picture in a PNG file of labels, in their colours; of RGB, a label is R 65536 + G 256 + B.
+    """Return the picture in a PNG file of labels, in their colours; of RGB, a label is R 65536 + G 256 + B.
 
     Raises InputError if the file is missing or damaged, its size is out of range, or it is of no kind that
     keeps labels.
@@ -151,7 +151,10 @@ def picture_orientation(path: Path) -> object:
 
 @contextmanager
 def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
-    """The picture in `data` as Pillow opens it, not decoded; what Pillow raises becomes an InputError."""
+    """Yield the picture in `data` as Pillow opens it, not decoded.
+
+    What Pillow raises becomes an InputError.
+    """
     if not data:
         raise InputError(f"{path}: the file is empty, {WANTED}")
     kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)
@@ -191,7 +194,7 @@ def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, in
 
 
 def _decoded(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Image:
-    """The picture decoded, turned as EXIF says, and converted to Pillow's `mode`."""
+    """Return the picture decoded, turned as EXIF says, and converted to Pillow's `mode`."""
     if isinstance(image, TiffImageFile):  # which Pillow turns while it decodes
         if image.use_load_libtiff:
             return _decoded_apart(path, data, mode, image.size)
@@ -218,7 +221,7 @@ def _orientation(image: ImageFile) -> object:
 
 
 def exif_of(image: ImageFile) -> dict[int, object]:
-    """What EXIF says of camera and exposure, by tag; empty where it is missing or damaged."""
+    """Return what EXIF says of camera and exposure, by tag; empty where it is missing or damaged."""
     try:
         return dict(image.getexif().get_ifd(IFD.Exif))
     except Exception:  # Pillow raises whatever damaged metadata bring
@@ -226,7 +229,7 @@ def exif_of(image: ImageFile) -> dict[int, object]:
 
 
 def _decoded_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
-    """The packed TIFF in `data`, decoded by a process of its own."""
+    """Return the packed TIFF in `data`, decoded by a process of its own."""
     command = [sys.executable, "-P", "-c", DECODE_TIFF, mode]
     done = subprocess.run(command, input=data, capture_output=True, check=False)
     if done.returncode < 0:
@@ -240,7 +243,7 @@ def _decoded_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) ->
 
 
 def _is_cut(data: bytes, image: JpegImageFile) -> bool:
-    """True for a JPEG just opened that has no end mark, or has it before the picture ends.
+    """Return True for a JPEG just opened that has no end mark, or has it before the picture ends.
 
     Then libjpeg takes grey for what is missing, but something else if more bytes come before the mark.
     """
@@ -254,7 +257,7 @@ def _is_cut(data: bytes, image: JpegImageFile) -> bool:
 
 
 def _xmp(image: ImageFile) -> bytes:
-    """The picture's XMP packet; empty if it has none, or one that is damaged or long."""
+    """Return the picture's XMP packet; empty if it has none, or one that is damaged or long."""
     xmp = image.info.get("xmp", b"")
     return xmp if isinstance(xmp, bytes) and len(xmp) <= MAX_XMP_SIZE else b""
 

@@ -41,7 +41,7 @@ MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a w
 
 
 def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
-    """The panorama in a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces, as a full sphere.
+    """Return the panorama in a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces, as a full sphere.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
     valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
@@ -61,7 +61,7 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
 
 
 def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
-    """The panorama of a picture; `path` names it in errors and warnings."""
+    """Return the panorama of a picture; `path` names it in errors and warnings."""
     if cube := cube_of_cells(path, picture, options.cube_order):
         return _embedded_and_masked(path, cube, CropRegion(), options, None)
     fields = gpano_fields(picture.xmp)
@@ -78,7 +78,7 @@ def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
 
 
 def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
-    """The panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
+    """Return panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
     path = Path("array")
     picture = Picture(rgb, is_valid)
     cameras = cameras_of(path, picture, options, has_gpano=True)
@@ -92,7 +92,7 @@ def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], optio
 
 
 def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
-    """The panorama of the pictures of one instant."""
+    """Return the panorama of the pictures of one instant."""
     files = rig.images_in(folder)
     pictures = [read_picture(file) for file in files]
     shots = list(zip(files, pictures, rig_cameras(folder, pictures, rig), strict=True))
@@ -106,7 +106,7 @@ def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
 def _on_sphere(
     path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None, deviation: float = 0.0
 ) -> Panorama:
-    """The pictures of one instant on one sphere, each with its file and cameras, masks taken out.
+    """Return the pictures of one instant on one sphere, each with its file and cameras, masks taken out.
 
     `deviation` is that of the one camera's focal length.
     """
@@ -149,7 +149,7 @@ def panorama_size(path: Path) -> tuple[int, int]:
 
 
 def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama:
-    """The panorama in a PNG file of labels. No automatic masks: a black border is a label too."""
+    """Return the panorama in a PNG file of labels. No automatic masks: a black border is a label too."""
     picture = read_labels(path, labels)
     width, height = picture.size
     if width != 2 * height:
@@ -189,7 +189,7 @@ def _region_of(
 def _embedded_and_masked(
     path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
 ) -> Panorama:
-    """The picture at its place in the sphere, with everything masked that is not to be counted."""
+    """Return the picture at its place in the sphere, with everything masked that is not to be counted."""
     size = full_size(path, region, picture.size)
     notes = [*picture.warnings]
     masks = _user_masks(path, [size, picture.size], options, notes)
@@ -212,7 +212,7 @@ def _embedded_and_masked(
 def _masked(
     path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions
 ) -> Panorama:
-    """The panorama less what a mask of its size, or the option for the nadir, takes out."""
+    """Return the panorama less what a mask of its size, or the option for the nadir, takes out."""
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)
     if not is_valid.any():
@@ -225,7 +225,7 @@ def _masked(
 def _user_masks(
     path: Path, sizes: list[tuple[int, int]], options: ReadOptions, notes: list[str]
 ) -> dict[int, NDArray[np.bool_]]:
-    """The user's mask, True where pixels count, by the index of the size that it has the shape of."""
+    """Return the user's mask, True where pixels count, by the index of the size that it has the shape of."""
     if options.mask is None:
         return {}
     file = find_mask(options.mask, path)
@@ -248,7 +248,7 @@ def read_photo(
     options: ReadOptions,
     is_masked: NDArray[np.bool_] | None = None,
 ) -> Panorama:
-    """The panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored.
+    """Return the panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored.
 
     An array that no camera is given for is a full sphere.
     """

@@ -40,7 +40,7 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
 
 @inline_kernel
 def channel(texel, shift):
-    """The 8-bit channel of a texel as float32; shift 0, 8 or 16."""
+    """Return the 8-bit channel of a texel as float32; shift 0, 8 or 16."""
     return np.float32((texel >> shift) & BYTE)
 
 
@@ -117,7 +117,7 @@ def make_projected():
 
 @inline_kernel
 def pose_float32(R_cam_from_world, center_world):
-    """A pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 that registers hold."""
+    """Return a pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 that registers hold."""
     f = np.float32
     R = R_cam_from_world
     t = center_world
@@ -154,7 +154,7 @@ def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
 
 @inline_kernel
 def texels_around(projected, n):
-    """The four texels around a projected point that `gather` has written."""
+    """Return the four texels around a projected point that `gather` has written."""
     return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
 
 

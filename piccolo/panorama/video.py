@@ -67,7 +67,7 @@ def sharpness_of(rgb: NDArray[np.uint8]) -> float:
 
 
 def _decoded(video: Path) -> Iterator[tuple[float, Any]]:
-    """Times [s] from the first frame, and the frames as PyAV has them."""
+    """Yield times [s] from the first frame, and the frames as PyAV has them."""
     av = import_optional(video, "av", "video")
     begin: float | None = None
     try:

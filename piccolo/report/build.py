@@ -111,7 +111,7 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
 
 
 def task_of(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
-    """What is to be done for a result; its key is of all that its pictures depend on."""
+    """Return what is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
     photo = Path(result.pano)
     if settings.images is not None:
@@ -186,7 +186,7 @@ def document_of(
 def storey_documents(
     scan_map: ScanMap, tasks: Sequence[Task], folder: Path, settings: ReportSettings
 ) -> Iterator[dict[str, Any]]:
-    """The storeys, each with its plan, which is written."""
+    """Yield the storeys, each with its plan, which is written."""
     origin = float((scan_map.R_map_from_world @ scan_map.origin_world)[2])
     storey, height = scan_map.storeys.at(scan_map.centers)
     found = scan_map.storeys.storeys

@@ -47,13 +47,13 @@ def entries_of(items: Sequence[Path | Result]) -> list[Entry]:
 
 
 def entries_of_walk(results: Sequence[Result]) -> list[Entry]:
-    """The results of one walk."""
+    """Return the results of one walk."""
     times = [float(k) if r.walk is None else r.walk.time for k, r in enumerate(results)]
     return [Entry(r, 0, time) for r, time in zip(results, times, strict=True)]
 
 
 def names_of(entries: Sequence[Entry]) -> list[str]:
-    """A name for each, which no other has: its path below the folder that all share."""
+    """Return a name for each, which no other has: its path below the folder that all share."""
     paths = [Path(entry.result.pano) for entry in entries]
     folders = [path.parent.parts for path in paths]
     shared = 0
@@ -69,14 +69,14 @@ def names_of(entries: Sequence[Entry]) -> list[str]:
 
 
 def short_names_of(names: Sequence[str]) -> list[str]:
-    """The file's own name without its ending, or the name as it is where several would be the same."""
+    """Return the file's own name without its ending, or the name as it is where several would be the same."""
     own = [ENDING.sub(r"\1", name.rpartition("/")[2]) for name in names]
     counts = Counter(own)
     return [short if counts[short] == 1 else name for short, name in zip(own, names, strict=True)]
 
 
 def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> dict[str, Any]:
-    """What the page knows of a result before it is opened; angles in degrees, lengths in metres."""
+    """Return what the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
     is_hopeless = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
     return {
@@ -99,7 +99,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
 
 
 def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
-    """What was found: the best pose, the others, and what speaks for them."""
+    """Return what was found: the best pose, the others, and what speaks for them."""
     poses = [best_pose, *(alternative.pose for alternative in result.alternatives)]
     centers = np.array([scan_map.from_world(pose).center_world for pose in poses])
     storey, height = scan_map.storeys.at(centers)
@@ -128,7 +128,7 @@ def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[s
 
 
 def pose_document(pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
-    """A pose in the plan's frame, and as the world has it."""
+    """Return a pose in the plan's frame, and as the world has it."""
     local = scan_map.from_world(pose)
     heading, pitch, roll = heading_pitch_roll_deg(pose)
     return {

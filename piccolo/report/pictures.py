@@ -64,7 +64,7 @@ def read_options_of(result: Result) -> ReadOptions:
 def make_pictures(
     photo: Path, result: Result, poses: list[Pose], scan: tuple[Surfels, PackedPoints], width: int | None
 ) -> tuple[bytes, str]:
-    """The thumbnail of a photo, JPEG, and the JSON of its other pictures.
+    """Return the thumbnail of a photo, JPEG, and the JSON of its other pictures.
 
     Spheres are at most `width` px wide, None for the photo's own size. Without a pose there is no scan.
     """
@@ -95,7 +95,7 @@ def _shown(result: Result) -> list[bool]:
 
 
 def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
-    """What the scan shows from a pose of its frame."""
+    """Return what the scan shows from a pose of its frame."""
     visible = surfels.take(visible_indices(surfels.points, pose.center_world))
     return render_surfels(visible, pose, width, Workers())
 
@@ -113,7 +113,7 @@ def scan_picture(view: View) -> bytes:
 
 
 def _grey_where_unscanned(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A sphere (H, W, 3) whose larger gaps (H, W) are dimmed towards grey."""
+    """Return a sphere (H, W, 3) whose larger gaps (H, W) are dimmed towards grey."""
     size = 2 * math.ceil(GAP * rgb.shape[1]) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))
     seen = np.pad(is_seen.view(np.uint8), ((0, 0), (size, size)), mode="wrap")

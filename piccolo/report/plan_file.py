@@ -88,7 +88,7 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
 
 
 def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
-    """The shapes drawn of a storey, in the map's frame: paths first, marks last."""
+    """Yield the shapes drawn of a storey, in the map's frame: paths first, marks last."""
     numbered = enumerate(document["photos"], 1)
     photos = [(n, photo) for n, photo in numbered if photo["isOnPlan"] and photo["storey"] in (index, None)]
     for s in segments_of([photo for _, photo in photos]):
@@ -109,7 +109,7 @@ def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
 
 
 def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
-    """The plans one below the other as matplotlib draws them, with a scale each."""
+    """Return the plans one below the other as matplotlib draws them, with a scale each."""
     plans = [(k, storey) for k, storey in enumerate(document["storeys"]) if storey["plan"]]
     sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + MARGIN for _, s in plans]
     heights = [float(side[1]) for side in sides] or [1.0]
@@ -133,7 +133,7 @@ def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
 
 
 def _draw_plan(axes: Any, storey: dict[str, Any], folder: Path) -> None:
-    """The plan of a storey with its name and scale, in metres of the map's frame."""
+    """Draw the plan of a storey with its name and scale, in metres of the map's frame."""
     from matplotlib.transforms import Affine2D  # noqa: PLC0415  # as of new_figure
 
     plan = storey["plan"]
@@ -154,7 +154,7 @@ def _draw_plan(axes: Any, storey: dict[str, Any], folder: Path) -> None:
 
 
 def _draw_scale(axes: Any) -> None:
-    """The colours of a walk's path."""
+    """Draw the colours of a walk's path."""
     from matplotlib.cm import ScalarMappable  # noqa: PLC0415
     from matplotlib.colors import Normalize  # noqa: PLC0415
 
@@ -209,7 +209,7 @@ def dxf_of(document: dict[str, Any]) -> bytes:
 
 
 def _add(space: Any, shape: Shape, layer: str, R_map_from_world: Array, origin: Array) -> None:
-    """A shape in the world's coordinates; no ellipse that is smaller than a hundredth of a millimetre."""
+    """Draw a shape in the world's coordinates, but no ellipse smaller than a hundredth of a millimetre."""
     color = COLORS[shape.status] if isinstance(shape, Mark) else shape.color
     how = {"layer": layer, "true_color": color[0] << 16 | color[1] << 8 | color[2]}
     if isinstance(shape, Line):
@@ -227,7 +227,7 @@ def _add(space: Any, shape: Shape, layer: str, R_map_from_world: Array, origin: 
 
 
 def _layer_name(name: str, index: int) -> str:
-    """A storey's name as DXF takes it."""
+    """Return a storey's name as DXF takes it."""
     kept = "".join("_" if letter in '<>/\\":;?*|=`,' else letter for letter in name)
     return f"PHOTOS {index + 1} {kept}"[:200]
 
@@ -242,7 +242,7 @@ class Segment(NamedTuple):
 
 
 def segments_of(photos: Sequence[dict[str, Any]]) -> Iterator[Segment]:
-    """The paths of the walks among the photos of a plan, from storey to storey not drawn."""
+    """Yield the paths of the walks among the photos of a plan, from storey to storey not drawn."""
     frames = sorted((p for p in photos if p["walk"] is not None), key=lambda p: (p["walk"], p["time"]))
     for _, walk in groupby(frames, key=lambda p: p["walk"]):
         known = [p for p in walk if p["pose"] and p["confidence"] >= LEAST_ON_PATH]

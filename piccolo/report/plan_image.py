@@ -55,7 +55,7 @@ class PlanImage(NamedTuple):
 
 
 def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage | None:
-    """The plan of a storey of a map's points.
+    """Return the plan of a storey of a map's points.
 
     Around the places (P, 3) [m] in it where a camera can be, above each of which the floor is at `floors`
     (P,) [m]. None if nothing is there.
@@ -105,7 +105,7 @@ def _painted(
     shape: tuple[int, int],
     pixel: float,
 ) -> NDArray[np.uint8]:
-    """The picture (H, W, 4): what is highest below the cut, gaps closed, shadows of the walls, the walls."""
+    """Return the picture (H, W, 4): what is highest below the cut, gaps closed, shadows of the walls, the walls."""
     order = np.argsort(above, kind="stable")  # what is higher is written later
     color = np.zeros((*shape, 3), np.uint8)
     is_seen = np.zeros(shape, np.bool_)
@@ -177,7 +177,7 @@ def read_control_points(path: Path) -> Array:
 
 
 def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]:
-    """a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f, and the rms error [m] at the points.
+    """Return a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f, and the rms error [m] at the points.
 
     Of pixels (N, 2), v downwards, and places (N, 2) [m]: two points give a turn and a scale, more any affine
     map by least squares. InputError if they lie in one point or, more than two, on one line.
@@ -201,7 +201,7 @@ def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]
 
 
 def own_plan(plan: OwnPlan, scan_map: ScanMap) -> PlanImage:
-    """The user's plan in the map's frame."""
+    """Return the user's plan in the map's frame."""
     points = read_control_points(plan.control_points)
     world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
     places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]

@@ -31,7 +31,7 @@ OWN = "'self' file:"
 
 
 def page_file(name: str) -> str:
-    """A file of the page, as the package has it."""
+    """Return a file of the page, as the package has it."""
     return (files("piccolo.report") / "page" / name).read_text(encoding="utf-8")
 
 
@@ -88,7 +88,7 @@ def finish_folder(out: Path, document: Mapping[str, Any]) -> None:
 
 
 def self_contained(folder: Path, document: Mapping[str, Any]) -> str:
-    """The page with everything in it; its pictures lie in a folder, as those of other reports do."""
+    """Return the page with everything in it; its pictures lie in a folder, as those of other reports do."""
     inlined = json.loads(json.dumps(document))
     for photo in inlined["photos"]:
         if photo["thumb"]:

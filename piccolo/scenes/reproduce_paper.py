@@ -35,12 +35,12 @@ UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
 
 
 def identity(scene: Scene, folder: Path) -> Scene:
-    """The scene itself."""
+    """Return the scene itself."""
     return scene
 
 
 def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | None = None) -> Scene:
-    """A number or a fraction of the points, drawn at random; InputError where there are fewer."""
+    """Return a number or a fraction of the points, drawn at random; InputError where there are fewer."""
     cloud = read_cloud(scene.cloud)
     count = num_points or max(1, round(fraction * len(cloud.points)))
     if count > len(cloud.points):
@@ -51,7 +51,7 @@ def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | No
 
 
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
-    """The cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
+    """Return the cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
     cloud = read_cloud(scene.cloud)
     turn = RigidTransform(random_rotation(_rng(scene)), np.zeros(3))
     points = turn.of_points(cloud.points.astype(np.float64) + cloud.origin_world)
@@ -88,7 +88,7 @@ def flipped(scene: Scene, folder: Path) -> Scene:
 
 
 def _rng(scene: Scene) -> np.random.Generator:
-    """A generator seeded by the scene's name: the same draw whatever else is run."""
+    """Return a generator seeded by the scene's name: the same draw whatever else is run."""
     return np.random.default_rng([crc32(scene.name.encode()), len(scene.queries)])
 
 
@@ -123,7 +123,7 @@ class Experiment(NamedTuple):
 
 
 def _paper_setting(setting: str, names: Mapping[Any, str]) -> ConditionsOf:
-    """A condition for each value of a setting of preset paper, which has no counterpart in the default."""
+    """Return a condition for each value of a setting of preset paper, which has no counterpart in the default."""
 
     def conditions_of(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
         paper = next((p for p in presets if isinstance(p, PaperSettings)), PaperSettings())
@@ -133,7 +133,10 @@ def _paper_setting(setting: str, names: Mapping[Any, str]) -> ConditionsOf:
 
 
 def _each_preset(cases: Mapping[str, dict[str, Any]]) -> ConditionsOf:
-    """A condition for each case and preset; a case has fields of Condition, and `gravity` of the settings."""
+    """Return a condition for each case and preset.
+
+    A case has fields of Condition, and `gravity` of the settings.
+    """
 
     def conditions_of(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
         return [
@@ -223,7 +226,7 @@ EXPERIMENTS = {
 
 
 def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> Table:
-    """A line a condition, the paper's figure at its end."""
+    """Return a line a condition, the paper's figure at its end."""
     lines = [_cells(condition, rows) for condition, rows in found]
     return Table(title, tuple(lines[0]), tuple(tuple(line.values()) for line in lines), 2)
 

@@ -58,12 +58,12 @@ class Scene:
         return {query.image.name: query for query in self.queries}
 
     def name_of(self, query: Query) -> str:
-        """A query's image as queries.json has it."""
+        """Return a query's image as queries.json has it."""
         return Path(os.path.relpath(query.image, self.folder)).as_posix()
 
 
 def read_scene(folder: Path, name: str | None = None) -> Scene:
-    """The scene of a folder, or of the queries.json in it.
+    """Return the scene of a folder, or of the queries.json in it.
 
     Raises InputError if there is no queries.json, or it is not as `write_queries` writes it.
     """
@@ -80,7 +80,7 @@ def read_scene(folder: Path, name: str | None = None) -> Scene:
 
 
 def find_scenes(roots: Sequence[Path]) -> list[Scene]:
-    """The scenes in and below folders, by name; a queries.json may stand for its folder.
+    """Return the scenes in and below folders, by name; a queries.json may stand for its folder.
 
     Raises InputError if there is none below one of the roots, or two have the same name.
     """
@@ -120,7 +120,7 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
 
 
 def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
-    """A frame's walk and time, and whether it has an answer; ValueError if they are none."""
+    """Return a frame's walk and time, and whether it has an answer; ValueError if they are none."""
     walk, time, is_answerable = entry.get("walk"), entry.get("time"), entry.get("answerable", True)
     if (walk is None) != (time is None) or not isinstance(is_answerable, bool):
         text = "a walk without a time, or an answerable that is not true or false"
@@ -135,7 +135,10 @@ def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """A path as a folder's files may give it, whatever links lead to either; a link itself stays one."""
+    """Return a path as a folder's files may give it, whatever links lead to either.
+
+    A link itself stays one.
+    """
     return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
 
 

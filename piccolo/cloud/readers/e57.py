@@ -68,7 +68,7 @@ class _UnusableError(Exception):
 
 
 def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The coloured points of all scans of an E57 file.
+    """Return the coloured points of all scans of an E57 file.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
     range is the scan's colorLimits, or else what the field's declaration says; it is never guessed. Scans
@@ -94,7 +94,7 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:
-    """The scans that have the channels, and why others have not."""
+    """Return the scans that have the channels, and why others have not."""
     elements = children(file.root, "data3D")
     scans: list[E57Scan] = []
     left_out: list[str] = []
@@ -108,7 +108,7 @@ def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], lis
 
 
 def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> E57Scan:
-    """What is to be read of a scan; _UnusableError if nothing is."""
+    """Return what is to be read of a scan; _UnusableError if nothing is."""
     points = child(element, "points")
     prototype = child(points, "prototype")
     if points is None or prototype is None or points.get("type") != "CompressedVector":
@@ -136,7 +136,7 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
 
 
 def _num_bits(path: Path, field: Element) -> int:
-    """The length of a field in a record, at least."""
+    """Return the length of a field in a record, at least."""
     type_ = field.get("type")
     if type_ == "Float":
         return 32 if field.get("precision") == "single" else 64
@@ -148,7 +148,7 @@ def _num_bits(path: Path, field: Element) -> int:
 
 
 def _color_range(path: Path, element: Element, field: Element) -> tuple[float, float]:
-    """The values of a channel that mean dark and full brightness."""
+    """Return the values of a channel that mean dark and full brightness."""
     name = field.tag.removeprefix(NAMESPACE)
     limits = child(element, "colorLimits")
     low, high = (number_of(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
@@ -198,7 +198,7 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
-    """The columns of a scan, a chunk at a time, in room that is used again."""
+    """Yield the columns of a scan, a chunk at a time, in room that is used again."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
     buffers = file.libe57.VectorSourceDestBuffer()
@@ -237,13 +237,13 @@ class E57Image(NamedTuple):
 
 
 def list_images(path: Path) -> list[E57Image]:
-    """The images of an E57 file, in its order."""
+    """Return the images of an E57 file, in its order."""
     with opened(path) as file:
         return list(_images(file))
 
 
 def read_image(path: Path, index: int) -> bytes:
-    """The JPEG or PNG file that is the image of that index in list_images."""
+    """Return the JPEG or PNG file that is the image of that index in list_images."""
     with opened(path) as file:
         image = list(_images(file))[index]
         number, representation, blob = image.node
@@ -255,7 +255,7 @@ def read_image(path: Path, index: int) -> bytes:
 
 
 def _images(file: E57File) -> Iterator[E57Image]:
-    """The representations of the elements of images2D that hold an image."""
+    """Yield the representations of the elements of images2D that hold an image."""
     elements = enumerate(children(file.root, "images2D"))
     for (number, element), (kind, representation_name) in product(elements, KINDS.items()):
         representation = child(element, representation_name)
@@ -289,7 +289,7 @@ def _side(path: Path, representation: Element, name: str) -> int:
 
 
 def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
-    """What a spherical image covers [deg], across and down, if the file says how large its pixels are."""
+    """Return what a spherical image covers [deg], across and down, if the file says how large its pixels are."""
     width, height = (number_of(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
     if width is None or height is None:
         return None

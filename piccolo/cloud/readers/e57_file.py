@@ -48,7 +48,7 @@ class E57File(NamedTuple):
 
 @contextmanager
 def opened(path: Path) -> Iterator[E57File]:
-    """An E57 file whose header and XML were checked, open to be read."""
+    """Yield an E57 file whose header and XML were checked, open to be read."""
     root = read_xml(path)
     libe57 = import_optional(path, "pye57.libe57")
     with refusing(path, libe57):
@@ -69,7 +69,7 @@ def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
 
 
 def read_xml(path: Path) -> Element:
-    """The root of a file's XML section."""
+    """Return the root of a file's XML section."""
     with path.open("rb") as file:
         head = file.read(HEADER.size)
         if len(head) < HEADER.size or not head.startswith(MAGIC):
@@ -135,29 +135,32 @@ def _parsed(path: Path, xml: bytes) -> Element:
 
 
 def child(element: Element | None, name: str) -> Element | None:
-    """The child of that name in E57's namespace, if there is one."""
+    """Return the child of that name in E57's namespace, if there is one."""
     return None if element is None else element.find(NAMESPACE + name)
 
 
 def children(element: Element, name: str) -> list[Element]:
-    """The children of the child of that name."""
+    """Return the children of the child of that name."""
     found = child(element, name)
     return [] if found is None else list(found)
 
 
 def text_of(element: Element | None, name: str) -> str:
-    """The text of a child, empty if there is none."""
+    """Return the text of a child, empty if there is none."""
     found = child(element, name)
     return "" if found is None else (found.text or "").strip()
 
 
 def number_of(path: Path, element: Element | None) -> float | None:
-    """The value of a number's element, None without one; an empty one is 0, a scaled integer is scaled."""
+    """Return the value of a number's element, None without one.
+
+    An empty one is 0, a scaled integer is scaled.
+    """
     return None if element is None else scaled(path, element, (element.text or "").strip() or "0")
 
 
 def scaled(path: Path, element: Element, text: str) -> float:
-    """The number that a text means in an element, which may be a scaled integer's."""
+    """Return the number that a text means in an element, which may be a scaled integer's."""
     value = parsed_number(path, text)
     if element.get("type") != "ScaledInteger":
         return value
@@ -166,7 +169,7 @@ def scaled(path: Path, element: Element, text: str) -> float:
 
 
 def parsed_number(path: Path, text: str) -> float:
-    """A finite number; InputError if the text is none."""
+    """Return a finite number; InputError if the text is none."""
     try:
         value = float(text)
     except ValueError:
@@ -177,14 +180,17 @@ def parsed_number(path: Path, text: str) -> float:
 
 
 def parsed_integer(path: Path, text: str) -> int:
-    """An integer of 64 bits or little more; InputError if the text is none."""
+    """Return an integer of 64 bits or little more; InputError if the text is none."""
     if not INTEGER.fullmatch(text):
         raise InputError(f"{path}: found {quoted(text.encode())} in the XML section, wanted an integer")
     return int(text)
 
 
 def pose_of(path: Path, element: Element) -> Pose | None:
-    """The pose of a scan or an image; None if it has none. A part that is missing is the identity's."""
+    """Return the pose of a scan or an image.
+
+    None if it has none. A part that is missing is the identity's.
+    """
     pose = child(element, "pose")
     if pose is None:
         return None

@@ -103,7 +103,7 @@ class LasHeader(NamedTuple):
 
 
 def read_header(path: Path) -> LasHeader:
-    """The header of a LAS or LAZ file; InputError if it is broken or promises too much."""
+    """Return the header of a LAS or LAZ file; InputError if it is broken or promises too much."""
     with path.open("rb") as file:
         head = file.read(MIN_HEADER_SIZE_1_4)
     if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
@@ -150,7 +150,7 @@ class LasLayout(NamedTuple):
 
 
 def read_laz_layout(header: LasHeader) -> LasLayout:
-    """The compression of a LAZ file; InputError if its parts don't fit together or in the file."""
+    """Return the compression of a LAZ file; InputError if its parts don't fit together or in the file."""
     lazrs = import_optional(header.path, "lazrs")
     with header.path.open("rb") as file:
         laszip = record_content(header, file, LASZIP_USER, LASZIP_RECORD_ID)
@@ -169,7 +169,7 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
 
 
 def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
-    """The content of the variable-length record of this user and id; None if there is none."""
+    """Return the content of the variable-length record of this user and id; None if there is none."""
     position = header.header_size
     for _ in range(min(header.num_vlrs, MAX_VLRS)):
         if position + VLR_HEADER.size > header.points_offset:
@@ -183,7 +183,7 @@ def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted
 
 
 def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
-    """The number of layers of a chunk, if the record is one that lazrs would write for these points."""
+    """Return number of layers of a chunk, if the record is one that lazrs would write for these points."""
     num_extra = header.record_size - RECORD_SIZES[header.point_format]
     expected = lazrs.LazVlr.new_for_compression(header.point_format, num_extra, False).record_data()
     if _without_versions(laszip[: len(expected)]) != _without_versions(expected):
@@ -193,13 +193,13 @@ def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
 
 
 def _without_versions(laszip: bytes) -> list[bytes]:
-    """The compressor, the number of items, and the type and size of each."""
+    """Return the compressor, the number of items, and the type and size of each."""
     items = [laszip[k : k + TYPE_AND_SIZE] for k in range(ITEMS_AT, len(laszip), ITEM_SIZE)]
     return [laszip[:2], laszip[ITEMS_AT - 2 : ITEMS_AT], *items]
 
 
 def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
-    """The start and bytes of the compressed chunk table, if the file has room for what it promises.
+    """Return the start and bytes of the compressed chunk table, if the file has room for what it promises.
 
     A writer that could not go back says in the file's last bytes where it begins.
     """
@@ -223,7 +223,7 @@ def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
 
 
 def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
-    """The chunks that hold the promised points, the last no more than is left."""
+    """Return the chunks that hold the promised points, the last no more than is left."""
     chunks: list[LazChunk] = []
     num_left = header.num_points
     most = MAX_CHUNK_SIZE // header.record_size
@@ -246,7 +246,7 @@ def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) 
 def decompress(
     header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]
 ) -> NDArray[np.uint8]:
-    """The records, one after the other, of the `chunks` whose compressed bytes are `data`."""
+    """Return the records, one after the other, of the `chunks` whose compressed bytes are `data`."""
     lazrs = import_optional(header.path, "lazrs")
     if layout.num_layers:
         _check_layers(header, layout.num_layers, data, chunks)
@@ -289,7 +289,7 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
 
 
 def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of a LAS or LAZ file; withheld ones are left out.
+    """Return the points of a LAS or LAZ file; withheld ones are left out.
 
     Colours are 16-bit, as the format says. They are taken for 8-bit if none of a million points, spread
     evenly over the file, exceeds 255; the source's warnings then say so, and a larger value met later is
@@ -316,7 +316,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 def _gray_source(
     header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
 ) -> PointSource:
-    """The points with their intensity for a gray, if that is wanted, of a file without colours."""
+    """Return the points with their intensity for a gray, if that is wanted, of a file without colours."""
     if not options.intensity_as_gray:
         why = f"red green blue are 0 in all {num_samples} points looked at"
         if not header.has_colors:
@@ -331,7 +331,7 @@ def _gray_source(
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:
-    """Records that are not compressed, in chunks of which NUM_SAMPLE_RUNS are a sample."""
+    """Return records that are not compressed, in chunks of which NUM_SAMPLE_RUNS are a sample."""
     most = max(1, min(CHUNK, MAX_SAMPLES // NUM_SAMPLE_RUNS, MAX_CHUNK_SIZE // header.record_size))
     counts = [most] * (header.num_points // most) + [header.num_points % most]
     chunks = tuple((count, count * header.record_size) for count in counts if count)
@@ -366,13 +366,13 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
 
 
 def _largest(header: LasHeader, layout: LasLayout, name: str) -> tuple[int, int]:
-    """The largest `rgb` or `intensity` in a sample of the points, and the number of those."""
+    """Return the largest `rgb` or `intensity` in a sample of the points, and the number of those."""
     found = [(int(records[name].max()), len(records)) for records in _chunks(header, layout, is_sample=True)]
     return max(largest for largest, _ in found), sum(count for _, count in found)
 
 
 def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[PointsWithScalar]:
-    """The points with their `intensity` or `class`."""
+    """Yield the points with their `intensity` or `class`."""
     bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
     for records in _chunks(header, layout):
         points_world, kept = _points(header, records)

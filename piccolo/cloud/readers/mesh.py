@@ -105,7 +105,7 @@ def weights_of(k: NDArray[np.int64]) -> Array:
 def _points(
     instance: SurfaceInstance, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
 ) -> RawCloud:
-    """The points k in the triangles `rows`; those on texels of alpha 0 are left out."""
+    """Return the points k in the triangles `rows`; those on texels of alpha 0 are left out."""
     surface = instance.surface
     weights = weights_of(k)
     matrix = instance.T_world_from_surface
@@ -133,7 +133,7 @@ def _blend(values: Array, corners: NDArray[np.int64], weights: Array) -> Array:
 
 
 def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
-    """The texels (N, 4) under uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
+    """Return texels (N, 4) under uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
     height, width = texels.shape[:2]
     turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
     turned -= np.floor(turned)
@@ -158,7 +158,7 @@ def _bytes(colors: Array) -> NDArray[np.uint8]:
 
 
 def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
+    """Return the points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
 
     The options' scale tells what a metre is in the file. A file that would give more than 30 million is
     sampled at a lower density, with a warning. Colours: from the texture, whose texels of alpha 0 leave their
@@ -172,7 +172,10 @@ def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points on the faces of a PLY file, as by open_mesh; with a texture if a comment names one."""
+    """Return the points on the faces of a PLY file, as by open_mesh.
+
+    With a texture if a comment names one.
+    """
     return _source(load_ply(path), options.scale)
 
 
@@ -207,7 +210,7 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
 
 
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
-    """The coloured surfaces where the scene puts them, and what the user should know."""
+    """Return the coloured surfaces where the scene puts them, and what the user should know."""
     scene = loaded.scene
     path = loaded.path
     meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
@@ -243,7 +246,7 @@ def _is_one_color(surfaces: list[Surface]) -> bool:
 
 
 def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
-    """The triangles of a mesh with its colours; None if it has none."""
+    """Return the triangles of a mesh with its colours; None if it has none."""
     vertices = np.array(mesh.vertices, dtype=np.float64)
     triangles = np.array(mesh.faces, dtype=np.int64)
     if not len(triangles):

@@ -61,7 +61,7 @@ class Texture(NamedTuple):
 
 
 def texture_of(path: Path, image: Any) -> Texture | None:
-    """The texture in an image that trimesh opened; None if it only stands for a missing one."""
+    """Return the texture in an image that trimesh opened; None if it only stands for a missing one."""
     file = getattr(image, "fp", None)
     if file is None:
         return None
@@ -89,7 +89,10 @@ def check_image(path: Path, name: str, content: bytes) -> None:
 
 @contextmanager
 def _image(path: Path, name: str, content: bytes) -> Iterator[Image.Image]:
-    """An image of a size that is allowed; InputError if it can't be opened, or decoded by who uses it."""
+    """Yield an image of a size that is allowed.
+
+    InputError if it can't be opened, or decoded by who uses it.
+    """
     with own_limit():
         try:
             with Image.open(BytesIO(content), formats=FORMATS) as image:
@@ -110,7 +113,7 @@ def _check(path: Path, image: Any) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """The kind of an error and the beginning of what it says."""
+    """Return the kind of an error and the beginning of what it says."""
     text = (str(error).splitlines() or [""])[0]
     return f"{type(error).__name__}: {text[:100]!a}" if text else type(error).__name__
 
@@ -132,7 +135,7 @@ class FolderResolver:
         return sum(map(len, self._contents.values()))
 
     def get(self, name: str) -> bytes:
-        """The content of a file, by the name that the mesh gives it."""
+        """Return the content of a file, by the name that the mesh gives it."""
         folder = self.path.parent.resolve()
         problem = ""
         try:
@@ -165,7 +168,10 @@ NO_MATERIAL = Material()  # of primitives without one, the first of all
 
 
 def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list[Material]]:
-    """A checked glTF or GLB file with triangles, base colours and nodes only; materials, by rows as named."""
+    """Return a checked glTF or GLB file with triangles, base colours and nodes only.
+
+    Materials, by rows as named.
+    """
     path = resolver.path
     is_glb = content.startswith(GLB_MAGIC)
     head, text, data = _glb_parts(path, content) if is_glb else (b"", content, b"")
@@ -260,7 +266,7 @@ def _check_nodes(path: Path, tree: Json) -> None:
 
 
 def _material(path: Path, material: Json) -> Material:
-    """The base colour of a material."""
+    """Return the base colour of a material."""
     base = material.get("pbrMetallicRoughness", {})
     texture = base.get("baseColorTexture")
     for name in UNREAD_EXTENSIONS & {*material.get("extensions", {}), *(texture or {}).get("extensions", {})}:
@@ -298,7 +304,7 @@ def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes
 
 
 def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:
-    """A primitive with its positions, colours and the base colour's uv."""
+    """Return a primitive with its positions, colours and the base colour's uv."""
     if primitive.get("mode") == FAN:
         raise InputError(f"{path}: has triangle fans, wanted triangles")
     row = _count(primitive["material"]) + 1 if "material" in primitive else 0
@@ -319,7 +325,7 @@ def _primitive(path: Path, accessors: list[Json], materials: list[Material], pri
 
 
 def _count(value: object) -> int:
-    """A number from JSON that must be whole and not negative."""
+    """Return a number from JSON that must be whole and not negative."""
     if not isinstance(value, int) or value < 0:
         raise ValueError(f"{str(value)[:40]} where a count or an index is wanted")
     return value

@@ -54,14 +54,14 @@ class Loaded:
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
 
     def texture(self, image: Any) -> Texture | None:
-        """The texture in an image, the same one for all surfaces that share it."""
+        """Return the texture in an image, the same one for all surfaces that share it."""
         if id(image) not in self.textures:
             self.textures[id(image)] = texture_of(self.path, image)
         return self.textures[id(image)]
 
 
 def load_gltf(path: Path, content: bytes) -> Loaded:
-    """A glTF or GLB file."""
+    """Return a glTF or GLB file."""
     resolver = FolderResolver(path)
     sanitized, materials = sanitize_gltf(content, resolver)
     kind = "glb" if content.startswith(GLB_MAGIC) else "gltf"
@@ -69,7 +69,7 @@ def load_gltf(path: Path, content: bytes) -> Loaded:
 
 
 def load_obj(path: Path, content: bytes) -> Loaded:
-    """An OBJ file with its materials."""
+    """Return an OBJ file with its materials."""
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -96,7 +96,7 @@ def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
-    """What a loader of trimesh gives, its colours moved to where no range is guessed and none is cut off."""
+    """Return what a loader of trimesh gives, its colours moved to where no range is guessed and none is cut off."""
     for mesh in (parsed, *parsed.get("geometry", {}).values()):
         if "faces" in mesh:
             mesh["process"] = False
@@ -128,7 +128,7 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
 
 
 def load_ply(path: Path) -> Loaded:
-    """A PLY file with faces."""
+    """Return a PLY file with faces."""
     content = path.read_bytes()
     resolver = FolderResolver(path)
     header = content.partition(b"end_header")[0].decode("utf-8", "replace")

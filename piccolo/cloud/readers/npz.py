@@ -71,7 +71,7 @@ class ArrayInFile(NamedTuple):
 
 
 def open_npy(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255."""
+    """Return the points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255."""
     array = _open_array(path, None, path.stat().st_size)
     if len(array.shape) != 2 or array.shape[1] != 6 or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
@@ -80,7 +80,7 @@ def open_npy(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
+    """Return the points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
     The range of colours follows from their type: uint8 0-255, uint16 0-65535, float 0-1. An archive whose
     arrays promise more than 200 times the size of the file, or 16 GB, is refused.
@@ -93,13 +93,13 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
-    """The points of chunks of positions and colours, as many as there are `rows`."""
+    """Return the points of chunks of positions and colours, as many as there are `rows`."""
     locate = partial(point_label, path)
     return PointSource(path, lambda: colored_chunks(read_parts(), brightest, locate), rows.shape[0])
 
 
 def has_npz_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` is an archive that begins with an array."""
+    """Return True if a file that begins with the bytes `head` is an archive that begins with an array."""
     name_size = int.from_bytes(head[ZIP_NAME_AT - 4 : ZIP_NAME_AT - 2], "little")
     return head.startswith(ZIP_MAGIC) and head[ZIP_NAME_AT : ZIP_NAME_AT + name_size].endswith(b".npy")
 
@@ -118,7 +118,7 @@ def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
 
 
 def _open(path: Path, member: str | None) -> IO[bytes]:
-    """A .npy file, or the member of that name of an archive."""
+    """Return a .npy file, or the member of that name of an archive."""
     if member is None:
         return path.open("rb")
     with zipfile.ZipFile(path) as archive:
@@ -126,7 +126,7 @@ def _open(path: Path, member: str | None) -> IO[bytes]:
 
 
 def _members(path: Path) -> list[zipfile.ZipInfo]:
-    """An archive's arrays of points and of colours."""
+    """Return an archive's arrays of points and of colours."""
     with damage_named(path), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     names = [name for names in (POINTS_NAMES, COLORS_NAMES) for name in names if name in members]
@@ -146,7 +146,7 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
 
 
 def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
-    """The array in a file or member of `size` bytes, by its header."""
+    """Return the array in a file or member of `size` bytes, by its header."""
     with damage_named(path), _open(path, member) as file:
         shape, is_fortran, dtype, offset = read_header(file.read(MAX_HEAD_SIZE))
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)

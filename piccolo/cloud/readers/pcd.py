@@ -92,7 +92,7 @@ class PcdHeader(NamedTuple):
 
 
 def read_header(path: Path) -> PcdHeader:
-    """The header of a PCD file; SIZE, TYPE and COUNT may be missing, as in old ones: 4, F and 1."""
+    """Return the header of a PCD file; SIZE, TYPE and COUNT may be missing, as in old ones: 4, F and 1."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     entries: dict[str, list[str]] = {}
@@ -155,7 +155,10 @@ def _count(text: str) -> int | None:
 
 
 def decompress_lzf(data: bytes, size: int) -> bytearray | None:
-    """The `size` bytes of compressed data; None if they are more or less, or are copied from nowhere."""
+    """Return the `size` bytes of compressed data.
+
+    None if they are more or less, or are copied from nowhere.
+    """
     out = bytearray()
     data = data + bytes(2)  # a last code that is cut off reads zeros, and makes too little or too much
     i = 0
@@ -181,7 +184,7 @@ def decompress_lzf(data: bytes, size: int) -> bytearray | None:
 
 
 def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of a PCD file.
+    """Return the points of a PCD file.
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
     in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
@@ -205,7 +208,7 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _wanted_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
-    """The fields x y z and the colour's one or three, or the intensity or label if the options say so."""
+    """Return fields x y z and the colour's one or three, or the intensity or label if the options say so."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
     if options.labels:
@@ -262,7 +265,7 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
 
 
 def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> Iterator[RawCloud]:
-    """The points with colours 0xAARRGGBB of a declared type, whose numbers ASCII has as text."""
+    """Yield the points with colours 0xAARRGGBB of a declared type, whose numbers ASCII has as text."""
     num_before = 0
     for columns in read_columns():
         points_world = points_of(columns)

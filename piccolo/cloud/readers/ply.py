@@ -60,7 +60,7 @@ class PlyHeader:
 
 
 def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The vertices of a PLY file, binary or ASCII; points on its faces if it has any.
+    """Return the vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
     out. The file's size is compared with the header's counts before memory is reserved.
@@ -79,7 +79,7 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _has_faces(header: PlyHeader) -> bool:
-    """True for a mesh; colours whose range trimesh would get wrong are refused."""
+    """Return True for a mesh; colours whose range trimesh would get wrong are refused."""
     found = dict(zip((element.name for element in header.elements), header.counts, strict=True))
     if not found.get("face"):
         return False
@@ -106,7 +106,7 @@ def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[Columns]:
 
 
 def read_header(path: Path) -> PlyHeader:
-    """The header of a PLY file; InputError if it is broken."""
+    """Return the header of a PLY file; InputError if it is broken."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     if not head.startswith(MAGIC):
@@ -145,7 +145,7 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
 
 
 def _property_names(header: PlyHeader, options: CloudSettings) -> tuple[str, ...]:
-    """The vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
+    """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
     found = [prop.name for prop in header.vertices.properties]
     colors = () if options.labels else color_names(found)
     scalars = [name for name in found if name.lower() in INTENSITY_NAMES]

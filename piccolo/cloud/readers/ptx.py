@@ -37,7 +37,7 @@ class PtxScan(NamedTuple):
 
 
 def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of all scans of a PTX file, in the world.
+    """Return the points of all scans of a PTX file, in the world.
 
     0 0 0 stands where no beam came back and is left out. A last scan with fewer lines than its header
     promises is read as far as it goes, with a warning; a line without end is then taken for cut off.
@@ -67,7 +67,7 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
-    """The z axes (3,) of the scanners in the world, unit; of those that have a place in it."""
+    """Yield the z axes (3,) of the scanners in the world, unit; of those that have a place in it."""
     for scan in scans:
         z = scan.T_world_from_scanner[:3, 2]
         length = float(np.linalg.norm(z))
@@ -76,7 +76,7 @@ def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
 
 
 def has_ptx_magic(head: bytes) -> bool:
-    """True if a file that begins with the bytes `head` counts columns and rows, then names a position."""
+    """Return True if a file that begins with the bytes `head` counts columns and rows, then names a position."""
     lines = [line.strip() for line in head.splitlines()[:3]]
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
@@ -103,7 +103,10 @@ def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
 
 
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
-    """The finite numbers of a header's line, one of them a count; None if the line has anything else."""
+    """Return the finite numbers of a header's line, one of them a count.
+
+    None if the line has anything else.
+    """
     fields = line.split()
     if num_wanted == 1 and not (line.isdigit() and len(line) <= MAX_COUNT_DIGITS):
         return None

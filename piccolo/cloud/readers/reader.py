@@ -81,13 +81,13 @@ class CloudFormat(NamedTuple):
 
 
 def quoted(line: bytes) -> str:
-    """The first line of `line`, short and printable, control characters as escapes."""
+    """Return the first line of `line`, short and printable, control characters as escapes."""
     text = line.splitlines()[0] if line else b""
     return ascii(text[:60].decode("latin-1")) + ("..." if len(text) > 60 else "")
 
 
 def point_label(path: Path, index: int) -> str:
-    """What messages call the point of that index in a file."""
+    """Return what messages call the point of that index in a file."""
     return f"{path}: point {index + 1}"
 
 
@@ -97,7 +97,7 @@ def color_names(names: Collection[str]) -> tuple[str, ...]:
 
 
 def brightest_of(path: Path, types: Sequence[str]) -> float:
-    """The value of full brightness in colours of these types, as "u1"."""
+    """Return the value of full brightness in colours of these types, as "u1"."""
     if len(set(types)) > 1 or types[0] not in BRIGHTEST:
         raise InputError(f"{path}: the colours are of type {' '.join(types)}, wanted {TYPES_WANTED}")
     return BRIGHTEST[types[0]]
@@ -142,7 +142,7 @@ def read_records(path: Path, offset: int, count: int, dtype: np.dtype[Any]) -> I
 
 
 def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[Any]) -> NDArray[Any]:
-    """The next `count` records of a file; InputError if there are fewer."""
+    """Return the next `count` records of a file; InputError if there are fewer."""
     records = np.empty(count, dtype)
     if file.readinto(records.view(np.uint8).data) < records.nbytes:
         raise InputError(f"{path}: {CUT}")
@@ -232,7 +232,7 @@ def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
 
 
 def _lower_edge(index: int) -> float:
-    """The value nearest to 0 in a bin."""
+    """Return the value nearest to 0 in a bin."""
     bits = (index << 16) ^ (1 << 31) if index >= NUM_BINS // 2 else ~(index << 16 | 0xFFFF) & 0xFFFFFFFF
     return float(np.array(bits, np.uint32).view(np.float32))
 

@@ -85,14 +85,14 @@ class NumberLines:
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
 
     def peek(self) -> bytes | None:
-        """The next line, which stays the next; None at the end."""
+        """Return the next line, which stays the next; None at the end."""
         line = next(self._lines, None)
         if line is not None:
             self._lines = chain([line], self._lines)
         return line
 
     def take_line(self) -> bytes | None:
-        """The next line; None at the end."""
+        """Return the next line; None at the end."""
         line = next(self._lines, None)
         self.num_taken += line is not None
         return line
@@ -104,7 +104,7 @@ class NumberLines:
         return num_skipped
 
     def _take_rows(self, count: int) -> NDArray[np.float64]:
-        """The wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
+        """Return the wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
         columns = list(self.layout.columns)
         num_columns = self.layout.num_columns
         most = max(1, raw.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
@@ -152,13 +152,16 @@ class NumberLines:
         return ((chunk.points_world, chunk.colors) for chunk in chunks)
 
     def locate(self, index: int) -> str:
-        """The file and the number in it of the line that comes after `index` others."""
+        """Return the file and the number in it of the line that comes after `index` others."""
         for number, _ in islice(self._numbered(), index, None):
             return f"{self.path}: line {number}"
         raise InputError(f"{self.path}: {CUT}")
 
     def _numbered(self) -> Iterator[tuple[int, bytes]]:
-        """Number in the file and text of all lines of numbers, from the first on; the file is read again."""
+        """Yield number in the file and text of all lines of numbers, from the first on.
+
+        The file is read again.
+        """
         with self.path.open("rb") as file:
             number = len((file.read(self.layout.start) + b".").splitlines()) - 1
         for lines in line_blocks(self.path, self.layout.start):
@@ -188,7 +191,7 @@ class NumberLines:
 
 
 def _kept(lines: list[bytes], has_counts: bool) -> list[bytes]:
-    """The lines of numbers among all, without blanks at their ends."""
+    """Return the lines of numbers among all, without blanks at their ends."""
     return [
         line
         for line in filter(None, map(bytes.strip, lines))
@@ -197,7 +200,7 @@ def _kept(lines: list[bytes], has_counts: bool) -> list[bytes]:
 
 
 def is_number(field: str) -> bool:
-    """True if np.loadtxt takes a field for a number."""
+    """Return True if np.loadtxt takes a field for a number."""
     try:
         float(field)
     except ValueError:
@@ -206,7 +209,7 @@ def is_number(field: str) -> bool:
 
 
 def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: str) -> PointSource:
-    """The points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
+    """Return points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
 
     def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
         return NumberLines(path, layout, wanted).read_points()
@@ -218,7 +221,7 @@ def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: 
 
 
 def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
+    """Return the points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
     A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or x y z and an
     intensity, or refused if it names a line's columns, x y z among them, but neither. Without one the first
@@ -264,19 +267,19 @@ def _delimiter(line: str) -> str | None:
 
 
 def _begins_numbers(line: bytes, fields: list[str]) -> bool:
-    """False for blank lines, comments, a header, and the count of points that .pts and CloudCompare write."""
+    """Return False for blank lines, comments, a header, and the count of points that .pts and CloudCompare write."""
     is_count = len(fields) == 1 and line.isdigit()
     return not line.startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields))
 
 
 def _names(header: str) -> list[str]:
-    """The names of columns in a header line, in lower case."""
+    """Return the names of columns in a header line, in lower case."""
     names = header.lstrip("#/ ")
     return [name.strip(' "').lower() for name in names.split(_delimiter(names))]
 
 
 def _named_columns(header: str) -> tuple[int, ...]:
-    """The fields of x, y, z and r, g, b, or of x, y, z and intensity, if a header line names them."""
+    """Return the fields of x, y, z and r, g, b, or of x, y, z and intensity, if a header line names them."""
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
     more = color_names(once) or tuple(name for name in once if name in INTENSITY_NAMES)[:1]
@@ -288,7 +291,7 @@ TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_t
 
 
 def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """The points of all scans of a PTS file.
+    """Return the points of all scans of a PTS file.
 
     All lines must have as many columns as the first one: x y z r g b if there are
     six, x y z intensity r g b and what else there is if there are more. The intensity may have any range. A

@@ -16,14 +16,17 @@ class Dataset(NamedTuple):
     find: Callable[[ConvertOptions], SceneList]
 
     def list_scenes(self, options: ConvertOptions) -> SceneList:
-        """The scenes in a folder; InputError if there are none. None is read from files outside of it."""
+        """Return the scenes in a folder.
+
+        InputError if there are none. None is read from files outside of it.
+        """
         found = self.find(options)
         specs = (spec._replace(panoramas=_inside(options, spec)) for spec in found.specs)
         return found._replace(specs=tuple(specs))
 
 
 def _inside(options: ConvertOptions, spec: SceneSpec) -> Iterator[PosedPanorama]:
-    """The panoramas of a scene; InputError if its cloud or one of their files lies outside."""
+    """Yield the panoramas of a scene; InputError if its cloud or one of their files lies outside."""
     for part in spec.cloud:
         options.inside(part.path)
     for panorama in spec.panoramas:

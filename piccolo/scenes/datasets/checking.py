@@ -74,7 +74,9 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress
 
 
 def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
-    """The pose under each convention that may have been mixed up, by its name; positions are less `origin`.
+    """Return the pose under each convention that may have been mixed up, by its name.
+
+    Positions are less `origin`.
 
     The camera's axes in any order and sign; and the rotation, or the whole transform, of a camera with known
     axes inverted.
@@ -97,10 +99,10 @@ def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
 
 
 def axis_rotations() -> Array:
-    """The 24 rotations (24, 3, 3) that take axes to axes, one of them the identity."""
+    """Return the 24 rotations (24, 3, 3) that take axes to axes, one of them the identity."""
     return np.asarray(np.round(Rotation.create_group("O").as_matrix()))
 
 
 def describe_axes(turn: Array) -> str:
-    """A rotation of axis_rotations in words: the given axis, with its sign, in each row."""
+    """Return a rotation of axis_rotations in words: the given axis, with its sign, in each row."""
     return ", ".join(f"{'-' if row.sum() < 0 else ''}{'xyz'[int(np.abs(row).argmax())]}" for row in turn)

@@ -23,12 +23,12 @@ DIRECTIONS = (WORLD_FROM_CAM, CAM_FROM_WORLD)
 
 
 def is_cloud(path: Path) -> bool:
-    """True for a file whose name ends as that of a cloud format."""
+    """Return True for a file whose name ends as that of a cloud format."""
     return path.suffix.lower() in SUFFIXES and path.is_file()
 
 
 def only_cloud_in(folder: Path) -> Path | None:
-    """The one cloud in a folder, None if there is none. InputError if there are several."""
+    """Return the one cloud in a folder, None if there is none. InputError if there are several."""
     named = sorted(path for path in folder.glob("cloud.*") if is_cloud(path))
     found = named or sorted(path for path in folder.iterdir() if is_cloud(path) and path.suffix != ".txt")
     if len(found) > 1:
@@ -38,7 +38,7 @@ def only_cloud_in(folder: Path) -> Path | None:
 
 
 def read_matrix(path: Path, num_rows: int) -> Array:
-    """The matrix (num_rows, 4) that is all of a text file."""
+    """Return the matrix (num_rows, 4) that is all of a text file."""
     wanted = f"wanted {num_rows} x 4 numbers"
     words = read_text(path, wanted, max_size=1 << 16).split()
     try:
@@ -51,7 +51,7 @@ def read_matrix(path: Path, num_rows: int) -> Array:
 
 
 def checked_pose(where: str, R_other_from_world: Array, center_world: Array, axes: str) -> Pose:
-    """The pose of a camera with axes by name; `where` names the file for refusals."""
+    """Return the pose of a camera with axes by name; `where` names the file for refusals."""
     check_transform(where, R_other_from_world, center_world)
     return Pose(AXES[axes].T @ orthonormal(R_other_from_world), center_world)
 
@@ -64,7 +64,7 @@ def check_transform(where: str, R: Array, t: Array) -> None:
 
 
 def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
-    """The pose in a matrix (3 or 4, 4) [R | t] that takes camera coordinates to the world's, or back."""
+    """Return pose in a matrix (3 or 4, 4) [R | t] that takes camera coordinates to the world's, or back."""
     R = T[:3, :3]
     t = T[:3, 3]
     check_transform(where, R, t)
@@ -74,7 +74,10 @@ def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
 
 
 def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
-    """The labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B into a table; 0 beyond."""
+    """Return the labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B into a table.
+
+    0 beyond.
+    """
     rgb = read_picture(path).rgb.astype(np.uint32)
     index = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
     return np.asarray(np.append(table, np.uint16(0))[np.minimum(index, len(table))], dtype=np.uint16)

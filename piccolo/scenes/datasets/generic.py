@@ -27,7 +27,7 @@ Entry = tuple[Path | None, PosedPanorama]  # a row of the list: its cloud, None 
 
 
 def list_scenes(options: ConvertOptions) -> SceneList:
-    """The rooms that the list names, or one by the folder's name."""
+    """Return the rooms that the list names, or one by the folder's name."""
     found = [path for name in LISTS if (path := options.folder / name).exists()]
     if not options.poses and len(found) != 1:
         wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
@@ -46,7 +46,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
 
 
 def _rows(path: Path, options: ConvertOptions, notes: list[str]) -> Iterator[Row]:
-    """The rows as text by column; a blank field is as good as none."""
+    """Return the rows as text by column; a blank field is as good as none."""
     if path.suffix.lower() == ".json":
         document = read_json(path, WANTED)
         if not isinstance(document, list) or not all(isinstance(row, dict) for row in document):
@@ -72,7 +72,7 @@ def _table(path: Path) -> list[dict[str, str]]:
 
 
 def _renamed(row: dict[str, str]) -> dict[str, str]:
-    """A row of tools/export_poses.py as one of a list, its rotation inverted to go with the position."""
+    """Return row of tools/export_poses.py as one of a list, its rotation inverted to go with the position."""
     inverse = {f"q{letter}": row[f"quaternion_{letter}"] for letter in "wxyz"}
     w = inverse["qw"]
     inverse["qw"] = w[1:] if w.startswith("-") else f"-{w}"
@@ -82,7 +82,7 @@ def _renamed(row: dict[str, str]) -> dict[str, str]:
 
 
 def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[dict[str, str]]:
-    """The lines of a TUM trajectory that have a picture named by their time."""
+    """Return the lines of a TUM trajectory that have a picture named by their time."""
     folder = options.images or options.folder / "images"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, wanted pictures named by the times in {path.name}")
@@ -104,7 +104,7 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
 
 
 def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[str, Entry]:
-    """A row's room, and the row itself."""
+    """Return a row's room, and the row itself."""
     if missing := [name for name in ("image", *NUMBERS) if name not in row]:
         raise InputError(f"{where}: found no {missing[0]}, {WANTED}")
     image = options.inside(path.parent / row["image"], where)
@@ -117,7 +117,7 @@ def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[s
 
 
 def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
-    """The pose in a row, its direction and axes by the row or by the options, and never by guessing."""
+    """Return pose in a row, its direction and axes by the row or by the options, and never by guessing."""
     axes = row.get("axes", options.axes)
     direction = row.get("direction", options.direction)
     for name, value, known in (("axes", axes, AXES), ("direction", direction, DIRECTIONS)):

@@ -38,7 +38,7 @@ class ConvertOptions:
         return [os.path.realpath(path) for path in named if path]
 
     def inside(self, path: Path, where: str = "") -> Path:
-        """A file of the dataset, which is refused if it lies elsewhere, by a link or by "..".
+        """Return a file of the dataset, which is refused if it lies elsewhere, by a link or by "..".
 
         Where a list names it, `where` is the place in the list.
         """
@@ -81,7 +81,7 @@ class RigidTransform(NamedTuple):
         return rotate_points(points, self.R_written_from_dataset) + self.shift
 
     def of_pose(self, pose: Pose) -> Pose:
-        """A camera transformed with the points."""
+        """Return a camera transformed with the points."""
         center_world = self.R_written_from_dataset @ pose.center_world + self.shift
         return Pose(pose.R_cam_from_world @ self.R_written_from_dataset.T, center_world)
 
@@ -110,7 +110,10 @@ class SceneList(NamedTuple):
 
 
 def scene_list(folder: Path, specs: Sequence[SceneSpec], missing: Sequence[str], layout: str) -> SceneList:
-    """The scenes found in a folder, and a note on those that miss a cloud; InputError if none is found."""
+    """Return the scenes found in a folder, and a note on those that miss a cloud.
+
+    InputError if none is found.
+    """
     if not specs:
         raise InputError(f"{folder}: found no {layout}, wanted the layout in docs/DATASETS.md")
     notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()

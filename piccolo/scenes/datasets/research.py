@@ -38,7 +38,7 @@ MPO = "mpo"
 
 
 def list_360loc(options: ConvertOptions) -> SceneList:
-    """The scenes that have 360-degree queries, and a cloud that the user put there."""
+    """Return the scenes that have 360-degree queries, and a cloud that the user put there."""
     below = (options.folder, *sorted(options.folder.glob("*")))
     specs = []
     missing = []
@@ -54,7 +54,7 @@ def list_360loc(options: ConvertOptions) -> SceneList:
 
 
 def _360loc_panoramas(options: ConvertOptions, folder: Path) -> Iterator[PosedPanorama]:
-    """The panoramas of all sequences: camera-to-world matrices, axes as of COLMAP."""
+    """Yield the panoramas of all sequences: camera-to-world matrices, axes as of COLMAP."""
     for path in map(options.inside, sorted((folder / QUERIES).glob(f"*/{CAMERA_POSES}"))):
         document = read_json(path, WANTED)
         if not isinstance(document, dict):
@@ -74,7 +74,7 @@ def _360loc_panoramas(options: ConvertOptions, folder: Path) -> Iterator[PosedPa
 
 
 def list_matterport(options: ConvertOptions) -> SceneList:
-    """The houses with skyboxes, six faces of a cube at each place, poses and a mesh."""
+    """Return the houses with skyboxes, six faces of a cube at each place, poses and a mesh."""
     patterns = ["*/" * depth + SKYBOXES for depth in range(MAX_DEPTH)]
     specs = []
     notes = []
@@ -106,7 +106,7 @@ def list_matterport(options: ConvertOptions) -> SceneList:
 def _matterport_panoramas(
     options: ConvertOptions, folder: Path, places: dict[str, dict[str, Path]]
 ) -> Iterator[PosedPanorama]:
-    """The skyboxes: turned as the level camera at one of its stops, in the middle of all of them.
+    """Yield the skyboxes: turned as the level camera at one of its stops, in the middle of all of them.
 
     The camera's axes are right, down, forward; skybox 1 is what our cubes have in front.
     """
@@ -120,7 +120,7 @@ def _matterport_panoramas(
 
 
 def list_omniscenes(options: ConvertOptions) -> SceneList:
-    """The rooms, each with the panoramas of all splits."""
+    """Return the rooms, each with the panoramas of all splits."""
     pictures: dict[tuple[str, Path], list[Path]] = defaultdict(list)
     for split in [path for pattern in PANORAMAS for path in sorted(options.folder.glob(pattern))]:
         for sequence in sorted(split.iterdir()):

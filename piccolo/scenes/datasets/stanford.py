@@ -55,7 +55,7 @@ class Picture(NamedTuple):
 
 
 def list_scenes(options: ConvertOptions) -> SceneList:
-    """The rooms for which there are panoramas and a cloud."""
+    """Return the rooms for which there are panoramas and a cloud."""
     table = _read_table(options) if options.labels else None
     specs = []
     missing = []
@@ -76,7 +76,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
 
 
 def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
-    """The panoramas by area and room; 5a and 5b are both of area 5."""
+    """Return the panoramas by area and room; 5a and 5b are both of area 5."""
     pictures: dict[tuple[str, str], list[Picture]] = defaultdict(list)
     for rgb in _globbed(folder, PANORAMAS):
         is_original = rgb.name == "rgb"
@@ -100,7 +100,10 @@ def _globbed(folder: Path, patterns: Iterable[str]) -> list[Path]:
 
 
 def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[CloudPart, ...]:
-    """The room's points, one `x y z r g b` a line; with labels the same, an object a file named by class."""
+    """Return the room's points, one `x y z r g b` a line.
+
+    With labels the same, an object a file named by class.
+    """
     found = _globbed(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
     if found and not usable:
@@ -125,7 +128,7 @@ def _panoramas(
 
 
 def _read_pose(picture: Picture) -> Pose:
-    """The pose in a JSON file: Blender's Euler angles of a camera that looks along -z, y up.
+    """Return the pose in a JSON file: Blender's Euler angles of a camera that looks along -z, y up.
 
     R_world_from_opengl = R_z(c) R_y(b) R_x(a) with final_camera_rotation = (a, b, c) [rad].
     """
@@ -148,7 +151,7 @@ def _three(path: Path, document: Any, name: str) -> Array:
 
 
 def _read_table(options: ConvertOptions) -> NDArray[np.uint16]:
-    """The class of each index in the semantic pictures."""
+    """Return the class of each index in the semantic pictures."""
     found = _globbed(options.folder, LABEL_FILES)
     if not found:
         raise InputError(

@@ -18,7 +18,7 @@ SHOWN_ANGLES_DEG = (1.0, 5.0, 10.0)  # at which recall over distance is drawn
 
 
 def figure_png(figure: Figure) -> bytes:
-    """A figure as a PNG file."""
+    """Return a figure as a PNG file."""
     file = BytesIO()
     figure.savefig(file, format="png", dpi=120)
     return file.getvalue()
@@ -57,7 +57,7 @@ def errors_figure(runs: Mapping[str, Sequence[QueryResult]], thresholds: Thresho
 
 
 def risk_figure(points: Sequence[Point]) -> Figure:
-    """The fraction that is wrong over the fraction that is accepted."""
+    """Return the fraction that is wrong over the fraction that is accepted."""
     figure = new_figure(figsize=(6, 4), layout="constrained")
     axes = figure.add_subplot()
     coverage = [100 * p.coverage for p in points]

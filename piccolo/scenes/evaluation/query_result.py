@@ -68,7 +68,7 @@ class QueryResult:
         return sum(seconds for stage, seconds in self.result.seconds.items() if stage != "read")
 
     def is_correct(self, thresholds: Thresholds = PAPER_THRESHOLDS) -> bool:
-        """True if both errors are below the thresholds."""
+        """Return True if both errors are below the thresholds."""
         return self.position_error < thresholds.max_distance and self.rotation_error < thresholds.max_angle
 
     def to_json(self) -> str:
@@ -94,14 +94,14 @@ class QueryResult:
 
 
 def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
-    """A query's result with its errors."""
+    """Return a query's result with its errors."""
     pose = result.best_pose if query.is_answerable else None
     errors = (np.inf, np.inf) if pose is None else pose_errors(pose, query.pose)
     return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
 
 
 def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
-    """True if a pose's position lies in the bounding box of a localizer's cloud (the paper's protocol)."""
+    """Return True if a pose's position lies in the bounding box of a localizer's cloud (the paper's protocol)."""
     points = scan.points
     center: Array = scan.from_world(pose).center_world
     axes = zip(center, (points.x, points.y, points.z), strict=True)
@@ -109,7 +109,7 @@ def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
 
 
 def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tuple[Scene, Query]]:
-    """The queries that a frame of a video may be: of the walk of its name, at its time."""
+    """Return the queries that a frame of a video may be: of the walk of its name, at its time."""
     found = VIDEO_FRAME.fullmatch(pano)
     if found is None:
         return []
@@ -175,7 +175,7 @@ def check_run(
 
 
 def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:
-    """True if a result's errors are those of its pose against this query's true pose."""
+    """Return True if a result's errors are those of its pose against this query's true pose."""
     again = query_result_of(scene, query, row.result, row.is_in_box)
     pairs = (row.position_error, again.position_error), (row.rotation_error, again.rotation_error)
     return all(a == b or abs(a - b) < MAX_DIFFERENCE for a, b in pairs)

@@ -37,13 +37,13 @@ class Summary(NamedTuple):
 
 
 def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
-    """The 25th, 50th and 75th percentiles (3,) of values, some of which may be infinite."""
+    """Return the 25th, 50th and 75th percentiles (3,) of values, some of which may be infinite."""
     found = np.quantile(np.minimum(values, HUGE), [0.25, 0.5, 0.75])
     return np.where(found > 1e-6 * HUGE, np.inf, found)
 
 
 def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Summary:
-    """The statistics of one or more queries."""
+    """Return the statistics of one or more queries."""
     is_correct = [row.is_correct(thresholds) for row in rows]
     is_localized = [row.result.status == LOCALIZED for row in rows]
     return Summary(
@@ -67,7 +67,7 @@ class Point(NamedTuple):
 
 
 def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> list[Point]:
-    """The curve of risk over coverage, a point for each distinct confidence, from the highest down."""
+    """Return the curve of risk over coverage, a point for each distinct confidence, from the highest down."""
     points: dict[float, Point] = {}
     num_wrong = 0
     for k, row in enumerate(sorted(rows, key=lambda row: -row.result.confidence), 1):
@@ -113,7 +113,7 @@ def per_query(rows: Sequence[QueryResult]) -> Table:
 
 
 def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]]]:
-    """The queries of each variant, of each scene, and all; a grouping of one group is left out."""
+    """Yield the queries of each variant, of each scene, and all; a grouping of one group is left out."""
     for kind in ("variant", "scene"):
         names = sorted({getattr(row, kind) for row in rows})
         if len(names) > 1:
@@ -149,7 +149,7 @@ def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Tabl
 
 
 def risk_table(points: Sequence[Point]) -> Table:
-    """The fraction accepted, and wrong of these, at a few minimum confidences."""
+    """Return the fraction accepted, and wrong of these, at a few minimum confidences."""
     cells = []
     for line in CONFIDENCES:
         if inside := [point for point in points if point.confidence >= line]:
@@ -175,14 +175,14 @@ def csv_text(rows: Sequence[QueryResult]) -> str:
 
 
 def pair_up(first: Sequence[QueryResult], second: Sequence[QueryResult]) -> list[Pair]:
-    """The queries that both runs have, in the order of their names."""
+    """Return the queries that both runs have, in the order of their names."""
     others = {row.key: row for row in second}
     pairs = [(row, others[row.key]) for row in first if row.key in others]
     return sorted(pairs, key=lambda pair: pair[0].key)
 
 
 def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thresholds) -> Table:
-    """The statistics of two runs over the queries that both have."""
+    """Return the statistics of two runs over the queries that both have."""
     columns = "run", "queries", "correct", "accuracy", "localized", "wrong of these"
     rows = []
     for k, name in enumerate(names):
@@ -194,7 +194,7 @@ def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thre
 
 
 def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:
-    """The queries that one run alone gets right, or whose statuses differ."""
+    """Return the queries that one run alone gets right, or whose statuses differ."""
     rows = []
     for first, second in pairs:
         was = first.is_correct(thresholds)

@@ -54,12 +54,12 @@ class WalkSummary(NamedTuple):
 
 
 def root_mean(squares: Array) -> float:
-    """The root of the mean (N,); NaN of nothing."""
+    """Return the root of the mean (N,); NaN of nothing."""
     return float(np.sqrt(squares.mean())) if len(squares) else np.nan
 
 
 def walks_of(scenes: Iterable[Scene], rows: Iterable[QueryResult]) -> dict[tuple[str, str], list[Frame]]:
-    """The frames that have a result, by scene and walk, each walk's in the order of time."""
+    """Return the frames that have a result, by scene and walk, each walk's in the order of time."""
     by_key = {row.key: row for row in rows}
     walks: dict[tuple[str, str], list[Frame]] = {}
     for scene in scenes:
@@ -76,14 +76,14 @@ def _time(frame: Frame) -> float:
 
 
 def step_errors(true: tuple[Pose, Pose], found: tuple[Pose, Pose]) -> tuple[float, float]:
-    """The error [m], [rad] of a motion, evo's: inv(inv(Q_0) Q_1) inv(P_0) P_1 of T_world_from_cam."""
+    """Return the error [m], [rad] of a motion, evo's: inv(inv(Q_0) Q_1) inv(P_0) P_1 of T_world_from_cam."""
     true_motion, motion = (np.linalg.solve(*map(T_world_from_cam, poses)) for poses in (true, found))
     error = np.linalg.solve(true_motion, motion)
     return float(np.linalg.norm(error[:3, 3])), angle_between(error[:3, :3], np.eye(3))
 
 
 def summarize_walk(frames: Sequence[Frame], thresholds: Thresholds = PAPER_THRESHOLDS) -> WalkSummary:
-    """The statistics of one walk, its frames (at least one) in the order of time."""
+    """Return the statistics of one walk, its frames (at least one) in the order of time."""
     good = [frame for frame in frames if frame.query.is_answerable]
     bad = [frame for frame in frames if not frame.query.is_answerable]
     errors = [pose_errors(f.pose, f.query.pose) if f.pose else (np.inf, np.inf) for f in good]
@@ -104,7 +104,7 @@ def summarize_walk(frames: Sequence[Frame], thresholds: Thresholds = PAPER_THRES
 
 
 def summarize_all(summaries: Sequence[WalkSummary]) -> WalkSummary:
-    """The statistics of all frames of several walks, and the latest of their first sure frames."""
+    """Return the statistics of all frames of several walks, and the latest of their first sure frames."""
     names = WalkSummary._fields[:6]
     counts: dict[str, Any] = {name: sum(getattr(summary, name) for summary in summaries) for name in names}
     squared = np.concatenate([summary.squared_errors for summary in summaries])
@@ -116,7 +116,7 @@ def summarize_all(summaries: Sequence[WalkSummary]) -> WalkSummary:
 
 
 def walk_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Thresholds) -> Table:
-    """A line a walk, and one of all."""
+    """Return a line a walk, and one of all."""
     summaries = {" ".join(name): summarize_walk(frames, thresholds) for name, frames in walks.items()}
     if len(summaries) > 1:
         summaries[ALL] = summarize_all(list(summaries.values()))

@@ -43,12 +43,12 @@ GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
 
 
 def numbers(values: Iterable[float], separator: str = " ") -> str:
-    """The shortest text of each number that reads back as the same float64."""
+    """Return the shortest text of each number that reads back as the same float64."""
     return separator.join(repr(float(value)) for value in values)
 
 
 def offset_comment(options: Options) -> list[str]:
-    """A comment line that gives the offset; none without."""
+    """Return a comment line that gives the offset; none without."""
     if options.offset is None:
         return []
     return [f"# world position = position here + {numbers(options.offset)}"]
@@ -60,7 +60,7 @@ def write_lines(out: Path, lines: Sequence[str]) -> None:
 
 
 def offset_file(out: Path) -> Path:
-    """The file of the offset beside one that has no place for it."""
+    """Return the file of the offset beside one that has no place for it."""
     return out.with_name(f"{out.name}.offset.txt")
 
 
@@ -102,7 +102,7 @@ def write_tum(images: Sequence[PosedImage], out: Path, options: Options) -> None
 
 
 def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
-    """A comment and the rows of poses, each with the text of its time; `axes` as in CAMERA_AXES."""
+    """Return a comment and the rows of poses, each with the text of its time; `axes` as in CAMERA_AXES."""
     lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {axes}"]
     for time, pose in poses:
         T = T_world_from_cam(turned(pose, CAMERA_AXES[axes]))
@@ -189,7 +189,7 @@ def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) 
 
 
 def _intrinsics(size: tuple[int, int]) -> dict[str, float]:
-    """The sphere as a focal length: x - cx reaches +-fl_x at the seam, y - cy +-fl_y / 2 at the poles."""
+    """Return sphere as a focal length: x - cx reaches +-fl_x at the seam, y - cy +-fl_y / 2 at the poles."""
     w, h = size
     return {"w": w, "h": h, "fl_x": w / 2, "fl_y": float(h), "cx": w / 2, "cy": h / 2}
 
@@ -251,7 +251,7 @@ def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None
 
 
 def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tuple[Any, Any, str]:
-    """The ellipsoid, what turns positions into longitude and latitude, and the system's name."""
+    """Return the ellipsoid, what turns positions into longitude and latitude, and the system's name."""
     pyproj = import_optional(what, "pyproj", "tools")
     crs = str(options.crs)
     try:
@@ -282,7 +282,10 @@ def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> 
 
 
 def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
-    """True if a place [deg], (x, y) [m] in the system, is in its area with a margin; some cross 180 E."""
+    """Return True if a place [deg], (x, y) [m] in the system, is in its area with a margin.
+
+    Some cross 180 E.
+    """
     margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
     width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
     is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin
@@ -290,7 +293,7 @@ def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> 
 
 
 def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
-    """The point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    """Return the point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
     result = image.result
     x, y, z = image.pose.center_world.tolist()
     heading, pitch, roll = heading_pitch_roll_deg(image.pose)

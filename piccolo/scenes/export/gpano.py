@@ -63,12 +63,12 @@ def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
 
 
 def _copy(image: PosedImage) -> bytes:
-    """The picture's file with its pose."""
+    """Return the picture's file with its pose."""
     return with_pose(image.path, read_bytes(image.path, WANTED), heading_pitch_roll_deg(image.pose))
 
 
 def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -> bytes:
-    """The JPEG `data` with heading, pitch and roll in its XMP packet; other segments keep their bytes.
+    """Return the JPEG `data` with heading, pitch and roll in its XMP packet; other segments keep their bytes.
 
     Fields of the pose that were there are replaced. Without a packet one is put behind JFIF's and EXIF's.
     """
@@ -99,7 +99,7 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
 
 
 def jpeg_segments(data: bytes) -> Iterator[Segment]:
-    """The segments of a JPEG up to the header of its first scan; fewer if it is damaged."""
+    """Yield the segments of a JPEG up to the header of its first scan; fewer if it is damaged."""
     begin = len(JPEG_MAGIC)
     while found := MARKER.match(data, begin):
         begin = found.end() - 1  # a marker may be filled up with FF
@@ -123,7 +123,7 @@ def _segment(path: Path, packet: bytes) -> bytes:
 
 
 def without_pose(packet: bytes) -> bytes:
-    """The packet without the fields of a pose, as attributes or as elements."""
+    """Return the packet without the fields of a pose, as attributes or as elements."""
     for prefix in dict.fromkeys(PREFIX.findall(packet)):
         for name in POSE_NAMES:
             field = re.escape(prefix) + b":" + name.encode()
@@ -135,7 +135,7 @@ def without_pose(packet: bytes) -> bytes:
 def _with_fields(
     path: Path, packet: bytes, angles_deg: tuple[float, float, float], size: tuple[int, int]
 ) -> bytes:
-    """The packet with a description more, of the pose and of what a viewer needs and is not there yet.
+    """Return the packet with a description more, of the pose and of what a viewer needs and is not there yet.
 
     A packet without an end of its RDF is damaged and gives way to a new one.
     """

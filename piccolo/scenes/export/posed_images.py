@@ -89,7 +89,7 @@ class Selection(NamedTuple):
 
 
 def true_results(scene: Scene) -> list[Result]:
-    """The true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
+    """Return true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
     cloud = str(scene.cloud)
     return [
         Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose, None, None, (), None, {}, {})
@@ -98,7 +98,10 @@ def true_results(scene: Scene) -> list[Result]:
 
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
-    """The results with a pose that are localized, or all with a pose; those of `clouds` only, if given."""
+    """Return the results with a pose that are localized, or all with a pose.
+
+    Those of `clouds` only, if given.
+    """
     known = {result.cloud_name for result in results}
     if missing := [cloud for cloud in clouds if cloud not in known]:
         wanted = ", ".join(sorted(known))
@@ -147,7 +150,7 @@ def posed_images(
 
 
 def _images_of(result: Result, index: int, form: Format, options: Options) -> list[PosedImage]:
-    """The pictures of a result, each as the format can hold it; InputError if it can't hold one."""
+    """Return the pictures of a result, each as the format can hold it; InputError if it can't hold one."""
     pose = result.best_pose
     if pose is None:
         raise InputError(f"{result.pano}: this result has no pose to write")
@@ -168,7 +171,7 @@ def _images_of(result: Result, index: int, form: Format, options: Options) -> li
 
 
 def _time(result: Result, path: Path, index: int, options: Options) -> str:
-    """The timestamp of a picture, a number as text."""
+    """Return the timestamp of a picture, a number as text."""
     if options.timestamps == "index":
         return str(index)
     if options.timestamps == "walk":
@@ -181,7 +184,7 @@ def _time(result: Result, path: Path, index: int, options: Options) -> str:
 
 
 def _pictures(result: Result, form: Format) -> list[tuple[Path, Mount | None]]:
-    """The files of a result that a format writes, with the camera of those that are no sphere."""
+    """Return the files of a result that a format writes, with the camera of those that are no sphere."""
     path = Path(result.pano)
     mounts = result.cameras
     if not mounts or form.cameras == "any":
@@ -207,7 +210,10 @@ def _size(path: Path, options: Options) -> tuple[int, int]:
 
 
 def _name(pano: Path, images: Path | None) -> str:
-    """The picture's name in the folder of images, with slashes; as given if there is no such folder."""
+    """Return the picture's name in the folder of images, with slashes.
+
+    As given if there is no such folder.
+    """
     if images is None:
         return pano.as_posix()
     name = Path(os.path.relpath(pano, images))
