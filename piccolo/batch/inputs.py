@@ -24,7 +24,7 @@ def is_from_stdin(words: Sequence[str]) -> bool:
 def panoramas_of(
     words: Iterable[str], stdin: TextIO, left_out: Counter[str], is_panorama: Callable[[Path], bool] = is_cube
 ) -> Iterator[Path]:
-    """Yield the panoramas that words name, in order: a picture, a folder, `@list.txt`, or `-` for lines of `stdin`.
+    """Yield the panoramas that words name, in order: pictures, folders, `@list.txt`, `-` for stdin.
 
     A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
     pictures in it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.

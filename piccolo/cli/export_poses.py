@@ -86,7 +86,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
 
 
 def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:
-    """Yield notes on results of other content than the clouds chosen have, which are refused without --force."""
+    """Yield notes on results of other clouds than those chosen; without --force they are refused."""
     for cloud in dict.fromkeys(result.cloud for result in results if result.cloud_name in arguments.cloud):
         paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
         if all(path.is_file() for path in paths):

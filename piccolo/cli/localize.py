@@ -141,7 +141,7 @@ def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
 
 @contextmanager
 def open_output(out: Path) -> Iterator[tuple[LineFile | None, Write]]:
-    """Yield a function that writes one line: to stdout, a FIFO, or to the end of a file, which comes with it."""
+    """Yield a function that writes one line to stdout, a FIFO, or the end of a file; and that file."""
     if is_stdout(out):
         yield None, lambda line: print(line, flush=True)
     elif is_stream(out):

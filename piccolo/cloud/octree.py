@@ -70,7 +70,7 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
 
 @inline_kernel
 def uniform_level(least_distance, level, low, high):
-    """Return the level at which all below a node, its children of `level`, is drawn if it is from low to high away.
+    """Return the level at which all below a node is drawn, from `low` to `high` away; children have `level`.
 
     0 if there is none.
     """

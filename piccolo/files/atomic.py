@@ -67,7 +67,7 @@ def _check_folder_of(path: Path) -> None:
 
 
 def _target_of(path: Path) -> Path:
-    """Return the file that a path stands for, there or not: of links their target, which is replaced, not they."""
+    """Return the file that a path stands for, there or not: of a link its target, which is replaced."""
     if not path.is_symlink():
         return path
     try:
@@ -161,7 +161,7 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a folder to fill under a temporary name beside `path`, which is new or empty, renamed to it at the end.
+    """Yield a temporary folder beside `path`, which is new or empty; it is renamed to `path` at the end.
 
     Nobody sees it half full, and after an error nothing is left.
     """

@@ -51,7 +51,7 @@ def digest_of_sources(folders: tuple[str, ...]) -> str:
 
 @cache
 def cache_root() -> Path:
-    """Return the folder for everything this program keeps between runs (XDG base directory specification), made now.
+    """Return the folder for what is kept between runs (XDG base directory specification), made now.
 
     Where it can't be written, or others may write to it, a folder of the user's own among the temporary files
     takes its place; what lies there may hold code. OSError where that can't be trusted either.

@@ -66,7 +66,7 @@ def connected(address: str, num_processes: int, num_threads: int) -> Iterator["C
 
 
 def _scheduler_at(address: str) -> str:
-    """Return the URL of the scheduler at an address or in the file that it has written, where something listens."""
+    """Return the URL at which the scheduler of an address, or of the file that it wrote, listens."""
     try:
         if Path(address).is_file():
             address = str(json.loads(Path(address).read_bytes())["address"])

@@ -149,7 +149,7 @@ def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 
 def _detail_circle(cap: NDArray[np.float32]) -> int:
-    """Return number of rows from the pole (row 0) to the outermost circle at which all detail ends, 0 if none."""
+    """Return the number of rows from the pole (row 0) to the outermost circle where all detail ends, or 0."""
     grey = cv2.transform(cap, np.full((1, 3), 1.0 / 3.0))
     east, west = _neighbors_around()
     second = grey.ravel()[east] + grey.ravel()[west] - 2.0 * grey
@@ -216,7 +216,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
 
 
 def mask_pole(is_valid: NDArray[np.bool_], pole: str, half_angle_deg: float) -> NDArray[np.bool_]:
-    """Return validity (H, W) without the rows whose centre is nearer than that to the `pole`, zenith or nadir."""
+    """Return validity (H, W) without the rows whose centre is nearer than `rows` to the `pole`."""
     height = len(is_valid)
     from_zenith = (np.arange(height) + 0.5) * 180.0 / height
     from_pole = from_zenith if pole == "zenith" else from_zenith[::-1]

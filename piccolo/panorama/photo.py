@@ -74,7 +74,7 @@ def _digest(files: list[Path]) -> str:
 
 
 def photo_of(path: Path, rig: Calibration | None = None) -> PhotoFacts:
-    """Return what a photo's file, or the first of a folder of cube faces or of a rig's pictures, says of itself.
+    """Return the facts that a photo's file gives, or the first file of a folder of cube faces or of a rig.
 
     InputError if the file is missing or no picture. Metadata that are damaged count as missing.
     """

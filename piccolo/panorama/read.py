@@ -41,7 +41,7 @@ MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a w
 
 
 def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
-    """Return the panorama in a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces, as a full sphere.
+    """Return the full sphere of a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
     valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.

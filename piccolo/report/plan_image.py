@@ -105,7 +105,7 @@ def _painted(
     shape: tuple[int, int],
     pixel: float,
 ) -> NDArray[np.uint8]:
-    """Return the picture (H, W, 4): what is highest below the cut, gaps closed, shadows of the walls, the walls."""
+    """Return the picture (H, W, 4): the highest points below the cut, gaps closed, walls with shadows."""
     order = np.argsort(above, kind="stable")  # what is higher is written later
     color = np.zeros((*shape, 3), np.uint8)
     is_seen = np.zeros(shape, np.bool_)

@@ -123,7 +123,7 @@ class Experiment(NamedTuple):
 
 
 def _paper_setting(setting: str, names: Mapping[Any, str]) -> ConditionsOf:
-    """Return a condition for each value of a setting of preset paper, which has no counterpart in the default."""
+    """Return a condition for each value of a setting that only preset paper has."""
 
     def conditions_of(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
         paper = next((p for p in presets if isinstance(p, PaperSettings)), PaperSettings())

@@ -96,7 +96,7 @@ def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
-    """Return what a loader of trimesh gives, its colours moved to where no range is guessed and none is cut off."""
+    """Return a mesh as trimesh loads it, without guessing its colours' range or cutting any off."""
     for mesh in (parsed, *parsed.get("geometry", {}).values()):
         if "faces" in mesh:
             mesh["process"] = False

@@ -76,7 +76,7 @@ def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
 
 
 def has_ptx_magic(head: bytes) -> bool:
-    """Return True if a file that begins with the bytes `head` counts columns and rows, then names a position."""
+    """Return True if the bytes `head` begin with counts of columns and rows and a position."""
     lines = [line.strip() for line in head.splitlines()[:3]]
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 

@@ -267,7 +267,7 @@ def _delimiter(line: str) -> str | None:
 
 
 def _begins_numbers(line: bytes, fields: list[str]) -> bool:
-    """Return False for blank lines, comments, a header, and the count of points that .pts and CloudCompare write."""
+    """Return False for blank lines, comments, headers, and the count of points that .pts files begin with."""
     is_count = len(fields) == 1 and line.isdigit()
     return not line.startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields))
 

@@ -101,7 +101,7 @@ def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool 
 
 
 def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
-    """Return True if a pose's position lies in the bounding box of a localizer's cloud (the paper's protocol)."""
+    """Return True if a pose lies in the bounding box of the scan's points (the paper's protocol)."""
     points = scan.points
     center: Array = scan.from_world(pose).center_world
     axes = zip(center, (points.x, points.y, points.z), strict=True)
