@@ -85,7 +85,7 @@ def _filtered(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArray[np
 
 
 def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return number of near black pixels from the edge (row 0) inwards, of the columns that are black there."""
+    """Return the number of near black pixels from the edge (row 0) inwards, of columns black there."""
     depth = np.zeros(len(is_black), dtype=np.int64)
     for begin in range(0, len(inwards), BAND):
         band = np.ascontiguousarray(inwards[begin : begin + BAND])
@@ -126,7 +126,7 @@ def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -
 
 
 def _edge_circle(cap: NDArray[np.float32]) -> int:
-    """Return number of rows from the pole (row 0) to the outermost circle that is an edge, 0 if there is none."""
+    """Return the number of rows from the pole (row 0) to the outermost circle that is an edge, or 0."""
     pairs = (cap[1:] + cap[:-1]) / 2.0
     is_step = (cv2.absdiff(pairs[2:], pairs[:-2]) > MIN_STEP) @ np.ones(3, np.bool_)
     fraction = np.concatenate([[0.0, 0.0], is_step.mean(axis=1)])  # fraction[k]: k rows are inside

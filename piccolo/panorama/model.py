@@ -102,7 +102,7 @@ class ReadOptions:
         return self.calibration if self.calibration is not None and self.calibration.is_rig else None
 
     def refined(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
-        """Return the same with the camera that a result refined, as a calibration of the picture as it is stored."""
+        """Return the options with the camera that a result refined as a calibration of the stored picture."""
         if len(cameras) != 1:
             return self
         given = self.calibration

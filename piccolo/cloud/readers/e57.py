@@ -289,7 +289,7 @@ def _side(path: Path, representation: Element, name: str) -> int:
 
 
 def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
-    """Return what a spherical image covers [deg], across and down, if the file says how large its pixels are."""
+    """Return the angles [deg] that a spherical image covers, across and down, by its pixel size."""
     width, height = (number_of(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
     if width is None or height is None:
         return None
