@@ -23,14 +23,14 @@ class Hypothesis:
 
 
 def by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """The best first; of equal ones, the first."""
+    """Sort hypotheses by falling score, equal ones in their order."""
     return sorted(poses, key=lambda p: -p.score)
 
 
 def suppressed(
     ranked: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
 ) -> list[Hypothesis]:
-    """The first `count` poses that are near (distance [m] and angle [rad]) none before."""
+    """Return the first `count` poses that are not near an earlier one (distance [m] and angle [rad])."""
     if not ranked:
         return []
     rotations = np.array([p.pose.R_cam_from_world for p in ranked])
@@ -41,13 +41,13 @@ def suppressed(
 def best_distinct(
     poses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
 ) -> list[Hypothesis]:
-    """At most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
+    """Return at most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
     return suppressed(by_score(poses), count, min_distance, min_angle)
 
 
 def alternative_poses(
     best: Pose, hypotheses: Sequence[Hypothesis], count: int = MAX_ALTERNATIVES
 ) -> list[Hypothesis]:
-    """The `count` best-scoring hypotheses that are distinct from `best` and from each other."""
+    """Return the `count` best-scoring hypotheses that are distinct from `best` and from each other."""
     ranked = [Hypothesis(best, math.inf), *by_score(hypotheses)]
     return suppressed(ranked, count + 1, MIN_DISTANCE, MIN_ANGLE)[1:]

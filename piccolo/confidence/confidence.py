@@ -17,7 +17,7 @@ MIN_CONFIDENCE = 0.9
 
 
 class Standing(NamedTuple):
-    """What speaks for one of the poses found."""
+    """Evidence for one of the poses found."""
 
     share: float  # what it explains by what the best pose does, over what both views show; 1 of the best
     score: float  # [0, 1] what the photo's blocks explain beyond chance
@@ -47,18 +47,18 @@ MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
 
 
 def features_of(standing: Standing) -> Array:
-    """What a pose's odds go by, (3,), as FEATURES names them."""
+    """Return the features (3,) of a pose's odds, as FEATURES names them."""
     share = min(max(standing.share, LEAST_SHARE), MOST_SHARE)
     return np.log([share, max(standing.score, LEAST_SCORE), standing.num_matches + NOISE_MATCHES])
 
 
 def log_odds(standing: Standing, model: ChoiceModel = MODEL) -> float:
-    """The logarithm of a pose's odds, but for a constant."""
+    """Return the logarithm of a pose's odds, up to a constant."""
     return float(features_of(standing) @ np.array(model.weights)) + standing.log_prior
 
 
 def none_features_of(covariance: PoseCovariance | None) -> Array:
-    """What the odds of none of the poses go by, (2,), as NONE_FEATURES names them."""
+    """Return the features (2,) of the odds that no pose is right, as NONE_FEATURES names them."""
     if covariance is None:
         return np.array([1.0, math.log10(MOST_STD)])
     std = covariance.largest_std if covariance.std_of_fit is None else covariance.std_of_fit
@@ -84,13 +84,13 @@ def posterior(
 
 
 def classify(probabilities: Array, min_confidence: float) -> str:
-    """The status of poses with such probabilities (K + 1,); ambiguous if it is one of several."""
+    """Return the status of poses with probabilities (K + 1,); ambiguous if several are likely together."""
     if probabilities[0] >= min_confidence:
         return LOCALIZED
     return AMBIGUOUS if 1.0 - probabilities[-1] >= min_confidence else NOT_LOCALIZED
 
 
 def check_confidence(min_confidence: float) -> None:
-    """Refuse a line that no confidence can pass or fail."""
+    """Refuse a threshold that no confidence can pass or fail."""
     if not 0.0 < min_confidence < 1.0:
         raise InputError(f"--min-confidence: found {min_confidence}, wanted above 0 and below 1")

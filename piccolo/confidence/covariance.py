@@ -42,7 +42,7 @@ class PoseCovariance:
 
 
 def least_constrained_direction(covariance_up: Array, covariance: Array, offsets: NDArray[np.float32]) -> str:
-    """The direction of the largest translational deviation, in words.
+    """Return the direction of the largest translational deviation, in words.
 
     Both are covariances (3, 3) of the position: in a frame whose z is up, with the offsets (3, N) [m] from
     the camera to what it sees, and in the world, where headings are clockwise from +y.
@@ -60,7 +60,7 @@ def least_constrained_direction(covariance_up: Array, covariance: Array, offsets
 
 
 def _is_corridor(direction: Array, offsets: NDArray[np.float32]) -> bool:
-    """True if what is seen (3, N), z up, lies much farther away along a direction (3,) than across it."""
+    """Return True if the offsets (3, N), z up, reach much farther along a direction (3,) than across it."""
     along = direction[:2]  # not of length 1, which scales reach and width alike
     walls = offsets[:2, np.abs(offsets[2]) < BAND * np.linalg.norm(offsets, axis=0)]
     if walls.shape[1] == 0:

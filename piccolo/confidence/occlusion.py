@@ -1,4 +1,4 @@
-"""What of a photo the scan at its pose explains, what contradicts it, and what was not scanned.
+"""The parts of a photo that the scan explains, that contradict it, and that were not scanned.
 
 Photo and scan are compared by local contrast, as the exposure differs. An occluder pollutes mean and
 deviation around it: they are taken again over what agrees, the whole photo's at first, then more local ones.
@@ -55,7 +55,7 @@ class Occlusion:
     is_valid: NDArray[np.bool_]  # (H, W) where the photo shows anything
 
     def fractions(self) -> tuple[float, float]:
-        """What is explained and what contradicts, of what the photo shows, by solid angle."""
+        """Return the fractions of the photo, by solid angle, that are explained and that contradict."""
         areas = solid_angles(self.is_valid.shape[1])[:, None] * self.is_valid
         is_compared = areas * (self.coverage > LEAST_COVERED)
         contradicted = float((is_compared * (self.difference > CONTRADICTING)).sum())
@@ -64,7 +64,7 @@ class Occlusion:
 
 
 def occlusion_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Occlusion:
-    """Photo and scan compared at a pose."""
+    """Compare photo and scan at a pose."""
     view = _filled_view(points, pose)
     small = resize(panorama, view.depth.shape[1])
     is_shared = view.is_seen & small.is_valid
@@ -81,7 +81,7 @@ def occlusion_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Occlus
 
 
 def _filled_view(points: PackedPoints, pose: Pose) -> View:
-    """The scan at a pose, on the smallest cells that its points fill."""
+    """Render the scan at a pose on the smallest cells that its points fill."""
     view = render_view(points, pose, WIDTHS[0])
     for width in WIDTHS[1:]:
         wider = view.is_seen.reshape(width // 2, 2, width, 2).any(axis=(1, 3))
@@ -92,9 +92,9 @@ def _filled_view(points: PackedPoints, pose: Pose) -> View:
 
 
 def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDArray[np.uint8]:
-    """The comparison as a picture (H, W) of the panorama's size: EXPLAINED, NOT_SCANNED or CONTRADICTED.
+    """Draw the comparison (H, W) at the panorama's size: EXPLAINED, NOT_SCANNED or CONTRADICTED.
 
-    What the photo does not show has the level of what was not scanned.
+    Masked pixels count as not scanned.
     """
     small = occlusion_at(points, panorama, pose)
     shape = panorama.is_valid.shape
@@ -118,7 +118,7 @@ def _squared_difference(
     weight: NDArray[np.float32],
     global_weight: float,
 ) -> NDArray[np.float32]:
-    """Squared difference (H, W) of the channels' contrasts, from what the scan has within a cell around.
+    """Return squared differences (H, W) of contrast from the scan's range within a cell around.
 
     An edge that is off by less than a cell, or blurred, differs by nothing.
     """
@@ -155,7 +155,7 @@ def write_squares(channels, photo, scan, low, high, squares):
 def _statistics(
     channels: NDArray[np.float32], weight: NDArray[np.float32], global_weight: float
 ) -> NDArray[np.float32]:
-    """Local means and 1 / deviations (H, W, 6) of channels (H, W, 3), mixed with those of all that counts."""
+    """Return local means and 1 / deviations (H, W, 6) of channels (H, W, 3), mixed with the global ones."""
     moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
     block_moments(channels, weight, moments)
     total = (moments * solid_angles(STATS_WIDTH)[:, None, None]).sum(axis=(0, 1))
@@ -168,7 +168,7 @@ def _statistics(
 
 
 def _smoothed(values: NDArray[np.float32]) -> NDArray[np.float32]:
-    """A map (H, W) under a narrow Gaussian on the sphere: along rows, wider at the poles, then columns."""
+    """Smooth a map (H, W) by a narrow Gaussian on the sphere: rows, wider at the poles, then columns."""
     height, width = values.shape
     cosine = np.cos((0.5 - (np.arange(height) + 0.5) / height) * math.pi)
     frequency = np.arange(width // 2 + 1) * math.tau / width
@@ -182,14 +182,14 @@ def _smoothed(values: NDArray[np.float32]) -> NDArray[np.float32]:
 def _extreme(
     channels: NDArray[np.float32], is_shared: NDArray[np.bool_], of: Any, unseen: float
 ) -> NDArray[np.float32]:
-    """The least or the most (H, W, 3), by cv2.erode or cv2.dilate, among a cell and its eight neighbours."""
+    """Return the extreme (H, W, 3), by cv2.erode or cv2.dilate, of a cell and its eight neighbours."""
     seen = np.where(is_shared[..., None], channels, np.float32(unseen))
     padded = np.concatenate([seen[:, -1:], seen, seen[:, :1]], axis=1)
     return np.asarray(of(padded, np.ones((3, 3), np.uint8))[:, 1:-1])
 
 
 def _enlarged(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """A map (h, w, ...) at another shape (H, W), bilinear; columns wrap."""
+    """Enlarge a map (h, w, ...) to a shape (H, W), bilinearly; columns wrap."""
     border = math.ceil(shape[1] / small.shape[1])
     padded = np.concatenate([small[:, -1:], small, small[:, :1]], axis=1)
     size = (shape[1] + 2 * border, shape[0])

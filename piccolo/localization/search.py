@@ -293,7 +293,7 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     num_views = min(views_at_once(len(rotations)), len(m.sparse))
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
-    check_memory(num_bytes, task, "set fewer `num_yaws` or `num_rotations`")
+    check_memory(num_bytes, task, "set fewer num_yaws or num_rotations")
     samples, validity = turn_panorama(query.photo.images.search(), rotations)
     num_starts = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
     num_starts = min(num_starts, settings.max_starts)

@@ -38,14 +38,14 @@ class PaperMap(LocalCloud):
 
 
 def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
-    """Everything that does not depend on the panorama."""
+    """Prepare everything that does not depend on the panorama."""
     points = pack_points(cloud.points, cloud.colors).subsample(settings.max_points)
     positions = free_grid(points, settings.num_translations, settings.grid_margin)
     return PaperMap(points, np.eye(3), cloud.origin_world, cloud.warnings, positions)
 
 
 def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
-    """The loss that the settings ask for."""
+    """Return the loss that the settings select."""
     if settings.loss == "photometric":
         return photometric_loss_of(shrink(panorama, settings.photometric_width))
     return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
@@ -54,7 +54,7 @@ def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
 def localize(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
-    """Algorithm 1 of the paper: search, refine, select; then evaluate what was selected."""
+    """Localize by Algorithm 1 of the paper: search, refine, select; then evaluate the selected pose."""
     points = paper_map.points
     known = settings.gravity == "known"
     rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
@@ -70,8 +70,8 @@ def localize(
         evidence, others = evaluate(points, panorama, best, refined)
     confidence = paper_confidence(evidence)
     alone = paper_confidence(replace(evidence, margin=1.0))
-    sure = AMBIGUOUS if others and alone >= settings.min_confidence else NOT_LOCALIZED
-    status = LOCALIZED if confidence >= settings.min_confidence else sure
+    otherwise = AMBIGUOUS if others and alone >= settings.min_confidence else NOT_LOCALIZED
+    status = LOCALIZED if confidence >= settings.min_confidence else otherwise
     in_world = tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others)
     return Localization(
         status, confidence, None, paper_map.to_world(best.pose), best.loss, evidence, in_world
@@ -81,7 +81,7 @@ def localize(
 def evaluate(
     points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
 ) -> tuple[Evidence, list[Hypothesis]]:
-    """Evidence at the best pose, and the alternatives, best first."""
+    """Return the evidence at the best pose, and the alternatives, best first."""
     at_pose = agreement_at(points, panorama, best.pose)
     others = [Hypothesis(r.pose, agreement_at(points, panorama, r.pose).score) for r in refined]
     others = alternative_poses(best.pose, others)
@@ -98,7 +98,7 @@ def evaluate(
 
 
 def paper_confidence(evidence: Evidence) -> float:
-    """How likely a pose of the preset paper is right: a rough guide, not calibrated."""
+    """Return a rough, uncalibrated probability that a pose of the preset paper is right."""
     features = evidence.margin, math.log(max(evidence.agreement, LEAST_SCORE))
     logit = PAPER_BIAS + sum(w * f for w, f in zip(PAPER_WEIGHTS, features, strict=True))
     return 1.0 / (1.0 + math.exp(-min(max(logit, -30.0), 30.0)))

@@ -29,13 +29,13 @@ LEAST_NORM = 0.5 / 255.0  # a residual below half an 8-bit level has the weight 
 
 
 def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> float:
-    """The loss at `pose`, in [0, sqrt(3)], over the panorama's own pixels; inf where too little is shown."""
+    """Return the loss in [0, sqrt(3)] at `pose`, over the panorama's own pixels; inf if too few are shown."""
     found = _compared(points, panorama, pose)
     return math.inf if found is None else float(np.linalg.norm(found[1], axis=-1).mean(dtype=np.float64))
 
 
 def photometric_loss_of(panorama: Panorama) -> Loss:
-    """The photometric loss of a panorama, at its own size."""
+    """Return the photometric loss of a panorama, at its own size."""
     return Loss(
         lambda points, pose: photometric_loss(points, panorama, pose),
         lambda points, pose: photometric_equations(points, panorama, pose),
@@ -43,7 +43,7 @@ def photometric_loss_of(panorama: Panorama) -> Loss:
 
 
 def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) -> Equations:
-    """Loss, its gradient (6,) and the matrix (6, 6) of iteratively reweighted least squares at `pose`."""
+    """Return the loss at `pose`, its gradient (6,) and the matrix (6, 6) of reweighted least squares."""
     found = _compared(points, panorama, pose)
     if found is None:
         return math.inf, np.zeros(6), np.eye(6)
@@ -64,7 +64,7 @@ def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) 
 def _compared(
     points: PackedPoints, panorama: Panorama, pose: Pose
 ) -> tuple[View, Image, NDArray[np.bool_]] | None:
-    """View at `pose`, its differences (N, 3) in [-1, 1] from the panorama where both count, and where (H, W).
+    """Render the view at `pose`; return it, its differences (N, 3) in [-1, 1], and their mask (H, W).
 
     None where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan.
     """
@@ -79,7 +79,7 @@ def _compared(
 
 
 def view_gradient(view: View) -> tuple[Image, Image]:
-    """Derivatives (H, W, 3) of a view by u and v [1/px]: central, one-sided beside a hole, 0 between two."""
+    """Return derivatives (H, W, 3) by u and v [1/px]: central, one-sided at a hole, 0 between two."""
     seen = view.is_seen[..., None].astype(np.float32)
     gradients = []
     for axis in (1, 0):
@@ -95,7 +95,7 @@ def view_gradient(view: View) -> tuple[Image, Image]:
 
 @functools.lru_cache(maxsize=2)
 def _unit_motion(width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives (H, W, 6) of u and v by a step, of what is 1 m off at each pixel's centre."""
+    """Return derivatives (H, W, 6) of u and v by a step, for points at 1 m in each pixel's centre."""
     rays = pixel_rays(width)
     rows_u, rows_v = (np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in ray_jacobian(rays))
     return rows_u, rows_v
@@ -104,7 +104,7 @@ def _unit_motion(width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
 def pixel_motion(
     depth: NDArray[np.float32], counts: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives (N, 6) of u and v [px] by a step, of what pixels of `counts` show at `depth` (H, W)."""
+    """Return derivatives (N, 6) of u and v [px] by a step, for pixels of `counts` at `depth` (H, W)."""
     rows_u, rows_v = (rows[counts] for rows in _unit_motion(depth.shape[1]))
     per_depth = 1.0 / np.maximum(depth[counts], LEAST_DEPTH)[:, None]
     rows_u[:, 3:] *= per_depth  # a turn moves pixels alike at every depth

@@ -96,7 +96,7 @@ def search(
     settings: PaperSettings,
     workers: Workers,
 ) -> list[Hypothesis]:
-    """The K2 poses to descend from, of all positions (N_t, 3) and rotations (N_r, 3, 3) of `grid`."""
+    """Select the K2 poses to descend from, of all positions (N_t, 3) and rotations (N_r, 3, 3) of `grid`."""
     positions, rotations = grid
     near = (settings.min_distance, np.radians(settings.min_angle_deg))
 
@@ -112,8 +112,8 @@ def search(
     by_loss = best_distinct(scored, settings.num_by_loss, *near)
     small = shrink(panorama, settings.histogram_width)
 
-    def rescored(h: Hypothesis) -> Hypothesis:
+    def rescore(h: Hypothesis) -> Hypothesis:
         return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
 
-    by_histogram = list(workers.map(rescored, by_loss, "compare colours"))
+    by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
     return best_distinct(by_histogram, settings.num_by_histogram, *near)

@@ -60,5 +60,5 @@ class PaperSettings(DescentSettings):
         return self.num_rotations or (8 if self.gravity == "known" else 32)
 
     def to_json(self) -> dict[str, object]:
-        """The settings as they took effect."""
+        """Return the settings as they took effect."""
         return {"preset": "paper", **asdict(self), "num_rotations": self.effective_num_rotations}

@@ -53,7 +53,7 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
 
 
 def is_map_file(path: Path) -> bool:
-    """True if the file begins as `save_map` writes it, of whatever version; clouds may be archives too.
+    """Return True if the file begins as `save_map` writes it, in any version; clouds may be archives too.
 
     The first member's name or its value is enough, so that a damaged map is still refused as a map.
     """
@@ -66,7 +66,7 @@ def is_map_file(path: Path) -> bool:
 
 @contextmanager
 def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
-    """A map's file that may be mapped: itself, or a copy in the user's cache; None where there is none.
+    """Provide a map's file that may be mapped: itself, or a copy in the user's cache; else None.
 
     A file of the cache, where nobody else may write, is only ever replaced whole. Any other may be cut off or
     overwritten in place at any time, which would kill, or mislead, a process that has mapped it. A copy that
@@ -86,7 +86,7 @@ def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
 
 
 def copied(path: Path, folder: Path) -> Path | None:
-    """The copy of a file in a folder, made if there is none of it as it is now; None if it can't be made."""
+    """Copy a file into a folder unless its current copy is there; None if that fails."""
     with path.open("rb") as file:
         copy = folder / f"{key_of('copy', os.fstat(file.fileno()))}.piccolo-map"
         try:

@@ -68,7 +68,7 @@ MAX_WARNING = 5000  # characters of a line
 
 @inline_kernel
 def is_in_range(node, reach):
-    """True if a node (6,) is not farther than `reach` from zero along any axis and its colour is one."""
+    """Return True if a node (6,) is within `reach` of zero along each axis and has a valid colour."""
     is_one = True
     for k in range(3):
         is_one = is_one and abs(node[k]) <= reach and F0 <= node[3 + k] <= BRIGHTEST
@@ -77,7 +77,7 @@ def is_in_range(node, reach):
 
 @kernel
 def first_misplaced(nodes, first_child, level_start, origin, leaf_size, reach):
-    """The first node outside its parent's voxel, farther than `reach` [m], or of no colour; -1 if none is.
+    """Return the first node outside its parent's voxel, beyond `reach` [m] or without valid colour, or -1.
 
     The links must be right. `origin` (3,) leads from a corner of all levels' grids to zero [m].
     """
@@ -126,12 +126,12 @@ def _refuse(path: Path, found: str) -> None:
 
 
 def _reach(arrays: Arrays) -> float:
-    """The most [m] that anything in a map is from the origin along an axis."""
+    """Return the largest distance [m] of anything in a map from the origin along an axis."""
     return WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
 
 
 def _check_frame(path: Path, arrays: Arrays) -> None:
-    """The rotation and the variance are such, and the origin lies at whole metres of the map's axes."""
+    """Check the rotation and the variance, and that the origin is at whole metres of the map's axes."""
     R = checked_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
     origin: Array = arrays["origin_world"]
     if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):

@@ -16,12 +16,12 @@ MAX_SCANS = 1000  # of a map
 
 
 def is_name(name: str) -> bool:
-    """True for one line of text that can be printed."""
+    """Return True for one line of text that can be printed."""
     return 1 <= len(name) <= MAX_NAME and name.isprintable() and name == name.strip()
 
 
 def check_name(name: str, taken: Sequence[str]) -> None:
-    """Refuse what is no name for a scan that is put beside others."""
+    """Refuse an invalid or duplicate name of a scan, or one scan too many."""
     if not is_name(name):
         raise InputError(f"--name: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
     if name in taken:
@@ -31,7 +31,7 @@ def check_name(name: str, taken: Sequence[str]) -> None:
 
 
 def named(scan_map: ScanMap, name: str) -> ScanMap:
-    """A map of one scan under a name."""
+    """Name the scan of a map of one scan."""
     check_name(name, ())
     if len(scan_map.scan_names) > 1:
         raise InputError(f"--name: found a map of several scans: {_listed(scan_map.scan_names)}")
@@ -53,13 +53,13 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
 
 
 def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:
-    """Mask (N,) of the candidates in the scans of these names."""
+    """Return a mask (N,) of the candidates in the scans of these names."""
     named_so = [k for k, name in enumerate(scan_map.scan_names) if name in within]
     return np.isin(scan_map.scan_of_candidate, named_so)
 
 
 def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
-    """The scan in which a place (3,) lies, that of the nearest candidate; None if there are no names."""
+    """Return the scan in which a place (3,) lies, by the nearest candidate; None if there are no names."""
     if not (scan_map.scan_names and len(scan_map.centers)):
         return None
     offsets = scan_map.centers - center_map
@@ -83,5 +83,5 @@ def with_places(scan_map: ScanMap, found: Localization) -> Localization:
 
 
 def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:
-    """The scan in which a pose of the world lies."""
+    """Return the scan in which a pose of the world lies."""
     return scan_at(scan_map, scan_map.from_world(pose).center_world)

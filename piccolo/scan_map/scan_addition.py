@@ -1,7 +1,7 @@
 """Another scan in a map: only what it changes is prepared again.
 
-Candidates stay where they are, views and local features are made anew where the new scan is seen, and all
-else keeps every bit.
+Candidates stay where they are. Views and local features are made again where the new scan is seen; all else
+keeps every bit.
 """
 
 from dataclasses import replace
@@ -50,7 +50,7 @@ class Candidates(NamedTuple):
 
 
 def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch: Stopwatch) -> ScanMap:
-    """A map and another scan in the same coordinates, under a name of its own."""
+    """Add another scan in the same coordinates to a map, under a name of its own."""
     check_name(name, old.scan_names)
     with watch.stage("read"):
         new, warnings = read_beside(old, cloud)
@@ -79,7 +79,7 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
 
 
 def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]]:
-    """The octree of a scan alone, in a map's frame, and warnings."""
+    """Read a scan into an octree of its own, in a map's frame; with warnings."""
     if old.octree.leaf_size != LEAF_SIZE:
         found = f"found a map of voxels of {old.octree.leaf_size} m"
         raise InputError(f"--add: {found}, wanted {LEAF_SIZE} m; prepare it again")
@@ -99,7 +99,7 @@ def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]
 
 
 def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers) -> Candidates:
-    """The candidates of a map and a new scan, by the octrees of the new one alone and of both."""
+    """Join the candidates of a map and a new scan, by the octrees of the new one alone and of both."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     points = new.level(CLEARANCE_VOXEL)[:, :3]
@@ -120,9 +120,9 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
 
 
 def most_of_sphere(box: Box, centers: Array) -> Array:
-    """The most of the sphere (N,) that what is in a box can take around centres (N, 3), by a ball around it.
+    """Bound the fraction (N,) of the sphere that a box takes around centres (N, 3), by a ball around it.
 
-    A half within that ball, where it may be all.
+    Half within that ball, where it may be all.
     """
     radius = 0.5 * float(np.linalg.norm(box.high - box.low))
     distance = np.linalg.norm(centers - 0.5 * (box.low + box.high), axis=1)
@@ -131,7 +131,7 @@ def most_of_sphere(box: Box, centers: Array) -> Array:
 
 
 def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
-    """Fractions of the sphere (N,) about centres (N, 3) where a new scan is in front, and where behind."""
+    """Return fractions (N,) of the sphere around centres (N, 3) with a new scan in front, and behind."""
     area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
 
     def compare(lo: int) -> tuple[Array, Array]:
@@ -149,7 +149,7 @@ def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tupl
 def joined_views(
     old: ScanMap, octree: Octree, found: Candidates, sparse: NDArray[np.int64], workers: Workers
 ) -> WideViews:
-    """Wide views of the sparse candidates: the map's, and those that it lacks or that have changed anew."""
+    """Join wide views of the sparse candidates: render those that have changed or that the map lacks."""
     known = np.full(len(old.centers), -1)  # row among the map's views
     known[old.sparse] = np.arange(len(old.sparse))
     place = np.full(len(found.centers), -1)
@@ -167,7 +167,7 @@ def joined_views(
 
 
 def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
-    """The scan of each candidate (N,): as it was, of new places that of the nearest, or the new one."""
+    """Assign a scan to each candidate (N,): its old one, the nearest candidate's, or the new one."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     num_known = len(found.rows)
@@ -181,7 +181,7 @@ def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
 
 
 def joined_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
-    """Features of the map's views, taken anew where these have changed, and of as many more as are needed."""
+    """Join features: extract them again in changed views, and in new views where they are needed."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     view_centers = old.local_features.view_centers

@@ -1,4 +1,4 @@
-"""The map prepared once per cloud: octree, places where a camera can be, and coarsely what it sees there."""
+"""The map prepared once per cloud: octree, candidate camera positions, and their coarse views."""
 
 import threading
 from collections.abc import Callable
@@ -36,7 +36,7 @@ class Voxelized(Protocol):
         """The axis that points up by its file."""
 
     def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Its points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+        """Average its points voxel by voxel, in axes turned by a rotation (3, 3)."""
 
 
 class LateFeatures:
@@ -48,7 +48,7 @@ class LateFeatures:
         self._lock = threading.Lock()
 
     def get(self, workers: Workers) -> FeatureMap:
-        """The features, made now if nobody has."""
+        """Return the features, made now if they are not yet."""
         with self._lock:
             self._made = self._made or self._make(workers)
             return self._made
@@ -109,25 +109,25 @@ class ScanMap:
         return len(self.local_features.view_centers) == 0 < len(self.centers)
 
     def features_now(self, workers: Workers) -> FeatureMap:
-        """The local features, made now where they are late."""
+        """Return the local features, made now where they are late."""
         return self.late.get(workers) if self.late else self.local_features
 
     def to_world(self, pose: Pose) -> Pose:
-        """A pose of the map's frame in the world."""
+        """Transform a pose of the map's frame to the world."""
         R_map_from_world = self.R_map_from_world
         center_world = R_map_from_world.T @ pose.center_world + self.origin_world
         return Pose(pose.R_cam_from_world @ R_map_from_world, center_world)
 
     def from_world(self, pose: Pose) -> Pose:
-        """A pose of the world in the map's frame."""
+        """Transform a pose of the world to the map's frame."""
         center = self.R_map_from_world @ (pose.center_world - self.origin_world)
         return Pose(pose.R_cam_from_world @ self.R_map_from_world.T, center)
 
 
 def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
+    """Return indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
 
-    And for each candidate (N,) which of these it is that lies in the same cell.
+    And for each candidate (N,) the place among these of the one in its cell.
     """
     cells = np.floor(centers / COARSE_SPACING).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
@@ -139,7 +139,7 @@ def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], 
 def candidates_of(
     octree: Octree, frame: tuple[Array, Array], prior: Prior, workers: Workers
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Candidates (N, 3) [m]; of a scan too large as a whole those near the prior's place, and a warning.
+    """Find candidates (N, 3) [m]; in a scan too large as a whole, near the prior's place, with a warning.
 
     The frame is R_map_from_world (3, 3) and origin_world (3,).
     """
@@ -149,8 +149,8 @@ def candidates_of(
         if prior.near_world is None or prior.radius is None:
             raise
     near = frame[0] @ (np.array(prior.near_world) - frame[1])
-    how = f"prepared within {prior.radius:g} m of --near, for this run only"
-    text = f"the scan is too large as a whole: {how}"
+    part = f"prepared within {prior.radius:g} m of --near, for this run only"
+    text = f"the scan is too large as a whole: {part}"
     centers = candidate_centers(octree, workers, Ball(near, prior.radius))
     workers.warn(text)
     return centers, (text,)
@@ -165,7 +165,7 @@ def prepare_map(
     prior: Prior = NOTHING_KNOWN,
     has_features: bool = True,
 ) -> ScanMap:
-    """Everything about a cloud that does not depend on the panorama; local features may come late.
+    """Prepare everything about a cloud that does not depend on the panorama; local features may come late.
 
     The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
     whole, what is near the prior's place; TooManyPositionsError if it names none.
@@ -206,7 +206,7 @@ def prepare_map(
 
 
 def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
-    """A line if the floors plainly face another way than the map's z, with the axis nearest to their way."""
+    """Warn if the floors face clearly away from the map's z, naming the nearest axis."""
     axis, sense, reason, _ = find_up(octree)
     cosine = sense * axis[2]
     if sense == 0.0 or cosine > np.cos(MAX_TILT):
@@ -220,22 +220,22 @@ def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> t
 
 
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
-    """The features of the views from few of a map's candidates, chosen by what they see."""
+    """Find local features in views from few of a map's candidates, chosen by what they see."""
     centers = scan_map.centers
     chosen = view_positions(centers, seen_by(scan_map.octree, centers), SEARCH_VIEW.num_rings)
     return make_feature_map(scan_map.octree, centers[chosen], workers)
 
 
 def seen_by(octree: Octree, centers: NDArray[np.float64]) -> Look:
-    """Ranges seen from each of some centres (N, 3), by its index."""
+    """Return a function that gives the ranges seen from a centre of (N, 3) by its index."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 
 
 def with_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
-    """A map that has its local features."""
+    """Add the local features to a map, made now if they are missing."""
     return replace(scan_map, local_features=scan_map.features_now(workers), late=None)
 
 
 def with_late_features(scan_map: ScanMap) -> ScanMap:
-    """A map without local features, which makes them when they are first asked for."""
+    """Let a map make its local features when they are first needed."""
     return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, workers)))

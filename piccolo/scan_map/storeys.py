@@ -77,7 +77,7 @@ class Storeys(NamedTuple):
 
 
 def find_storeys(octree: Octree) -> Storeys:
-    """The storeys of a map by the surfaces of its octree."""
+    """Find the storeys of a map by the surfaces of its octree."""
     xyz = octree.level(SURFACE_VOXEL)[:, :3]
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
@@ -109,7 +109,7 @@ def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArray[np.bool_]]:
-    """The floors by their height [voxels], ascending: which cells (I, J) each has.
+    """Find the floors by their height [voxels], ascending, with the cells (I, J) of each.
 
     `ijk` (N, 3) are all voxels, `tops` those that have room above. The largest floor first, then what is
     LEAST_APART from those found above or below it. None if nothing stands on any.
@@ -146,7 +146,7 @@ def _opened(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> NDAr
 
 
 def _has_things_above(ijk: NDArray[np.int64], level: int, mask: NDArray[np.bool_]) -> bool:
-    """True if anything stands on a floor or around it."""
+    """Return True if anything is on a floor or around it."""
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((OPENING, OPENING), np.uint8))
     is_above = (ijk[:, 2] > level + THICKNESS) & (ijk[:, 2] <= level + HEADROOM)
     count = wide[ijk[is_above, 0], ijk[is_above, 1]].sum()
@@ -154,14 +154,14 @@ def _has_things_above(ijk: NDArray[np.int64], level: int, mask: NDArray[np.bool_
 
 
 def _overlap(mask: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
-    """The fraction of the smaller of two floors that is above or below the other, or a gap in it."""
+    """Return the fraction of the smaller of two floors that overlaps the other or a gap in it."""
     square = np.ones((GAP, GAP), np.uint8)
     one, two = (cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0 for m in (mask, other))
     return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))
 
 
 def _united(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
-    """The levels of each storey: one that is hardly above those before it joins them."""
+    """Group levels to storeys: a level that is hardly above those before it joins them."""
     groups: list[list[int]] = []
     for level, mask in masks.items():
         below = sum((masks[other] for other in groups[-1]), np.zeros_like(mask)) if groups else mask

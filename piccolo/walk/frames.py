@@ -112,7 +112,7 @@ def checked_times(times: Sequence[float]) -> None:
 
 
 def states_of(scan_map: ScanMap, found: Localization) -> list[State]:
-    """The poses that a frame has alone, with its own probabilities."""
+    """List the poses that a frame has alone, with its own probabilities."""
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     none = max(found.probability_none, 1e-9)
@@ -134,7 +134,7 @@ def log_ratio(probability: float, other: float) -> float:
 
 
 def centers_of(states: Sequence[State]) -> Array:
-    """Positions (N, 3) [m] of states."""
+    """Return the positions (N, 3) [m] of states."""
     return np.array([state.pose.center_world for state in states]).reshape(-1, 3)
 
 

@@ -1,4 +1,4 @@
-"""The results of a walk's frames: positions smoothed together, as nobody is jerked about."""
+"""The results of a walk's frames: positions smoothed with a constant-acceleration prior."""
 
 import math
 from collections.abc import Sequence
@@ -81,7 +81,7 @@ def alone_of(frame: Frame) -> Alone | None:
 
 
 def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None) -> Localization:
-    """A frame with the probabilities that a walk gives its poses."""
+    """Make the result of a frame with the probabilities that a walk gives its poses."""
     if not frame.states:
         return frame.alone or Localization()
     order = sorted(range(len(frame.states)), key=lambda j: (j != chosen, -probabilities[j]))
@@ -171,7 +171,7 @@ def marginal_covariances(information: NDArray[np.float64]) -> list[Array]:
 
 
 def moved(pose: Pose, covariance: PoseCovariance, move: Array, variance: Array) -> Located:
-    """A pose whose position was moved by what other frames say, and the covariance then.
+    """Move a pose by the smoothing of its position, and update its covariance.
 
     Rotation and position are jointly Gaussian: the one follows the other by C_wd C_dd^-1.
     """

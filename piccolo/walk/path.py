@@ -3,7 +3,7 @@
 A state is a pose of a frame; a frame may have none, and the way goes on from an earlier one. Viterbi (1967)
 finds the likeliest way, forward-backward (Rabiner 1989) the probability of each pose. Frames of one place
 err alike: what they say of one pose against another counts only as far as the camera has moved on, and only
-beyond what exact copies of a room say against each other.
+beyond what exact copies of a room differ by.
 
 The camera may also be at a place that no frame has listed, as a copy of one that is: what is followed from
 frame to frame speaks as much for that. Only a search of the whole scan tells, and each only so much.
@@ -66,7 +66,7 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
 def new_differences(behind: Array, share: float) -> Array:
     """Log differences (S,) of poses to the best that count in a frame that is new to a share.
 
-    Copies differ by a little for as long as the camera is in one of them; what is no copy is just worse.
+    Copies differ by a little for as long as the camera is in one of them; non-copies just score lower.
     """
     is_other = np.clip((behind - COPY_LOG_ODDS) / (OTHER_LOG_ODDS - COPY_LOG_ODDS), 0.0, 1.0)
     return np.asarray(is_other * behind + (1.0 - is_other) * share * np.maximum(behind - COPY_LOG_ODDS, 0.0))
@@ -146,7 +146,7 @@ class Lattice:
         self.ended = -math.inf  # the sum over ways that end at a state
 
     def add(self, frame: Frame) -> None:
-        """The next frame in time."""
+        """Add the next frame in time."""
         self.frames.append(frame)
         k = len(self.frames) - 1
         before = next((f for f in reversed(self.frames[:-1]) if f.states), None)
@@ -201,7 +201,7 @@ class Lattice:
         return 1.0 if last is None else max(share_moved(last, frame), LEAST_TOLD)
 
     def _steps_to(self, k: int) -> list[_Steps]:
-        """Steps from all earlier frames from which the way may lead to a frame."""
+        """Return steps from all earlier frames from which the way may lead to a frame."""
         ends = centers_of(self.frames[k].states)
         steps: list[_Steps] = []
         passed = 0.0
@@ -223,7 +223,7 @@ class Lattice:
         return steps
 
     def _expected(self, start: Array, reach: float) -> float:
-        """Log odds that a pose within a reach [m] gains: the more, the less of the map lies there.
+        """Return the log odds that a pose within a reach [m] gains: more where less of the map lies there.
 
         A frame's own odds hold where each place of the map is as likely as the others.
         """
@@ -238,7 +238,7 @@ class Lattice:
         return float(np.logaddexp(self.unlisted[-1].forward, self.ended))
 
     def smoothed(self) -> Path:
-        """The likeliest way, and the probability of each state by all frames."""
+        """Return the likeliest path, and the probability of each state by all frames."""
         backward = [np.zeros(len(f.states)) for f in self.frames]
         unlisted = 0.0
         for k in range(len(self.frames) - 1, -1, -1):
@@ -285,7 +285,7 @@ class Lattice:
 
 
 def lattice_of(frames: Sequence[Frame], space: FreeSpace, motion: Motion) -> Lattice:
-    """The lattice of frames in their order."""
+    """Build the lattice of frames in their order."""
     lattice = Lattice(space, motion)
     for frame in frames:
         lattice.add(frame)

@@ -1,4 +1,4 @@
-"""Frames looked at once more, when those after them are known too."""
+"""A second search of doubtful frames, when the frames after them are known too."""
 
 import math
 from collections.abc import Callable
@@ -48,7 +48,7 @@ Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it ca
 
 @one_blas_thread
 def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
-    """The path of all frames that a tracker has followed.
+    """Find the path of all frames of a tracker, and search doubtful and lost ones again.
 
     Where the path is in doubt, each place that a frame may show is looked for in its neighbours, so that no
     copy loses by not having been listed. Then lost frames are looked for from those that are sure.
@@ -78,7 +78,7 @@ def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path
 
 
 def motion_of(tracker: Tracker) -> Motion:
-    """How the camera is carried: if nobody said how far, by the frames that are localized alone."""
+    """Estimate the motion of the camera, if it is not given, from the frames that are localized alone."""
     motion = tracker.motion
     if motion.is_timed or not motion.is_guess:
         return motion
@@ -94,7 +94,7 @@ def _path_of(tracker: Tracker) -> Path:
 
 
 def _is_certain(path: Path, k: int) -> bool:
-    """True if the path leaves no doubt of a frame's pose."""
+    """Return True if a frame's pose is certain on the path."""
     chosen = path.chosen[k]
     return chosen is not None and bool(path.probabilities[k][chosen] > CERTAIN)
 
@@ -116,7 +116,7 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
 
 
 def _rivals(tracker: Tracker, m: int) -> list[Follower]:
-    """The likelier poses of a frame, one of each place; none if there is only one."""
+    """Return the likelier poses of a frame, one of each place; none if there is only one."""
     likely = tracker.frames[m].likely
     if len(likely) < 2:
         return []
@@ -127,7 +127,7 @@ def _rivals(tracker: Tracker, m: int) -> list[Follower]:
 
 
 def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math.inf) -> bool:
-    """True if a frame has a pose of some log odds to which a person can have walked."""
+    """Return True if a frame has a pose above the log odds that can be reached on foot."""
     frame = tracker.frames[k]
     states = [state for state in frame.states if state.log_odds > least_odds]
     return any(_is_within(tracker, f, state, frame.time) for state in states)
@@ -136,7 +136,7 @@ def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math
 def _follower_of_lost(
     tracker: Tracker, path: Path, k: int, step: int, tried: set[tuple[int, int]]
 ) -> Follower | None:
-    """Whence a frame that has no pose on the path is looked for: from the nearest that is sure, once."""
+    """Return the nearest sure pose from which to search a frame without one on the path, once."""
     chosen = path.chosen[k]
     if chosen is not None and path.probabilities[k][chosen] > SURE:
         return None
@@ -152,7 +152,7 @@ def _follower_of_lost(
 def _found_again(
     tracker: Tracker, k: int, follower: Follower, panorama: Panorama, searched: set[int]
 ) -> bool:
-    """True if a frame has got a pose more, near where a follower leads; by features only once."""
+    """Search a frame near where a follower leads, by features only once; True if it gains a pose."""
     frame = tracker.frames[k]
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
     end = follow(query, follower, frame.time, tracker.motion)
@@ -172,7 +172,7 @@ def _found_again(
 
 
 def _joined(query: Query, frame: Frame, found: Hypothesis) -> bool:
-    """True if a pose was put beside those of a frame, or in place of one from which it is the better end."""
+    """Add a pose to a frame, or replace a worse one nearby; True if the frame has changed."""
     for j, state in enumerate(frame.states):
         if is_same(state.pose, found.pose) and found.score > MIN_GAIN * state.score:
             frame.states[j] = states_at(query, [found])[0]
@@ -185,7 +185,7 @@ def _joined(query: Query, frame: Frame, found: Hypothesis) -> bool:
 def _searched_near(
     tracker: Tracker, frame: Frame, follower: Follower, radius: float, panorama: Panorama
 ) -> bool:
-    """True if a frame is found near a pose by local features; whole views have been asked."""
+    """Search a frame near a pose by local features; True if it is found."""
     x, y, z = (float(v) for v in tracker.scan_map.to_world(follower.state.pose).center_world)
     near = replace(tracker.settings.prior, near_world=(x, y, z), radius=radius)
     settings = replace(tracker.settings, prior=near)
@@ -198,7 +198,7 @@ def _searched_near(
 
 
 def _is_sure(tracker: Tracker, path: Path, m: int) -> bool:
-    """True for a frame whose pose the path knows, or that has just been found."""
+    """Return True for a frame with a sure pose on the path, or that has just been found."""
     if not 0 <= m < len(tracker.frames) or not tracker.frames[m].states:
         return False
     chosen = path.chosen[m]
@@ -208,7 +208,7 @@ def _is_sure(tracker: Tracker, path: Path, m: int) -> bool:
 
 
 def _state_on(tracker: Tracker, path: Path, m: int) -> State:
-    """The state of a sure frame: on the path, or what was found last."""
+    """Return the state of a sure frame: on the path, or the last one found."""
     states = tracker.frames[m].states
     chosen = path.chosen[m]
     is_old = chosen is not None and len(path.probabilities[m]) == len(states)
@@ -216,7 +216,7 @@ def _state_on(tracker: Tracker, path: Path, m: int) -> State:
 
 
 def _follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
-    """The pose of a sure frame, and of the one before it in the direction of the sweep."""
+    """Make a follower from a sure frame and the one before it in the direction of the sweep."""
     state = _state_on(tracker, path, m)
     other = m - step
     if _is_sure(tracker, path, other):
@@ -228,7 +228,7 @@ def _follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
 
 
 def _is_within(tracker: Tracker, f: Follower, state: State, time: float) -> bool:
-    """True for a state that a person can walk to."""
+    """Return True if a person can walk to a state."""
     reach = tracker.motion.max_speed * abs(time - f.time) + REACH_SLACK
     ends = state.pose.center_world[None]
     return bool(tracker.lattice.space.distance(f.state.pose.center_world, ends, 2.0 * reach)[0] <= reach)

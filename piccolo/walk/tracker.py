@@ -1,4 +1,4 @@
-"""A camera followed through a scan: frame by frame, each by what is known so far."""
+"""Tracking of a camera through a scan, frame by frame, from past frames only."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -101,7 +101,7 @@ class Tracker:
         self.lattice = Lattice(self.lattice.space, self.motion)
 
     def prepared(self, panorama: Panorama) -> Query:
-        """The query of a frame, with the images that its descents need."""
+        """Prepare the query of a frame, with the images that its descents need."""
         query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
         for image in query.photo.images:
             image()
@@ -164,14 +164,14 @@ class Tracker:
             frame.put(states_at(query, found), "tracked" if is_there else "near")
 
     def followers(self) -> list[Follower]:
-        """The poses from which the next frame may come: of the last that is credible, then of later ones."""
+        """Return the poses to track from: those of the last credible frame, then of a later one."""
         known = [k for k, frame in enumerate(self.frames) if frame.states]
         credible = [k for k in known if self.frames[k].is_credible][-1:]
         later = [k for k in known[-1:] if k not in credible]
         return [f for k in (*credible, *later) for f in self._followers_of(k, known)][:MOST_TRACKED]
 
     def _followers_of(self, k: int, known: list[int]) -> list[Follower]:
-        """The poses of a frame, the likeliest first."""
+        """Return the poses of a frame, the likeliest first."""
         last = self.frames[k]
         weights = self.lattice.forward[k]
         earlier = next((self.frames[m] for m in reversed(known) if m < k), None)
@@ -203,7 +203,7 @@ class Tracker:
 
 
 def merged(query: Query, states: list[State], others: Sequence[Hypothesis]) -> list[State]:
-    """The states of a frame, and other poses beside them."""
+    """Merge other poses into the states of a frame."""
     for other in others:
         more = beside(query, states, other)
         states = states if more is None else [*states, more]
@@ -211,12 +211,12 @@ def merged(query: Query, states: list[State], others: Sequence[Hypothesis]) -> l
 
 
 def least_score(f: Follower) -> float:
-    """What a frame must explain to be there where it was followed."""
+    """Return the least score with which a frame counts as tracked."""
     return max(LEAST_SCORE, LEAST_KEPT * f.state.score)
 
 
 def followed(query: Query, followers: Sequence[Follower], time: float, motion: Motion) -> list[Hypothesis]:
-    """Where each of some poses leads, worked out beside each other; the query's images are made."""
+    """Track a frame from several poses in parallel; the query's images must be made."""
     return list(query.workers.map(lambda f: follow(query, f, time, motion), followers, "descend"))
 
 
@@ -237,9 +237,9 @@ def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis
 
 
 def predicted(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
-    """Where a camera is, going on as it went from an earlier pose to the last.
+    """Predict a camera's pose at constant velocity from an earlier pose and the last.
 
-    `ratio` is the time since by the time between the two. At most max_distance [m] away.
+    `ratio` is the time since, divided by the time between the two. At most max_distance [m] away.
     """
     move = ratio * (before.center_world - earlier.center_world)
     length = float(np.linalg.norm(move))
@@ -249,7 +249,7 @@ def predicted(before: Pose, earlier: Pose, ratio: float, max_distance: float) ->
 
 
 def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
-    """The pose to which a frame descends from one near it, or where it explains less, from farther around."""
+    """Descend from a predicted pose; perturb it if the end has less than the least score."""
     near = descend_fine(query, descend_middle(query, start).pose)
     if near.score < least_score:
         around = descend_fine(query, perturb_middle(query, near.pose).pose)
@@ -261,19 +261,19 @@ def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
 
 
 def tracked_on(query: Query, end: Hypothesis) -> Hypothesis:
-    """A pose that explains more, farther around one that was tracked; else the same."""
+    """Perturb a tracked pose and descend again; return the better of the two."""
     around = descend_last(query, descend_fine(query, perturb_middle(query, end.pose).pose).pose)
     return max(end, around, key=lambda h: h.score)
 
 
 def descend_last(query: Query, pose: Pose) -> Hypothesis:
-    """The last descent, on the points themselves, with the score by which poses are selected."""
+    """Descend on the points themselves, and score the end as poses are selected."""
     pose = descend(query.points_at(pose), query.photo.images.full(), pose, LAST_LIMITS)
     return score_pose(query, pose)
 
 
 def found_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
-    """Poses found within a radius [m] by whole views; none if the best has less than a score."""
+    """Search by whole views within a radius [m]; return poses of at least a score."""
     x, y, z = (float(value) for value in query.scan_map.to_world(near).center_world)
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.sparse) == 0:
@@ -285,9 +285,9 @@ def found_near(query: Query, near: Pose, radius: float, least_score: float) -> l
 
 
 def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
-    """Poses found in a whole map by whole views, copies too, to centimetres, the best first.
+    """Search the whole map by whole views; return poses, copies too, to centimetres, best first.
 
-    None if the best has less than a score.
+    None if the best has less than the least score.
     """
     first = brief_query(replace(query, num_halves=0))
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
@@ -303,7 +303,7 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 
 
 def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
-    """Poses of a frame as states, with the odds that they have by whole views, the best first."""
+    """Make states of a frame's poses, best first, with odds by whole views."""
     ranked = suppressed(by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
     asked = replace(query, num_halves=0)
     best, *others = ranked
@@ -317,9 +317,9 @@ def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
 
 
 def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
-    """A pose as a state beside others of its frame, by what it explains by the best.
+    """Make a state of another pose of a frame, with its odds relative to the best state.
 
-    None if it is one of them, or so much worse that it can't be a copy.
+    None if the frame has it already, or if it is too much worse to be a copy.
     """
     best = max(states, key=lambda state: state.log_odds)
     if any(is_same(state.pose, found.pose) for state in states):
@@ -333,6 +333,6 @@ def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | 
 
 
 def is_same(pose: Pose, other: Pose) -> bool:
-    """True for two poses that are one answer."""
+    """Return True if two poses are one answer."""
     distance, angle = pose_errors(pose, other)
     return distance < MIN_DISTANCE and angle < MIN_ANGLE
