@@ -48,7 +48,7 @@ def assert_gray(open_file, path, intensity, points_world=POINTS, atol=1e-9):
     read = whole(open_file, path, GRAY)
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, points_world, atol=atol)
-    assert_refused(r"has intensity and no colours.*--intensity-as-gray", open_file, path)
+    assert_refused(r"has intensity and no colours.*`intensity_as_gray`", open_file, path)
 
 
 @pytest.mark.parametrize("kind", ["bytes", "16 bits", "decibels", "mirrors"])

@@ -125,7 +125,7 @@ def test_an_intensity_of_0_is_not_recommended(tmp_path, point_format):
             is_there = bool(intensity.any())
             why = "point format" if point_format in (1, 6) else "red green blue are 0 in all 1200 points"
             assert why in str(error.value)
-            assert ("--intensity-as-gray" in str(error.value)) == is_there
+            assert ("`intensity_as_gray`" in str(error.value)) == is_there
             assert ("its intensity is 0 in all 1200 points looked at, wanted" in str(error.value)) != is_there
 
 

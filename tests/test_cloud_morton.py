@@ -108,7 +108,7 @@ def test_millimetres_and_far_outliers_are_warned_of():
     raw = seeded_cloud(9)
     millimetres = RawCloud(raw.points_world * 1000, raw.colors)
     (warning,) = clean(Path("room.ply"), millimetres, 1.0).warnings
-    assert "--units mm" in warning
+    assert "`units` to mm" in warning
     assert "room.ply" in warning
     metres = clean(Path("room.ply"), millimetres, 0.001)
     assert metres.warnings == ()

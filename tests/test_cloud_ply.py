@@ -151,7 +151,7 @@ def test_paths_that_are_no_cloud_and_unreadable_files_are_refused(tmp_path, monk
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_scales_are_above_zero(scale):
-    with pytest.raises(InputError, match=r"--units: found .*, wanted a number above 0"):
+    with pytest.raises(InputError, match=r"`units`: found .*, wanted a number above 0"):
         CloudSettings(scale)
 
 

@@ -101,7 +101,7 @@ def test_both_ways_warn_of_the_same(scale):
     warnings = cloud.read().warnings
     assert cloud.voxels(LEVEL).warnings == warnings
     assert warnings[:2] == ("a word", "0.ply: 4 points with NaN or infinite coordinates left out")
-    assert [("--units mm" in line) for line in warnings[2:]] == ([True] if scale == 1.0 else [])
+    assert [("`units` to mm" in line) for line in warnings[2:]] == ([True] if scale == 1.0 else [])
 
 
 def test_several_files_are_named_together_and_progress_knows_each():
@@ -256,4 +256,4 @@ def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch,
         open_files([path], CloudSettings(), preset, no_cache, workers)
     (warning,) = heard
     assert warning.startswith(f"{path}: the cloud spans")
-    assert warning.endswith("set --units mm")
+    assert warning.endswith("set `units` to mm")

@@ -113,5 +113,5 @@ def test_points_too_far_away_are_left_out_and_two_scenes_are_no_map():
 
 def test_too_many_voxels_are_refused(monkeypatch):
     monkeypatch.setattr(voxels, "MAX_VOXELS", 40_000)
-    with pytest.raises(InputError, match=r"more than 40000 voxels of 0\.02 m are filled.*--units"):
+    with pytest.raises(InputError, match=r"more than 40000 voxels of 0\.02 m are filled.*`units`"):
         stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)

@@ -92,8 +92,10 @@ def test_a_position_becomes_a_prior_of_any_height():
     assert near.near_world == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)
     assert from_wgs84("EPSG:4326", latitude, longitude) is None
-    with pytest.raises(piccolo.InputError, match="--crs: found 'EPSG:0'"):
+    with pytest.raises(piccolo.InputError, match="`crs`: found 'EPSG:0'"):
         from_wgs84("EPSG:0", latitude, longitude)
+    with pytest.raises(piccolo.InputError, match="`crs`: found 'EPSG:0'"):
+        piccolo.open_scan("no_such_scan.ply", crs="EPSG:0")
 
 
 def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):

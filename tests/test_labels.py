@@ -114,7 +114,7 @@ def test_clouds_without_labels_are_refused(tmp_path):
     PlyData([mesh["vertex"], PlyElement.describe(faces, "face")]).write(str(tmp_path / "mesh.ply"))
     with pytest.raises(InputError, match=r"mesh.ply: found a mesh, wanted points with labels"):
         open_source(tmp_path / "mesh.ply", READ)
-    with pytest.raises(InputError, match="--labels, --intensity-as-gray: found both"):
+    with pytest.raises(InputError, match="`labels`, `intensity_as_gray`: found both"):
         CloudSettings(intensity_as_gray=True, labels=Labels())
 
 
@@ -163,5 +163,5 @@ def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
     assert_refused(wanted, read_panorama, write(tmp_path / "b.png", bytes(bits)), READ_IMAGE)
     with pytest.raises(InputError, match=r"found labels of 128 x 65, wanted the full sphere, W = 2 H"):
         read_panorama(_png(tmp_path / "c.png", np.zeros((65, 128), np.uint8)), READ_IMAGE)
-    with pytest.raises(InputError, match="--labels: found --fov or --projection too"):
+    with pytest.raises(InputError, match="`labels`: found `fov_deg` or `projection` too"):
         PanoramaOptions(fov_deg=90.0, labels=Labels())

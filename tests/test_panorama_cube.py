@@ -103,7 +103,7 @@ def test_grids_are_read_by_the_order_given(tmp_path, rows):
 
 def test_orders_and_shapes_that_are_no_cube_are_refused(tmp_path):
     for order in ("", "rlud", "rludff", "rludfx"):
-        with pytest.raises(InputError, match=r"cube_order: found .*, wanted each of the letters rludfb"):
+        with pytest.raises(InputError, match=r"`cube_order`: found .*, wanted each of the letters rludfb"):
             ReadOptions(cube_order=order)
     path = write(tmp_path / "a.png", encoded(picture_of(["fl"]), ".png"))
     with pytest.raises(InputError, match="found 128 x 64, wanted six equal squares as cube_order says"):

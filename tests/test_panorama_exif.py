@@ -131,9 +131,9 @@ def test_a_sphere_stays_a_sphere_whatever_its_exif(tmp_path):
 
 def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
     path = photo(tmp_path / "a.jpg")
-    assert_refused(r"found 480 x 360, wanted .*\(EXIF, --focal, --camera\)", read_panorama, path)
+    assert_refused(r"found 480 x 360, wanted .*\(EXIF, `focal_px`, `camera`\)", read_panorama, path)
     pinhole_only = ReadOptions(projection="pinhole")
-    assert_refused("found no focal length in EXIF, wanted --focal", read_panorama, path, pinhole_only)
+    assert_refused("found no focal length in EXIF, wanted `focal_px`", read_panorama, path, pinhole_only)
     wrong = calibrated([Mount(pinhole(640, 360, 100.0))])
     assert_refused("made: found a picture of 480 x 360 and a calibration for 640", read_panorama, path, wrong)
 
@@ -141,14 +141,14 @@ def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"focal_px": 0.0}, "--focal: found 0.0, wanted above 0"),
-        ({"focal_px": 500.0, "fov_deg": 60.0}, "--focal, --fov or --projection: wanted only one of them"),
+        ({"focal_px": 0.0}, "`focal_px`: found 0.0, wanted above 0"),
+        ({"focal_px": 500.0, "fov_deg": 60.0}, "`focal_px`, `fov_deg` or `projection`: wanted only one of them"),
         (
             {"projection": "cylinder"},
-            "--projection: found 'cylinder', wanted one of equirectangular, pinhole",
+            "`projection`: found 'cylinder', wanted one of equirectangular, pinhole",
         ),
-        ({"projection": "fisheye"}, "--projection fisheye: found no --fov"),
-        ({"gravity_vector": (0.0, 0.0, 0.0)}, "--gravity-vector: found .*, wanted three finite numbers"),
+        ({"projection": "fisheye"}, "`projection` fisheye: found no `fov_deg`"),
+        ({"gravity_vector": (0.0, 0.0, 0.0)}, "`gravity_vector`: found .*, wanted three finite numbers"),
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, message):
@@ -158,7 +158,7 @@ def test_options_that_mean_nothing_are_refused(options, message):
 
 def test_no_plane_shows_half_a_sphere():
     options = ReadOptions(fov_deg=179.5, projection="pinhole")
-    with pytest.raises(InputError, match=r"--fov: found 179.5 of a pinhole, wanted less than 178"):
+    with pytest.raises(InputError, match=r"`fov_deg`: found 179.5 of a pinhole, wanted less than 178"):
         panorama_of_array(PHOTO, np.ones(PHOTO.shape[:2], bool), options)
 
 

@@ -162,13 +162,13 @@ def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     around = read_panorama(path, ReadOptions(fov_deg=360.0))
     assert around.rgb.shape == (100, 200, 3)
     assert around.is_valid[10:90].all()
-    with pytest.raises(InputError, match=r"found 200 x 200, higher than the sphere .* a smaller --fov"):
+    with pytest.raises(InputError, match=r"found 200 x 200, higher than the sphere .* a smaller `fov_deg`"):
         read_panorama(write(path, encoded(RGB[:, :200], ".png")), ReadOptions(fov_deg=270.0))
 
 
 @pytest.mark.parametrize("fov_deg", [0.0, -90.0, 361.0, float("nan")])
 def test_other_fields_of_view_are_refused(fov_deg):
-    with pytest.raises(InputError, match=r"--fov: found .*, wanted above 0 and at most 360"):
+    with pytest.raises(InputError, match=r"`fov_deg`: found .*, wanted above 0 and at most 360"):
         ReadOptions(fov_deg=fov_deg)
 
 

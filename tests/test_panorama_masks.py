@@ -188,7 +188,7 @@ def test_any_white_pixel_of_a_larger_mask_counts_and_the_nadir_is_masked(tmp_pat
     is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
     np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
     for degrees in (-1.0, 91.0, float("nan")):
-        with pytest.raises(InputError, match=r"--mask-nadir: found .*, wanted 0 to 90"):
+        with pytest.raises(InputError, match=r"`mask_nadir_deg`: found .*, wanted 0 to 90"):
             ReadOptions(mask_nadir_deg=degrees)
 
 

@@ -40,7 +40,7 @@ def read_calibration(path: Path) -> Calibration:
     """Return the cameras in a file that take one picture, as `read_cameras`; InputError if they are a rig."""
     calibration = read_cameras(path)
     if calibration.is_rig:
-        raise InputError(f"{path}: found a rig, each camera with an image of its own: give it as --rig")
+        raise InputError(f"{path}: found a rig, each camera with an image of its own: give it as `rig`")
     return calibration
 
 

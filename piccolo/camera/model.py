@@ -330,5 +330,5 @@ def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:
         focal = width / math.radians(fov_deg)
         return Camera("SIMPLE_FISHEYE", width, height, (focal, width / 2.0, height / 2.0))
     if fov_deg >= 2.0 * math.degrees(MAX_PERSPECTIVE) - 1.0:
-        raise InputError(f"--fov: found {fov_deg:g} of a pinhole, wanted less than 178")
+        raise InputError(f"`fov_deg`: found {fov_deg:g} of a pinhole, wanted less than 178")
     return pinhole(width, height, width / 2.0 / math.tan(math.radians(fov_deg) / 2.0))

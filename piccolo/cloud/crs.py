@@ -4,11 +4,12 @@ import math
 import struct
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from ..errors import InputError
 from ..optional import import_optional
 from .readers import e57_file, las
+from .settings import check_crs
+
+__all__ = ["check_crs", "crs_of", "from_wgs84"]
 
 PROJECTION_USER = b"LASF_Projection"  # of LAS's records
 WKT_ID = 2112
@@ -45,16 +46,6 @@ def _of_las(path: Path) -> str:
     codes = {key: value for key, place, _, value in entries if place == 0}
     code = codes.get(PROJECTED_KEY, codes.get(GEOGRAPHIC_KEY, 0))
     return f"EPSG:{code}" if 0 < code < USER_DEFINED else ""
-
-
-def check_crs(crs: str) -> Any:
-    """Return the system that a text names, by pyproj, its heights left aside; InputError if there is none."""
-    pyproj = import_optional("GPS in photos", "pyproj", "tools")
-    try:
-        return pyproj.CRS.from_user_input(crs).to_2d()
-    except pyproj.exceptions.CRSError as error:
-        wanted = "wanted a coordinate system such as EPSG:25832"
-        raise InputError(f"--crs: found {crs[:80]!r}, {wanted}") from error
 
 
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:

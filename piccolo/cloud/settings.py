@@ -2,13 +2,14 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..geometry.pose import Array, rotation_to_z
+from ..optional import import_optional
 
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
 
@@ -26,13 +27,25 @@ class CloudSettings:
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 
     def __post_init__(self) -> None:
-        """Reject an invalid scale, and labels together with intensity."""
+        """Raise InputError for invalid values, and for labels together with intensity."""
         if self.intensity_as_gray and self.labels:
-            raise InputError("--labels, --intensity-as-gray: found both, wanted one of them")
+            raise InputError("`labels`, `intensity_as_gray`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):
-            raise InputError(f"up: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
+            raise InputError(f"`up`: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
-            raise InputError(f"--units: found {self.scale}, wanted a number above 0 (metres a unit)")
+            raise InputError(f"`units`: found {self.scale}, wanted a number above 0 (metres a unit)")
+        if self.crs:
+            check_crs(self.crs)
+
+
+def check_crs(crs: str) -> Any:
+    """Return the system of x and y that a text names, as pyproj has it; InputError if there is none."""
+    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    try:
+        return pyproj.CRS.from_user_input(crs).to_2d()
+    except pyproj.exceptions.CRSError as error:
+        wanted = "wanted a coordinate system such as EPSG:25832"
+        raise InputError(f"`crs`: found {crs[:80]!r}, {wanted}") from error
 
 
 IN_METRES = CloudSettings()

@@ -56,7 +56,7 @@ class PointValidator:
             farthest = max(-float(points.min()), float(points.max()))
             if farthest > MAX_COORDINATE:
                 found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
-                raise InputError(f"{self.path}: {found}; remove broken points or set --units")
+                raise InputError(f"{self.path}: {found}; remove broken points or set `units`")
         return points, colors
 
     def check(self) -> None:
@@ -84,7 +84,7 @@ def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
     low, high = np.percentile(samples, [1.0, 99.0], axis=0)
     if np.count_nonzero(high - low > METRES_LIMIT) >= 2:
         size = " x ".join(f"{extent:.0f}" for extent in high - low)
-        return (f"{label}: the cloud spans {size} m; if its unit is the millimetre, set --units mm",)
+        return (f"{label}: the cloud spans {size} m; if its unit is the millimetre, set `units` to mm",)
     farthest = float(np.abs(points).max())
     if farthest > FAR:
         blur = f"blur the rest to {np.spacing(np.float32(farthest)):.2g} m"

@@ -26,7 +26,7 @@ PHASE = (COARSEST << QUANTUM_BITS) // 3 + 1
 
 JOINING_BYTES = 160  # a voxel, of which two clouds' are joined: nodes, cells, codes, order, sums
 AT_ONCE = 1 << 18  # voxels, whose temporary arrays stay small
-THIN = "set --units if its unit is not the metre, or cut out a part"
+THIN = "set `units` if its unit is not the metre, or cut out a part"
 NUM_LEVELS = COARSEST.bit_length()  # from 128 leaves wide (2.56 m) down to one
 
 
@@ -222,14 +222,14 @@ class VoxelTable:
             colors = colors[num_added:]
             if len(points) and self.num_voxels < full:
                 far = f"points more than {MAX_CELL * LEAF_SIZE / 1000:.0f} km apart, wanted one scene"
-                raise InputError(f"{self.label}: {far}; remove broken points or set --units")
+                raise InputError(f"{self.label}: {far}; remove broken points or set `units`")
             if len(points):
                 self._grow()
 
     def _grow(self) -> None:
         if self.num_voxels >= MAX_VOXELS:
             found = f"more than {self.num_voxels} voxels of {LEAF_SIZE} m are filled"
-            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set --units")
+            raise InputError(f"{self.label}: {found}; if its unit is not the metre, set `units`")
         if self.num_voxels == len(self.rows):
             num_more = max(FIRST_ROWS, len(self.rows) // MORE_ROWS)
             self._check_memory(num_more * ROW_BYTES)

@@ -143,7 +143,7 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
     if abs(width - 2.0 * height) > ASPECT_TOLERANCE * 2.0 * height:
         raise InputError(f"{found} of a sphere of {width:.0f} x {height:.0f}, wanted that width = 2 x height")
     if region.height > 1.0 + ASPECT_TOLERANCE:
-        raise InputError(f"{found}, higher than the sphere at this field of view, wanted a smaller --fov")
+        raise InputError(f"{found}, higher than the sphere at this field of view, wanted a smaller `fov_deg`")
     if width > MAX_WIDTH:
         raise InputError(f"{found} of a sphere {width:.0f} wide, wanted at most {MAX_WIDTH}")
     if region.width * region.height < MIN_REGION:

@@ -81,19 +81,19 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
-        _check_number("--fov", self.fov_deg, 360.0)
-        _check_number("--focal", self.focal_px, 1e6)
+        _check_number("`fov_deg`", self.fov_deg, 360.0)
+        _check_number("`focal_px`", self.focal_px, 1e6)
         if not (math.isfinite(self.mask_nadir_deg) and 0.0 <= self.mask_nadir_deg <= 90.0):
-            raise InputError(f"--mask-nadir: found {self.mask_nadir_deg}, wanted 0 to 90")
+            raise InputError(f"`mask_nadir_deg`: found {self.mask_nadir_deg}, wanted 0 to 90")
         if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
             wanted = f"wanted each of the letters {FACE_LETTERS} once (right, left, up, down, front, back)"
-            raise InputError(f"cube_order: found {self.cube_order}, {wanted}")
+            raise InputError(f"`cube_order`: found {self.cube_order}, {wanted}")
         if self.projection is not None and self.projection not in get_args(Projection):
             wanted = f"wanted one of {', '.join(get_args(Projection))}"
-            raise InputError(f"--projection: found {self.projection!r}, {wanted}")
+            raise InputError(f"`projection`: found {self.projection!r}, {wanted}")
         vector = self.gravity_vector
         if vector is not None and not (all(map(math.isfinite, vector)) and math.hypot(*vector) > 0.0):
-            raise InputError(f"--gravity-vector: found {vector}, wanted three finite numbers, not all 0")
+            raise InputError(f"`gravity_vector`: found {vector}, wanted three finite numbers, not all 0")
         self._check_together()
 
     @property
@@ -114,20 +114,22 @@ class ReadOptions:
     def _check_together(self) -> None:
         """Refuse options that say the same thing twice, or of different pictures."""
         given = {
-            "--camera or --rig": self.calibration is not None,
-            "--focal": self.focal_px is not None,
-            "cube_order": self.cube_order is not None,
-            "--fov or --projection": self.fov_deg is not None or self.projection is not None,
+            "`camera` or `rig`": self.calibration is not None,
+            "`focal_px`": self.focal_px is not None,
+            "`cube_order`": self.cube_order is not None,
+            "`fov_deg` or `projection`": self.fov_deg is not None or self.projection is not None,
         }
         if self.focal_px is not None and self.fov_deg is None and self.projection == "pinhole":
-            given["--fov or --projection"] = False
+            given["`fov_deg` or `projection`"] = False
         names = [name for name, is_given in given.items() if is_given]
         if self.labels and names:
-            raise InputError(f"--labels: found {names[0]} too, wanted a picture of the full sphere")
+            raise InputError(f"`labels`: found {names[0]} too, wanted a picture of the full sphere")
         if len(names) > 1:
             raise InputError(f"{', '.join(names)}: wanted only one of them")
         if self.projection == "fisheye" and self.fov_deg is None:
-            raise InputError("--projection fisheye: found no --fov, wanted the angle that the width shows")
+            raise InputError(
+                "`projection` fisheye: found no `fov_deg`, wanted the angle that the width shows"
+            )
 
 
 def _check_number(option: str, value: float | None, largest: float) -> None:

@@ -35,7 +35,7 @@ Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that t
 AS_STORED = ReadOptions()
 WANTED = (
     "wanted width = 2 x height (a full equirectangular panorama), GPano metadata of a crop, a field of view "
-    "(--fov), a photo's focal length (EXIF, --focal, --camera), or the order of cube faces (cube_order)"
+    "(`fov_deg`), a photo's focal length (EXIF, `focal_px`, `camera`), or the cube's order (`cube_order`)"
 )
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
@@ -181,7 +181,7 @@ def _region_of(
         wrong = " and a crop in the metadata that does not fit it" if region is None else ""
         raise InputError(f"{path}: found {width} x {height}{wrong}, {WANTED}")
     if region.is_full and is_dual_fisheye(picture.rgb):
-        found = "two fisheye pictures side by side, wanted their calibration as --camera (docs/CAMERAS.md)"
+        found = "two fisheye pictures side by side, wanted their calibration as `camera` (docs/CAMERAS.md)"
         raise InputError(f"{path}: {found}, or that the camera's program stitches them first")
     return region, notes
 

@@ -109,8 +109,7 @@ def read_header(path: Path) -> LasHeader:
     if not head.startswith(MAGIC) or len(head) < MIN_HEADER_SIZE:
         wanted = f"wanted 'LASF' and a header of {MIN_HEADER_SIZE} bytes or more"
         raise InputError(f"{path}: begins with {head[:4]!r} and {len(head)} bytes, {wanted}")
-    major = head[24]
-    minor = head[25]
+    major, minor = head[24:26]
     sizes = struct.unpack_from("<HIIBHI", head, 94)
     header_size, points_offset, num_vlrs, format_id, record_size, num_points = sizes
     if minor >= 4:
@@ -193,7 +192,6 @@ def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
 
 
 def _without_versions(laszip: bytes) -> list[bytes]:
-    """Return the compressor, the number of items, and the type and size of each."""
     items = [laszip[k : k + TYPE_AND_SIZE] for k in range(ITEMS_AT, len(laszip), ITEM_SIZE)]
     return [laszip[:2], laszip[ITEMS_AT - 2 : ITEMS_AT], *items]
 
@@ -316,7 +314,6 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 def _gray_source(
     header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
 ) -> PointSource:
-    """Return the points with their intensity for a gray, if that is wanted, of a file without colours."""
     if not options.intensity_as_gray:
         why = f"red green blue are 0 in all {num_samples} points looked at"
         if not header.has_colors:
@@ -372,7 +369,6 @@ def _largest(header: LasHeader, layout: LasLayout, name: str) -> tuple[int, int]
 
 
 def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[PointsWithScalar]:
-    """Yield the points with their `intensity` or `class`."""
     bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
     for records in _chunks(header, layout):
         points_world, kept = _points(header, records)

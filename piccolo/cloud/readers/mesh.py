@@ -200,7 +200,7 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
     area = total * scale * scale  # [m^2]
     num_points = round(min(area * DENSITY, MAX_POINTS))
     if num_points == 0:
-        raise InputError(f"{path}: an area of {area:.2g} square metres, too small for points; set --units")
+        raise InputError(f"{path}: an area of {area:.2g} square metres, too small for points; set `units`")
     if area * DENSITY > MAX_POINTS:
         density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
         notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
