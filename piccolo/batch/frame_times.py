@@ -34,7 +34,7 @@ def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
         if source is None and not (times and all(a < b for a, b in pairwise(times))):
             return None
         if times is None:
-            raise InputError("--times exif: found a frame without a time in EXIF, wanted one in all")
+            raise InputError("`times` exif: found a frame without a time in EXIF, wanted one in all")
     elif source == NAMES:
         times = [_number_in(frame) for frame in frames]
     else:
@@ -60,7 +60,7 @@ def exif_times(frames: Sequence[Path]) -> list[float] | None:
 def _number_in(frame: Path) -> float:
     found = NUMBER.findall(frame.stem)
     if not found:
-        raise InputError(f"--times names: found no number in {frame.name}, wanted seconds in each name")
+        raise InputError(f"`times` names: found no number in {frame.name}, wanted seconds in each name")
     return float(found[-1])
 
 

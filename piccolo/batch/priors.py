@@ -41,7 +41,7 @@ class PriorTable:
             try:
                 check_within(scan_map, prior.within)
             except InputError as error:
-                text = str(error).replace("--within", f"{self.path}: within, of {name}")
+                text = str(error).replace("`within`", f"{self.path}: within, of {name}")
                 raise InputError(text) from error
 
     @property

@@ -12,7 +12,7 @@ from ..files.line_file import LineFile, whole_lines, whole_size
 from ..result import FAILED, FORMAT
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
-WAYS = "--overwrite starts again, another --out keeps both"
+WAYS = "`overwrite` starts again, another `out` keeps both"
 Name = TypeVar("Name", Path, str)
 
 

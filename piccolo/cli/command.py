@@ -9,7 +9,7 @@ from typing import Any
 from ..jobs.memory import check_address_space
 from .errors import UsageError, print_note, raising_signals, report_error
 from .progress import log_shown
-from .start import as_started
+from .start import as_started, for_terminal
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
@@ -25,7 +25,7 @@ class HelpFormatter(argparse.RawDescriptionHelpFormatter):
 
     def format_help(self) -> str:
         """Return the usage or the whole help."""
-        return as_started(super().format_help())
+        return for_terminal(super().format_help())
 
 
 def new_parser(

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from ..errors import InputError, printable, text_of
 from ..jobs.memory import is_shortage
-from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, for_terminal
 
 EXIT_BAD_USAGE = 2
 EXIT_BAD_INPUT = 3
@@ -121,11 +121,11 @@ def print_error(arguments: argparse.Namespace, text: str, exit_code: int) -> int
     """One line on stderr, with --debug after the traceback of the error at hand; returns the exit code."""
     if arguments.debug and sys.exc_info()[0]:
         traceback.print_exc()
-    tqdm.write(f"{arguments.program}: {as_started(printable(text))}", file=sys.stderr)
+    tqdm.write(f"{arguments.program}: {for_terminal(printable(text))}", file=sys.stderr)
     return exit_code
 
 
 def print_note(arguments: argparse.Namespace, text: str) -> None:
     """One line on stderr, but not with --quiet."""
     if not arguments.quiet:
-        tqdm.write(f"{arguments.program}: {printable(text)}", file=sys.stderr)
+        tqdm.write(f"{arguments.program}: {for_terminal(printable(text))}", file=sys.stderr)

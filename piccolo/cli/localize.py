@@ -47,6 +47,7 @@ from .executing import (
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, shown, warn_once
+from .start import for_terminal
 from .walking import check_plan, check_walk_options, run_walk, walk_inputs
 
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
@@ -173,7 +174,7 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
     elif not arguments.quiet:
-        warnings = (f"warning: {printable(warning)}" for warning in answer.warnings)
+        warnings = (f"warning: {for_terminal(printable(warning))}" for warning in answer.warnings)
         for line in (*warnings, result.summary()):
             tqdm.write(line, file=sys.stderr)
     write(result.to_json())

@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from ..errors import printable
 from ..jobs.threads import Progress
+from .start import for_terminal
 
 DELAY = 0.5  # seconds: what takes less needs no bar
 COUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left"
@@ -42,7 +43,7 @@ def warn_once(is_quiet: bool) -> Callable[[str], None]:
     def warn(warning: str) -> None:
         if not is_quiet and warning not in printed:
             printed.add(warning)
-            tqdm.write(f"warning: {printable(warning).replace(' up=', ' --up ')}", file=sys.stderr)
+            tqdm.write(f"warning: {for_terminal(printable(warning))}", file=sys.stderr)
 
     return warn
 

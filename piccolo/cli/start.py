@@ -21,6 +21,15 @@ COMMANDS = (
     "make_room", "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
 )  # fmt: skip
 SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
+# a parameter of the API in a message, the unit in its name, and those whose flag has another name
+PARAMETER = re.compile("`([a-z][a-z0-9_]*)`")
+UNIT = re.compile("_(deg|px|world)$")
+FLAGS = {
+    "num_threads": "--threads",
+    "radius": "RADIUS of --near",
+    "heading_tolerance_deg": "the tolerance of --heading",
+    "cube_order": "the order of cube faces",
+}
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)
 EXIT_CANNOT_START = 3
@@ -33,6 +42,13 @@ def __getattr__(name: str) -> Callable[[], int]:
     if name not in COMMANDS:
         raise AttributeError(f"piccolo has no command {name!r}")
     return partial(run, name)
+
+
+def for_terminal(text: str) -> str:
+    """Return a message in the words of the command line: parameters in backticks become flags."""
+    return PARAMETER.sub(
+        lambda m: FLAGS.get(m[1]) or f"--{UNIT.sub('', m[1]).replace('_', '-')}", as_started(text)
+    )
 
 
 def as_started(text: str) -> str:

@@ -93,4 +93,4 @@ def classify(probabilities: Array, min_confidence: float) -> str:
 def check_confidence(min_confidence: float) -> None:
     """Refuse a threshold that no confidence can pass or fail."""
     if not 0.0 < min_confidence < 1.0:
-        raise InputError(f"--min-confidence: found {min_confidence}, wanted above 0 and below 1")
+        raise InputError(f"`min_confidence`: found {min_confidence}, wanted above 0 and below 1")

@@ -34,7 +34,7 @@ SETTINGS = {
     "distributed.worker.profile.enabled": False,  # samples of all stacks, a hundred a second
     "distributed.scheduler.worker-saturation": 1.0,  # none waits behind another whose worker may be lost
 }
-NO_SCHEDULER = f"--dask {{}}: no scheduler answers there within {TIMEOUT:.0f} s ({{}}); wanted "
+NO_SCHEDULER = f"`dask` {{}}: no scheduler answers there within {TIMEOUT:.0f} s ({{}}); wanted "
 NO_SCHEDULER += f"its address, such as tcp://host:8786, the file that it has written, or {LOCAL}"
 _opening = threading.Lock()
 
@@ -45,8 +45,8 @@ def connected(address: str, num_processes: int, num_threads: int) -> Iterator["C
 
     Raises InputError if dask.distributed is missing, or no scheduler or worker of this version answers.
     """
-    import_optional("--dask", "dask", "distributed").config.set(SETTINGS)
-    distributed = import_optional("--dask", "distributed", "distributed")
+    import_optional("`dask`", "dask", "distributed").config.set(SETTINGS)
+    distributed = import_optional("`dask`", "distributed", "distributed")
     with ExitStack() as stack:
         if address == LOCAL:
             scheduler = stack.enter_context(_local_cluster(distributed, num_processes, num_threads))
@@ -84,7 +84,7 @@ def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> It
     """Yield the address of a scheduler in this process, with workers in others that end with it."""
     # In place of Dask's own, of which MALLOC_TRIM_THRESHOLD_ makes large arrays slow.
     environment = dict.fromkeys(LIBRARIES, str(num_threads))
-    import_optional("--dask", "dask", "distributed").config.set({ENVIRONMENT: environment})
+    import_optional("`dask`", "dask", "distributed").config.set({ENVIRONMENT: environment})
     resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
     # What this thread blocks, its children do: Ctrl-C is for this process, and not for the others.
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
@@ -121,13 +121,13 @@ class Cluster:
             versions = set(self._client.run(_version).values())
         except TimeoutError as error:
             text = f"found a scheduler without workers for {TIMEOUT:.0f} s, wanted one at least"
-            raise InputError(f"--dask {self.address}: {text}") from error
+            raise InputError(f"`dask` {self.address}: {text}") from error
         except Exception as error:  # of a worker, in words
             text = f"a worker can't run piccolo ({error}); install version {__version__} there"
-            raise InputError(f"--dask {self.address}: {text}") from error
+            raise InputError(f"`dask` {self.address}: {text}") from error
         if odd := sorted(versions - {__version__}):
             text = f"found a worker with piccolo {odd[0]}, wanted {__version__} as here"
-            raise InputError(f"--dask {self.address}: {text}")
+            raise InputError(f"`dask` {self.address}: {text}")
 
     def has_files(self, paths: Sequence[Path]) -> bool:
         """Return True if all workers see the files."""
@@ -170,13 +170,13 @@ class Cluster:
             count = error.allowed_failures + 1
             raise WorkerLostError(f"each of {count} workers of the cluster was lost at work on it") from error
         except (self._distributed.client.FutureCancelledError, CancelledError) as error:
-            text = f"--dask {self.address}: the scheduler was lost; the same command goes on from here"
+            text = f"`dask` {self.address}: the scheduler was lost; the same command goes on from here"
             raise InputError(text) from error
 
 
 def sent_file(name: str) -> Path:
     """Return where a worker has what `Cluster.send_file` has sent it."""
-    worker = import_optional("--dask", "distributed", "distributed").get_worker()
+    worker = import_optional("`dask`", "distributed", "distributed").get_worker()
     return Path(worker.local_directory) / name
 
 

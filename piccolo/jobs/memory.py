@@ -23,7 +23,7 @@ LIMIT: list[float] = []  # [byte] of this process, if the user sets one
 def limit_memory(gigabytes: float | None) -> None:
     """Set the memory [10^9 byte] that this process may take in all; None for a part of what is free."""
     if gigabytes is not None and not gigabytes > 0.0:
-        raise InputError(f"--max-memory: found {gigabytes:g}, wanted gigabytes above 0")
+        raise InputError(f"`max_memory`: found {gigabytes:g}, wanted gigabytes above 0")
     LIMIT[:] = [] if gigabytes is None else [gigabytes * GB]
 
 
@@ -33,7 +33,7 @@ def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
     if num_bytes > room:
         needs = f"{purpose} needs {num_bytes / GB:.2g} GB of memory"
         left = f"{max(room, 0.0) / GB:.2g} GB may be taken"
-        raise ResourceError(f"{needs}, {left}; {advice}, or raise --max-memory")
+        raise ResourceError(f"{needs}, {left}; {advice}, or raise `max_memory`")
 
 
 def memory_left() -> float:

@@ -19,7 +19,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, TypeVar, cast
+from typing import Any
 
 import llvmlite.binding as llvm
 import numba
@@ -198,8 +198,6 @@ class KernelCache:
 # branch alone stops LLVM vectorising a loop. "nnan" and "ninf" stay off: a point at the camera divides by 0.
 FASTMATH = {"nsz", "arcp", "contract", "afn", "reassoc"}
 
-Function = TypeVar("Function", bound=Callable[..., Any])
-
 F0 = np.float32(0.0)
 F1 = np.float32(1.0)
 HALF = np.float32(0.5)
@@ -207,10 +205,7 @@ HALF = np.float32(0.5)
 
 # A function of scalars that kernels call. Always inlined, as are kernels in kernels: a call would go to
 # whichever copy of the callee was loaded first, and a first run had other last bits than the runs after it.
-def inline_kernel(function: Function) -> Function:
-    """Compile a function of scalars into each kernel that calls it."""
-    compiled = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)(function)
-    return cast(Function, compiled)
+inline_kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)
 
 
 @inline_kernel
@@ -223,9 +218,9 @@ def copy_to(target, source):
         target.flat[k] = source.flat[k]
 
 
-def kernel(function: Function) -> Function:
+def kernel(function: Callable[..., Any]) -> Any:  # a Numba dispatcher, which has no type
     """Compile a function of arrays and scalars on its first call; kept between runs by KernelCache."""
     dispatcher: Any = inline_kernel(function)
     if hasattr(dispatcher, "enable_caching"):  # not with NUMBA_DISABLE_JIT=1
         dispatcher._cache = KernelCache(function)
-    return cast(Function, dispatcher)
+    return dispatcher

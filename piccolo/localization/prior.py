@@ -18,14 +18,16 @@ def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.b
     """Which candidates (N,) each option allows, by half a grid spacing more than it says."""
     allowed: dict[str, NDArray[np.bool_]] = {}
     if prior.near_world is not None and prior.radius is not None:
-        allowed["--near"] = distances_to(scan_map, prior.near_world) <= prior.radius + COARSE_SPACING / 2
+        allowed["`near_world`"] = (
+            distances_to(scan_map, prior.near_world) <= prior.radius + COARSE_SPACING / 2
+        )
     if prior.height is not None:
         heights = heights_above_floor(scan_map.octree, scan_map.centers)
         low, high = prior.height
         is_high_enough = heights >= low - COARSE_SPACING / 2
-        allowed["--height"] = is_high_enough & (heights <= high + COARSE_SPACING / 2)
+        allowed["`height`"] = is_high_enough & (heights <= high + COARSE_SPACING / 2)
     if prior.within:
-        allowed["--within"] = candidates_within(scan_map, prior.within)
+        allowed["`within`"] = candidates_within(scan_map, prior.within)
     return allowed
 
 
@@ -38,7 +40,7 @@ def distances_to(scan_map: ScanMap, near_world: tuple[float, float, float | None
 
 
 def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
-    """Why no candidate is left, as a warning: how many each option allows, and the nearest to --near."""
+    """Return a warning that no candidate is left: how many each option allows, and the nearest one."""
     num = len(scan_map.centers)
     if num == 0:
         return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
@@ -49,7 +51,7 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
     distances = distances_to(scan_map, prior.near_world)
     k = int(distances.argmin())
     x, y, z = scan_map.R_map_from_world.T @ scan_map.centers[k] + scan_map.origin_world
-    return f"{text}; the nearest to --near is {x:.2f} {y:.2f} {z:.2f}, {distances[k]:.2f} m away"
+    return f"{text}; the nearest to `near_world` is {x:.2f} {y:.2f} {z:.2f}, {distances[k]:.2f} m away"
 
 
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:

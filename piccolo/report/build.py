@@ -80,7 +80,7 @@ def build_report(
         raise InputError("report: found no result")
     if settings.is_self_contained and len(entries) > MAX_SELF_CONTAINED:
         found = f"found {len(entries)} photos, wanted {MAX_SELF_CONTAINED} or fewer"
-        raise InputError(f"--self-contained: {found}; without it the report is a folder")
+        raise InputError(f"`self_contained`: {found}; without it the report is a folder")
     note = check_settings(settings, scan_map, entries)
     with temporary_folder() if settings.is_self_contained else nullcontext(out) as folder:
         if not settings.is_self_contained:
@@ -101,7 +101,7 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     found = max(len(scan_map.storeys.storeys), 1)
     if settings.storey_names and len(settings.storey_names) != found:
         names = f"found {len(settings.storey_names)} names"
-        raise InputError(f"--storeys: {names}, wanted {found}, as the scan has storeys, the lowest first")
+        raise InputError(f"`storeys`: {names}, wanted {found}, as the scan has storeys, the lowest first")
     for plan in settings.own_plans:
         if not 1 <= plan.storey <= found:
             raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")

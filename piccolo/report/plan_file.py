@@ -127,7 +127,7 @@ def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
     file = io.BytesIO()
     how = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(form, {})
     options = {"svg.fonttype": "none", "svg.hashsalt": "piccolo"}  # texts stay texts, the same each time
-    with import_optional("--plan", "matplotlib", "tools").rc_context(options):
+    with import_optional("`plan`", "matplotlib", "tools").rc_context(options):
         figure.savefig(file, format=form, metadata=how)
     return file.getvalue()
 
@@ -192,7 +192,7 @@ def _fraction(color: tuple[int, int, int]) -> tuple[float, ...]:
 
 def dxf_of(document: dict[str, Any]) -> bytes:
     """Points, headings, 95 % ellipses and names in metres of the scan's coordinates."""
-    ezdxf = import_optional("--plan", "ezdxf", "tools")
+    ezdxf = import_optional("`plan`", "ezdxf", "tools")
     drawing = ezdxf.new("R2010", setup=True)
     drawing.header["$INSUNITS"] = 6
     drawing.header["$PDMODE"] = 34

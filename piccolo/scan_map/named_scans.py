@@ -23,18 +23,18 @@ def is_name(name: str) -> bool:
 def check_name(name: str, taken: Sequence[str]) -> None:
     """Refuse an invalid or duplicate name of a scan, or one scan too many."""
     if not is_name(name):
-        raise InputError(f"--name: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
+        raise InputError(f"`name`: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
     if name in taken:
-        raise InputError(f"--name: found {name!r}, which the map has already: {_listed(taken)}")
+        raise InputError(f"`name`: found {name!r}, which the map has already: {_listed(taken)}")
     if len(taken) >= MAX_SCANS:
-        raise InputError(f"--add: found a map of {len(taken)} scans, the most that one holds")
+        raise InputError(f"`add`: found a map of {len(taken)} scans, the most that one holds")
 
 
 def named(scan_map: ScanMap, name: str) -> ScanMap:
     """Name the scan of a map of one scan."""
     check_name(name, ())
     if len(scan_map.scan_names) > 1:
-        raise InputError(f"--name: found a map of several scans: {_listed(scan_map.scan_names)}")
+        raise InputError(f"`name`: found a map of several scans: {_listed(scan_map.scan_names)}")
     return replace(scan_map, scan_names=(name,), scan_of_candidate=np.zeros_like(scan_map.scan_of_candidate))
 
 
@@ -46,10 +46,12 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
     """Refuse names that no scan of a map has."""
     names = scan_map.scan_names
     if within and not names:
-        raise InputError("--within: found a scan without names, wanted a map by tools/prepare_map.py --name")
+        raise InputError(
+            "`within`: found a scan without names, wanted a map by tools/prepare_map.py with `name`"
+        )
     for name in within:
         if name not in names:
-            raise InputError(f"--within: found {name!r}, wanted of {_listed(names)}")
+            raise InputError(f"`within`: found {name!r}, wanted of {_listed(names)}")
 
 
 def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:

@@ -106,7 +106,7 @@ def extended_map(
     if path := prepared_map_among(paths):
         raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
     if cloud_settings.up != "auto":
-        raise InputError("--up: found beside --add, wanted without; a scan is added in the map's axes")
+        raise InputError("`up`: found beside `add`, wanted without; a scan is added in the map's axes")
     with watch.stage("read"):
         old = load_map(map_path)
         cloud = open_cloud(paths, cloud_settings, workers.show)
@@ -125,7 +125,7 @@ def extended_map(
 def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSettings) -> None:
     """Refuse a map of labels where colours are asked for, and the other way round."""
     if scan_map.has_labels != (cloud_settings.labels is not None):
-        kind = "labels, wanted --labels too" if scan_map.has_labels else "colours, wanted no --labels"
+        kind = "labels, wanted `labels` too" if scan_map.has_labels else "colours, wanted no `labels`"
         raise InputError(f"{map_path}: found a prepared map of {kind}")
 
 

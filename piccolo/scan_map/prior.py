@@ -23,13 +23,13 @@ class Prior:
         """Refuse what contradicts itself, naming the option."""
         numbers = *(self.near_world or ()), *(self.height or ()), self.radius, self.heading_deg
         if not all(math.isfinite(number) for number in numbers if number is not None):
-            raise InputError("--near, --height, --heading: found nan or inf, wanted finite numbers")
+            raise InputError("`near_world`, `height`, `heading`: found nan or inf, wanted finite numbers")
         if (self.near_world is None) != (self.radius is None):
             raise InputError("near_world, radius: found one of them, wanted both or none")
         if self.radius is not None and self.radius <= 0.0:
             raise InputError(f"radius: found {self.radius}, wanted metres above 0")
         if self.height is not None and not self.height[0] < self.height[1]:
-            raise InputError(f"--height: found {list(self.height)}, wanted MIN below MAX")
+            raise InputError(f"`height`: found {list(self.height)}, wanted MIN below MAX")
         if not 0.0 < self.heading_tolerance_deg <= 180.0:
             raise InputError(f"heading_tolerance_deg: found {self.heading_tolerance_deg}, wanted 0 to 180")
 

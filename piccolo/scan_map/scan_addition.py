@@ -82,13 +82,13 @@ def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]
     """Read a scan into an octree of its own, in a map's frame; with warnings."""
     if old.octree.leaf_size != LEAF_SIZE:
         found = f"found a map of voxels of {old.octree.leaf_size} m"
-        raise InputError(f"--add: {found}, wanted {LEAF_SIZE} m; prepare it again")
+        raise InputError(f"`add`: {found}, wanted {LEAF_SIZE} m; prepare it again")
     voxels = cloud.voxels(old.R_map_from_world)
     nodes = voxels.nodes.copy()
     nodes[:, :3] += voxels.origin - np.rint(old.R_map_from_world @ old.origin_world)
     if (farthest := float(np.abs(nodes[:, :3]).max())) > WINDOW * LEAF_SIZE:
         found = f"found a scan {farthest / 1000.0:.0f} km from the map's"
-        raise InputError(f"--add: {found}, wanted one coordinate system")
+        raise InputError(f"`add`: {found}, wanted one coordinate system")
     own = old.octree.level(COARSE_VOXEL)[:, :3]
     added = nodes[:, :3]
     gap = np.maximum(added.min(axis=0) - own.max(axis=0), own.min(axis=0) - added.max(axis=0))
@@ -195,5 +195,5 @@ def joined_features(old: ScanMap, octree: Octree, found: Candidates, workers: Wo
     more = view_positions(centers, seen_by(octree, centers), SEARCH_VIEW.num_rings, num_known)
     anew = np.concatenate([place[has_place & ~is_kept], looked_at[more]])
     if np.count_nonzero(is_kept) + len(anew) > MOST_VIEWS:
-        raise InputError(f"--add: found more than {MOST_VIEWS} views with features, the most of one map")
+        raise InputError(f"`add`: found more than {MOST_VIEWS} views with features, the most of one map")
     return extend_feature_map(old.local_features, is_kept, octree, found.centers[anew], workers)

@@ -149,7 +149,7 @@ def candidates_of(
         if prior.near_world is None or prior.radius is None:
             raise
     near = frame[0] @ (np.array(prior.near_world) - frame[1])
-    part = f"prepared within {prior.radius:g} m of --near, for this run only"
+    part = f"prepared within {prior.radius:g} m of `near_world`, for this run only"
     text = f"the scan is too large as a whole: {part}"
     centers = candidate_centers(octree, workers, Ball(near, prior.radius))
     workers.warn(text)
@@ -216,7 +216,7 @@ def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> t
     nearest = f"{'-' if up_world[k] < 0.0 else ''}{'xyz'[k]}"
     angle = np.degrees(np.arccos(max(cosine, -1.0)))
     text = f"the floors face {angle:.0f} deg away from {taken}, which is taken for up ({reason})"
-    return (f"{text}; set up={nearest}, or turn the scan by tools/align_gravity.py",)
+    return (f"{text}; set `up` to {nearest}, or turn the scan by tools/align_gravity.py",)
 
 
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:

@@ -30,7 +30,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     """Return the rooms that the list names, or one by the folder's name."""
     found = [path for name in LISTS if (path := options.folder / name).exists()]
     if not options.poses and len(found) != 1:
-        wanted = f"wanted one of {', '.join(LISTS)}, or --poses"
+        wanted = f"wanted one of {', '.join(LISTS)}, or `poses`"
         raise InputError(f"{options.folder}: found {len(found)} lists, {wanted}")
     path = options.poses or options.inside(found[0])
     entries: dict[str, list[Entry]] = defaultdict(list)
@@ -139,7 +139,7 @@ def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> Sce
     found = {cloud for cloud, _ in entries}
     clouds = {cloud or options.cloud or only_cloud_in(options.folder) for cloud in found}
     if None in clouds:
-        raise InputError(f"{options.folder}: found no cloud, wanted one, or --cloud, or a column `cloud`")
+        raise InputError(f"{options.folder}: found no cloud, wanted one, or `cloud`, or a column 'cloud'")
     if len(clouds) > 1:
         names = ", ".join(sorted(map(str, clouds))[:2])
         raise InputError(f"room {room}: found the clouds {names}, wanted one")

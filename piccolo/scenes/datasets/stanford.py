@@ -71,7 +71,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
             specs.append(SceneSpec(NAME, name, parts, panoramas, settings=settings))
         else:
             missing.append(name)
-    layout = f"room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with --labels Annotations)"
+    layout = f"room with panoramas ({PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with `labels` Annotations)"
     return scene_list(options.folder, specs, missing, layout)
 
 

@@ -42,7 +42,7 @@ def write_scene(spec: SceneSpec, out: Path, copies: bool = False, show: Progress
         source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
         if source != spec.source:
             found = f"found a scene of {json.dumps(source)}, wanted {json.dumps(spec.source)}"
-            raise InputError(f"{folder}: {found}: remove it, or change --out")
+            raise InputError(f"{folder}: {found}: remove it, or change `out`")
         return Written(folder, None, len(scene.queries))
     folder.parent.mkdir(parents=True, exist_ok=True)
     check_output_folder(folder)

@@ -185,7 +185,7 @@ def check_variants(scenes: Sequence[Scene], variants: Sequence[str]) -> None:
     """Refuse variants that no query of the scenes has."""
     known = {query.variant for scene in scenes for query in scene.queries}
     if missing := [variant for variant in variants if variant not in known]:
-        raise InputError(f"--variants: found no {missing[0]}, wanted some of {', '.join(sorted(known))}")
+        raise InputError(f"`variants`: found no {missing[0]}, wanted some of {', '.join(sorted(known))}")
 
 
 def input_files(scenes: Sequence[Scene]) -> list[Path]:

@@ -25,7 +25,7 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     form = FORMATS[name]
     (check_output_folder if form.is_folder else check_output)(out)
     if not results:
-        raise InputError(f"{out}: there is no pose to write; --all also writes those that are not localized")
+        raise InputError(f"{out}: there is no pose to write; `all` also writes those that are not localized")
     images, left_out = posed_images(results, form, options)
     form.write(images, out, options)
     return left_out

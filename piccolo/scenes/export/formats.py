@@ -69,7 +69,7 @@ def write_offset_beside(out: Path, options: Options) -> None:
     if options.offset is None:
         return
     if is_stream(out):
-        raise InputError(f"--offset: nothing can be written beside {out}, wanted a file as --out")
+        raise InputError(f"`offset`: nothing can be written beside {out}, wanted a file as `out`")
     write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
 
 
@@ -257,10 +257,10 @@ def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tu
     try:
         system = pyproj.CRS.from_user_input(crs)
     except pyproj.exceptions.CRSError as error:
-        raise InputError(f"--crs: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+        raise InputError(f"`crs`: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
     units = {axis.unit_name for axis in system.axis_info[:2]}
     if not system.is_projected or units != {"metre"}:
-        raise InputError(f"--crs: found {crs} ({system.name}), wanted a projected system in metres")
+        raise InputError(f"`crs`: found {crs} ({system.name}), wanted a projected system in metres")
     transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
     for image in images:
         _check_place(image, system, transformer, crs)
@@ -318,9 +318,9 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
 
 OFFSET = frozenset({"offset"})
 MODEL = OFFSET | {"size"}
-COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; --out is a new folder"
-NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that --images names"
-POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that --images names"
+COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; `out` is a new folder"
+NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that `images` names"
+POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that `images` names"
 # a blank ends a name, for COLMAP as for the readers in Python
 COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=rf"\s|{NO_UTF8}", cameras="own")
 NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL, cameras="spheres")
@@ -334,7 +334,7 @@ NOT_IN_POTREE = rf"[\"\t\n\r]|{NO_UTF8}"
 POTREE = Format(
     "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden=NOT_IN_POTREE, cameras="spheres"
 )
-GEOJSON_TEXT = "points for maps, in WGS84; needs --crs and the library pyproj"
+GEOJSON_TEXT = "points for maps, in WGS84; needs `crs` and the library pyproj"
 GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
-GPX_TEXT = "track of the positions in WGS84; needs --crs and the library pyproj"
+GPX_TEXT = "track of the positions in WGS84; needs `crs` and the library pyproj"
 GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")

@@ -51,11 +51,11 @@ class Segment(NamedTuple):
 
 
 def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write a copy of each picture into a new folder, under its name in --images or its file name."""
+    """Write a copy of each picture into a new folder, under its name in `images` or its file name."""
     names = [image.name if options.images else Path(image.name).name for image in images]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{twice}: two pictures have this name; --images FOLDER tells them apart")
+        raise InputError(f"{twice}: two pictures have this name; `images` FOLDER tells them apart")
     with replacing_folder(out) as folder:
         for name, image in zip(names, images, strict=True):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -157,5 +157,5 @@ def _with_fields(
     return packet[:place] + description + packet[place:]
 
 
-TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; --out is a new folder"
+TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; `out` is a new folder"
 GPANO = Format("gpano", TEXT, write, is_folder=True, forbidden="", cameras="spheres", check=_copy)

@@ -50,9 +50,9 @@ class Options:
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the option."""
         if self.size is not None:
-            check_size("--size", self.size)
+            check_size("`size`", self.size)
         if self.offset is not None and not all(math.isfinite(value) for value in self.offset):
-            raise InputError(f"--offset: found {self.offset}, wanted three finite numbers")
+            raise InputError(f"`offset`: found {self.offset}, wanted three finite numbers")
 
 
 class Format(NamedTuple):
@@ -105,7 +105,7 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     known = {result.cloud_name for result in results}
     if missing := [cloud for cloud in clouds if cloud not in known]:
         wanted = ", ".join(sorted(known))
-        raise InputError(f"--cloud: found no result for {missing[0]}, wanted one of {wanted}")
+        raise InputError(f"`cloud`: found no result for {missing[0]}, wanted one of {wanted}")
     chosen = []
     left_out = Counter[str]()
     for result in results:
@@ -141,7 +141,7 @@ def posed_images(
             key = image.name if form.has_unique_names else str(index)
             if key in posed:
                 clouds = f"{posed[key].result.cloud_name}, {result.cloud_name}"
-                raise InputError(f"{key}: has two results (clouds {clouds}); --cloud chooses one")
+                raise InputError(f"{key}: has two results (clouds {clouds}); `cloud` chooses one")
             posed[key] = image
     if not posed:
         reason, names = next(iter(left_out.items()))
@@ -176,10 +176,10 @@ def _time(result: Result, path: Path, index: int, options: Options) -> str:
         return str(index)
     if options.timestamps == "walk":
         if result.walk is None:
-            raise InputError(f"{path}: found no frame of a walk, as --timestamps walk needs")
+            raise InputError(f"{path}: found no frame of a walk, as `timestamps` walk needs")
         return repr(result.walk.time)
     if not re.fullmatch(r"\d+(\.\d+)?", path.stem):
-        raise InputError(f"{path}: its name {path.stem!r} is no number, as --timestamps name needs")
+        raise InputError(f"{path}: its name {path.stem!r} is no number, as `timestamps` name needs")
     return path.stem
 
 
@@ -204,7 +204,7 @@ def _size(path: Path, options: Options) -> tuple[int, int]:
     try:
         size = options.size or panorama_size(path)
     except InputError as error:
-        raise InputError(f"{error}; with --size W H no picture is needed") from error
+        raise InputError(f"{error}; with `size` W H no picture is needed") from error
     check_size(str(path), size)
     return size
 
@@ -218,5 +218,5 @@ def _name(pano: Path, images: Path | None) -> str:
         return pano.as_posix()
     name = Path(os.path.relpath(pano, images))
     if ".." in name.parts:
-        raise InputError(f"{pano}: is not in the folder --images {images}")
+        raise InputError(f"{pano}: is not in the folder `images` {images}")
     return name.as_posix()

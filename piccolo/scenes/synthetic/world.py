@@ -214,12 +214,12 @@ def check_cameras(cameras: Calibration) -> None:
     path = cameras.path
     mounts = cameras.mounts
     if cameras.is_choice and len(mounts) > 1:
-        raise InputError(f"--camera: found {len(mounts)} cameras in {path}, wanted one, or those of a rig")
+        raise InputError(f"`camera`: found {len(mounts)} cameras in {path}, wanted one, or those of a rig")
     if not cameras.has_sizes or max(extent_of(mounts)) > MAX_SIDE:
-        raise InputError(f"--camera: found pictures of no size in {path}, or over {MAX_SIDE} px")
+        raise InputError(f"`camera`: found pictures of no size in {path}, or over {MAX_SIDE} px")
     names = [mount.image for mount in mounts if mount.image is not None]
     if any(re.search(r"[*?|\[/]", name) or not name.endswith((".jpg", ".png")) for name in names):
-        raise InputError(f"--camera: found images {names} in {path}, wanted names of .jpg or .png files")
+        raise InputError(f"`camera`: found images {names} in {path}, wanted names of .jpg or .png files")
 
 
 def make_photos(
