@@ -25,7 +25,7 @@ from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .result import Result, Source, failure_of, result_of, unreadable_result
-from .scan_map.named_scans import check_within, with_places
+from .scan_map.named_scans import add_places, check_within
 from .scan_map.prior import GpsPrior, gps_prior
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk, WalkAbout, photo_facts
@@ -108,14 +108,14 @@ class OpenedScan:
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
             if read_options.use_gps and (gps := self.gps_prior_of(photo, settings)):
-                near = replace(settings, prior=gps.applied_to(settings.prior))
+                near = replace(settings, prior=gps.apply_to(settings.prior))
                 attempts = [(near, gps), (settings, replace(gps, is_used=False))]
             run = localize_guessed if has_guessed_focal(picture) else localize
             for tried, gps in attempts:  # noqa: B007  near the GPS position, or else anywhere
                 found = run(self.prepared, picture, tried, self.workers, watch)
                 if found.status == LOCALIZED:
                     break
-            found = with_places(self.prepared, found)
+            found = add_places(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:

@@ -24,7 +24,7 @@ from .paper.localize import PaperMap
 from .paper.localize import prepare as prepare_by_paper
 from .scan import Scan
 from .scan_map.named_scans import check_within
-from .scan_map.open_map import CachePolicy, open_map, prepared_map_among
+from .scan_map.open_map import CachePolicy, find_prepared_map, open_map
 from .scan_map.scan_map import ScanMap, prepare_map
 
 Units = Literal["mm", "cm", "m", "ft", "us-ft"]
@@ -128,7 +128,7 @@ def open_files(
         scan_map = open_map(paths, cloud_settings, cache, workers, watch, settings.prior)
         check_within(scan_map, settings.prior.within)
         return OpenedScan(scan_map, name, cloud_settings, settings, workers, watch.seconds)
-    if map_path := prepared_map_among(paths):
+    if map_path := find_prepared_map(paths):
         raise InputError(f"{map_path}: a prepared map; the preset paper needs the cloud itself")
     with watch.stage("read"):
         cloud = open_cloud(paths, cloud_settings, workers.show)

@@ -19,7 +19,7 @@ from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, T_world_from_cam, checked_rotation, quaternion_wxyz
+from .geometry.pose import Pose, T_world_from_cam, check_rotation, quaternion_wxyz
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .scan_map.prior import GpsPrior
@@ -292,7 +292,7 @@ def read_results(paths: Sequence[Path]) -> list[Result]:
     """
     results = []
     for path in paths:
-        found = parse_lines(path, read_bytes(path, WANTED), _checked_result)
+        found = parse_lines(path, read_bytes(path, WANTED), _parse_result)
         if not found:
             raise InputError(f"{path}: found no result, {WANTED}")
         results += found
@@ -311,7 +311,7 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
     return words
 
 
-def _checked_result(text: str) -> Result:
+def _parse_result(text: str) -> Result:
     """Return a result of one line.
 
     Refused are names and numbers that can't be written, and a pose that is none.
@@ -332,5 +332,5 @@ def _checked_result(text: str) -> Result:
         is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
         if not (is_number and center.shape == (3,) and np.isfinite(center).all()):
             raise InputError("result: found no numbers of a pose, wanted R_cam_from_world and center_world")
-        checked_rotation(R, MAX_ROTATION_ERROR, "result: R_cam_from_world")
+        check_rotation(R, MAX_ROTATION_ERROR, "result: R_cam_from_world")
     return result

@@ -18,10 +18,10 @@ from .localization.query import Query
 from .panorama import Panorama, ReadOptions, read_photo
 from .panorama.photo import PhotoFacts, photo_of, photo_of_array, sha256_of
 from .result import Failure, Result, Source, failure_of, result_of, unreadable_result
-from .scan_map.named_scans import with_places
-from .walk.frames import Frame, checked_times
-from .walk.localize import WalkFrame, alone_of, localization_of, localizations_of
-from .walk.second_look import finished
+from .scan_map.named_scans import add_places
+from .walk.frames import Frame, check_times
+from .walk.localize import WalkFrame, make_localization, make_localizations, result_alone
+from .walk.second_look import finish
 from .walk.tracker import Tracker
 
 Picture = str | PathLike[str] | NDArray[np.uint8]
@@ -96,7 +96,7 @@ class Walk:
                 digest = sha256_of(Path(frame), self.read_options.rig)
                 return Prepared(Taken(frame, name, None, watch.seconds, (), digest, failure), None, None)
         with watch.stage("prepare"):
-            query = self.tracker.prepared(panorama)
+            query = self.tracker.prepare(panorama)
         warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
         return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
 
@@ -106,7 +106,7 @@ class Walk:
         taken, panorama, query = prepared
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
-            checked_times([self.tracker.frames[-1].time, when])
+            check_times([self.tracker.frames[-1].time, when])
         elif time is None:
             self.tracker.forget_times()
         watch = Stopwatch(taken.seconds)
@@ -155,19 +155,19 @@ class Walk:
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, by all of them."""
-        path = finished(self.tracker, self._panorama, show)
-        found = localizations_of(self.tracker, path)
+        path = finish(self.tracker, self._panorama, show)
+        found = make_localizations(self.tracker, path)
         return [
-            self._result(taken, with_places(self.tracker.scan_map, f), walk)
+            self._result(taken, add_places(self.tracker.scan_map, f), walk)
             for taken, (f, walk) in zip(self.taken, found, strict=True)
         ]
 
     def _now(self, frame: Frame, number: int) -> Result:
-        probabilities = self.tracker.lattice.filtered()
+        probabilities = self.tracker.lattice.filter_last()
         chosen = int(probabilities.argmax()) if len(probabilities) else None
-        found = localization_of(self.tracker, frame, probabilities, chosen)
-        walk = WalkFrame(frame.time, number, frame.how, alone_of(frame), None)
-        return self._result(self.taken[number], with_places(self.tracker.scan_map, found), walk)
+        found = make_localization(self.tracker, frame, probabilities, chosen)
+        walk = WalkFrame(frame.time, number, frame.how, result_alone(frame), None)
+        return self._result(self.taken[number], add_places(self.tracker.scan_map, found), walk)
 
     def _panorama(self, k: int) -> Panorama | None:
         taken = self.taken[k]

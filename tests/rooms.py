@@ -14,7 +14,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
-from piccolo.views.view import average_view, normalized_view
+from piccolo.views.view import average_view, normalize_view
 
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000
@@ -72,7 +72,7 @@ def scene(seed):
 
 def view(octree, center_map, config, shown):
     """What is seen around a centre on the cells that are shown."""
-    return normalized_view(average_view(octree, center_map, config), center_map, config, shown)
+    return normalize_view(average_view(octree, center_map, config), center_map, config, shown)
 
 
 def write_room(folder, words):

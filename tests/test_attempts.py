@@ -86,8 +86,8 @@ def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(
     monkeypatch.setattr(attempts, "search_poses", lambda query, gravity: None)
     monkeypatch.setattr(attempts, "refine", lambda query, starts, beam: [at(3.0, 0.5)])
     monkeypatch.setattr(attempts, "is_clear", lambda query, found: is_clear)
-    monkeypatch.setattr(attempts, "first_score", lambda query, starts: own)
-    monkeypatch.setattr(attempts, "mirror_score", lambda query: asked.append(query) or 0.5)
+    monkeypatch.setattr(attempts, "score_starts", lambda query, starts: own)
+    monkeypatch.setattr(attempts, "score_mirror", lambda query: asked.append(query) or 0.5)
     found, is_done = attempts.look_first(QUERY, [at(0.0, 0.2)], Stopwatch())
     assert places(found) == [0.0, 3.0]
     assert (is_done, asked) == (is_enough, [QUERY] * num_asked)
@@ -99,7 +99,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
-    mirror = attempts.mirrored(tilted)
+    mirror = attempts.mirror_query(tilted)
     other = _query(_turned_over(panorama))
     own, expected = (q.photo.images.search().rgbx.view(np.uint8).astype(int) for q in (mirror, other))
     assert np.abs(own - expected).max() <= 1  # level
@@ -113,8 +113,8 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = attempts.mirrored(asked)
-    own, other = (attempts.first_score(q, search_poses(q, "known")) for q in (asked, mirror))
+    mirror = attempts.mirror_query(asked)
+    own, other = (attempts.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
 
 
@@ -142,7 +142,7 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
 
 def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
-    few = whole.narrowed(np.arange(len(whole.sparse)) < 7)
+    few = whole.narrow(np.arange(len(whole.sparse)) < 7)
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
     assert attempts.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
     assert 0.3 < len(attempts.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
@@ -170,7 +170,7 @@ BRIEFLY = (2, {"gravity": "unknown", "is_brief": True})
 def test_attempts_are_made_in_this_order(monkeypatch, is_whole, gravity, parts, expected):
     monkeypatch.setattr(attempts, "is_whole", lambda query: is_whole)
     settings = CoarseToFineSettings(gravity=gravity)
-    found = attempts.attempts_for(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
+    found = attempts.plan_attempts(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
     assert [(num, getattr(run, "__name__", None) or run.keywords) for num, run in found] == expected
 
 
@@ -182,7 +182,7 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
         return [*hypotheses, at(query.num_halves, 0.5)], query.num_halves == sure
 
     made = [(k, run) for k in (1, 2, 0)]
-    monkeypatch.setattr(method, "attempts_for", lambda query: made)
+    monkeypatch.setattr(method, "plan_attempts", lambda query: made)
     monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
     monkeypatch.setattr(method, "judge", lambda query, found: (query.num_halves, found))
     how = CoarseToFineSettings(), Workers(1), Stopwatch()
@@ -207,7 +207,7 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
 ):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
     looked = at(9, 0.2)
-    monkeypatch.setattr(attempts, "matched_poses", lambda query: [] if num_matches is None else ["pose"])
+    monkeypatch.setattr(attempts, "match_poses", lambda query: [] if num_matches is None else ["pose"])
     monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
     monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
     monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_halves, 0.5)])

@@ -19,7 +19,7 @@ from piccolo.batch import localizer as module
 from piccolo.batch.inputs import panoramas_of
 from piccolo.cli import localize, options
 from piccolo.errors import InputError
-from piccolo.files.line_file import locked, whole_lines, whole_size
+from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.result import read_results
 from piccolo.scenes.scene import read_scene
 
@@ -330,12 +330,12 @@ def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):
 
 def test_two_processes_do_not_write_one_file(tmp_path, out):
     for line in ('{"a": 1}', '{"b": 2}'):
-        with locked(out) as file:
+        with open_locked(out) as file:
             file.append(line)
-            with pytest.raises(InputError, match="another process is writing it"), locked(out):
+            with pytest.raises(InputError, match="another process is writing it"), open_locked(out):
                 pass
     assert list(whole_lines(out, whole_size(out, b"{", "a test"))) == [b'{"a": 1}\n', b'{"b": 2}\n']
-    with locked(tmp_path / "new"):
+    with open_locked(tmp_path / "new"):
         pass
     assert not (tmp_path / "new").exists()
 
@@ -343,14 +343,14 @@ def test_two_processes_do_not_write_one_file(tmp_path, out):
 def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(out, monkeypatch):
     """The first of two writes nothing and removes the file, which the second has opened before."""
     flock, first = fcntl.flock, contextlib.ExitStack()
-    first.enter_context(locked(out))
+    first.enter_context(open_locked(out))
 
     def flock_late(handle, how):
         first.close()
         flock(handle, how)
 
     monkeypatch.setattr(fcntl, "flock", flock_late)
-    with locked(out) as file:
+    with open_locked(out) as file:
         file.append("{}")
     assert out.read_text() == "{}\n"
 

@@ -142,13 +142,13 @@ def test_rays_behind_and_outside_are_not_in_the_picture():
 def test_scaled_keeps_rays():
     for model in MODELS:
         this = camera(model)
-        half = this.scaled(500, 400)
+        half = this.scale_to_size(500, 400)
         rays, is_seen = this.rays(points())
         np.testing.assert_allclose(
             half.pixels(rays)[0][is_seen], this.pixels(rays)[0][is_seen] / 2.0, atol=1e-9
         )
     with pytest.raises(InputError, match="found a picture of 500 x 300 and a calibration for 1000 x 800"):
-        camera("PINHOLE").scaled(500, 300)
+        camera("PINHOLE").scale_to_size(500, 300)
 
 
 @pytest.mark.parametrize(("lens", "fov_deg"), [("pinhole", 90.0), ("pinhole", 170.0), ("fisheye", 220.0)])

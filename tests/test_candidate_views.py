@@ -160,7 +160,7 @@ def test_views_and_points_count_from_their_place():
 def test_points_depend_on_what_the_photo_shows(shift):
     query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
     height, width = query.photo.panorama.is_valid.shape
-    half = query.without(np.arange(width)[None] < np.full((height, 1), width // 2))
+    half = query.mask_pixels(np.arange(width)[None] < np.full((height, 1), width // 2))
     assert half.cache.views is query.cache.views
     assert 0.3 < len(half.points_at(pose).weights) / len(query.points_at(pose).weights) <= 1.01
     azimuth = np.arctan2(*(pose.R_cam_from_world @ half.points_at(pose).offsets)[1::-1])

@@ -7,7 +7,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
-from measuring.confidence import occluded, outside_field
+from measuring.confidence import mask_outside_field, occlude
 
 from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
@@ -19,8 +19,8 @@ from piccolo.localization.comparison import (
     Comparison,
     compare,
     correlate_blocks,
+    mask_occluders,
     sample_photo,
-    without_occluders,
 )
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -49,7 +49,7 @@ def _clean():
 def _hidden(fraction):
     """A photo behind pieces of another room, and where (H, W) it is hidden."""
     rgb, other = rooms.query(1).rgb, rooms.query(2).rgb
-    shown = occluded(rgb, other, fraction, np.random.default_rng(1))
+    shown = occlude(rgb, other, fraction, np.random.default_rng(1))
     return shown, (shown != rgb).any(axis=2)
 
 
@@ -140,7 +140,7 @@ def test_an_occluder_costs_what_it_hides(fraction):
 
 def test_blocks_outside_a_narrow_photo_count_nothing():
     seen, true_pose = _clean()
-    outside = outside_field(WIDTH, 90.0, 0.5)
+    outside = mask_outside_field(WIDTH, 90.0, 0.5)
     narrow = compare(_query(rooms.query(1).rgb, outside), true_pose)
     shown = _blocks_of(~outside)
     assert (narrow.visible_area[shown == 0.0] == 0.0).all()
@@ -157,7 +157,7 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     true_pose = rooms.scene(1)[2]
     rgb, is_hidden = _hidden(0.4)
     query = _query(rgb)
-    shown = without_occluders(query, true_pose)
+    shown = mask_occluders(query, true_pose)
     masked = _blocks_of(~shown.photo.panorama.is_valid[::2, ::2])
     covered = _blocks_of(is_hidden)
     assert masked[covered > 0.9].mean() > 0.8
@@ -172,7 +172,7 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     )
     clean = _query(rooms.query(1).rgb)
     fits = (compare(clean, true_pose).correlation >= CONTRADICTS).all()
-    assert (without_occluders(clean, true_pose) is clean) == fits
+    assert (mask_occluders(clean, true_pose) is clean) == fits
 
 
 def test_a_photo_that_was_turned_over_is_told():

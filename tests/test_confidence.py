@@ -76,10 +76,10 @@ def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(st
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 50.0), (0.003, 0.001)])
 def test_numbers_beyond_reason_change_nothing_more(a, b):
-    np.testing.assert_array_equal(*(rule.none_features_of(_covariance(std)) for std in (a, b)))
-    assert (rule.none_features_of(None) == rule.none_features_of(_covariance(0.3))).all()
+    np.testing.assert_array_equal(*(rule.none_features(_covariance(std)) for std in (a, b)))
+    assert (rule.none_features(None) == rule.none_features(_covariance(0.3))).all()
     least, less = Standing(0.0, 0.02, 0), Standing(-0.5, -0.3, 0)
-    faint, nothing = (rule.features_of(standing) for standing in (least, less))
+    faint, nothing = (rule.pose_features(standing) for standing in (least, less))
     np.testing.assert_array_equal(faint, nothing)
     np.testing.assert_array_equal(faint, np.log([0.1, 0.02, 8.0]))
 

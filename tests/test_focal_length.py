@@ -16,7 +16,7 @@ from piccolo.confidence.localization import Evidence, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.localization import focal_length as focal
-from piccolo.localization.localize import likeliest
+from piccolo.localization.localize import select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
@@ -43,14 +43,14 @@ def _fit(rgb, pose, **options):
 @pytest.mark.parametrize("num", [1, 2])
 def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num):
     true, curvature = np.array([0.01, -0.02])[:num], np.array([[4.0, 1.0], [1.0, 3.0]])[:num, :num]
-    changes = focal.design(num, 0.04)
+    changes = focal.make_design(num, 0.04)
     pulls = np.tile([[0.3, -0.3], [-0.3, 0.3], [0.1, 0.2], [-0.1, -0.2]], (2, 1))[:, :num]
     off = changes - true
     whole = 0.5 * np.einsum("ki,ij,kj->k", off, curvature, off)
     losses = whole[:, None] / 8.0 + off @ pulls.T
     turn = np.array([0.0, 0.0, 0.5])
     poses = [Pose(exp_so3(turn * c[0]), np.array([3.0 * c[0], 0.0, 0.0])) for c in changes]
-    crest = focal.crest_of(changes, losses, poses, Pose(np.eye(3), np.zeros(3)))
+    crest = focal.fit_crest(changes, losses, poses, Pose(np.eye(3), np.zeros(3)))
     np.testing.assert_allclose(crest.change, true, atol=1e-9)
     np.testing.assert_allclose(crest.motion[:, 0], [0.0, 0.0, 0.5, 3.0, 0.0, 0.0], atol=1e-9)
     inverse = np.linalg.inv(curvature)
@@ -60,11 +60,11 @@ def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num
 
 
 def test_a_loss_of_few_blocks_or_without_a_crest_tells_nothing():
-    changes = focal.design(1, 0.04)
+    changes = focal.make_design(1, 0.04)
     poses = [Pose(np.eye(3), np.zeros(3))] * len(changes)
-    crest = focal.crest_of(changes, -np.repeat(changes**2, 9, axis=1), poses, poses[0])
+    crest = focal.fit_crest(changes, -np.repeat(changes**2, 9, axis=1), poses, poses[0])
     assert not crest.information.any()
-    few = focal.crest_of(changes, np.repeat(changes**2, 3, axis=1), poses, poses[0])
+    few = focal.fit_crest(changes, np.repeat(changes**2, 3, axis=1), poses, poses[0])
     assert not few.information.any()
 
 
@@ -131,9 +131,9 @@ def test_other_poses_with_other_guesses_share_the_probability():
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     here, elsewhere = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
     sure = Localization("localized", 0.95, 0.05, here, evidence=evidence)
-    assert likeliest([replace(sure, confidence=0.9), sure], settings) is sure
+    assert select_likeliest([replace(sure, confidence=0.9), sure], settings) is sure
     other = replace(sure, confidence=0.9, pose=elsewhere)
-    doubtful = likeliest([sure, other, other], settings)
+    doubtful = select_likeliest([sure, other, other], settings)
     assert doubtful.status == "ambiguous"
     assert doubtful.confidence == pytest.approx(0.95**2 / 1.85)
     (rival,) = doubtful.alternatives
@@ -145,7 +145,7 @@ def test_other_poses_with_other_guesses_share_the_probability():
 def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask():
     rgb, _ = _photo(pinhole(640, 480, TRUE))
     panorama = _panorama(rgb, focal_px=TRUE, mask_nadir_deg=80.0)
-    found = panorama.retaken(pinhole(640, 480, 1.1 * TRUE), 1024)
+    found = panorama.resample(pinhole(640, 480, 1.1 * TRUE), 1024)
     pixels = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
     wanted, is_wanted = sphere_of([View(Mount(pinhole(640, 480, 1.1 * TRUE)), pixels)], 1024)
     assert not found.is_valid[300:].any()
@@ -161,10 +161,10 @@ def test_only_the_photo_of_one_camera_has_a_focal_length_to_refine():
 
 def test_pictures_of_a_result_are_made_with_the_camera_found():
     found = (Mount(pinhole(640, 480, 321.5)),)
-    options = ReadOptions(focal_px=300.0, refine_focal=True).refined(found)
+    options = ReadOptions(focal_px=300.0, refine_focal=True).with_refined_camera(found)
     assert (options.focal_px, options.calibration.mounts) == (None, found)
     turned = Mount(pinhole(640, 480, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     given = ReadOptions(calibration=Calibration("a.json", (turned,)), refine_focal=True)
-    assert given.refined(found).calibration.mounts == (turned.with_camera(found[0].camera),)
+    assert given.with_refined_camera(found).calibration.mounts == (turned.with_camera(found[0].camera),)
     plain = ReadOptions()
-    assert plain.refined(()) is plain
+    assert plain.with_refined_camera(()) is plain

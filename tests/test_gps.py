@@ -88,7 +88,7 @@ def test_a_position_becomes_a_prior_of_any_height():
     assert prior.center_world == pytest.approx((x, y), abs=1e-3)
     assert (prior.radius, prior.is_used) == (15.0, True)
     assert gps_prior(GpsPosition(latitude, longitude, None), UTM, 1.0).radius == 30.0
-    near = prior.applied_to(Prior(height=(1.0, 2.0)))
+    near = prior.apply_to(Prior(height=(1.0, 2.0)))
     assert near.near_world == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)
     assert from_wgs84("EPSG:4326", latitude, longitude) is None

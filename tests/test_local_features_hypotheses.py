@@ -14,7 +14,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, poses_of, rough_poses
 from piccolo.local_features.matching import Matches
-from piccolo.localization.attempts import matched_poses
+from piccolo.localization.attempts import match_poses
 from piccolo.localization.localize import localize
 from piccolo.localization.prior import contradictions
 from piccolo.localization.query import prepare_query
@@ -152,7 +152,7 @@ def test_matches_beyond_a_prior_are_asked_too():
     query, world = _query(1), rooms.query(1).pose
     x, y, _ = world.center_world
     prior = Prior(near_world=(x + 1.4, y, None), radius=0.5)
-    poses = matched_poses(replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)))
+    poses = match_poses(replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)))
     assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses)
 
 

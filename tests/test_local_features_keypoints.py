@@ -15,7 +15,7 @@ from piccolo.local_features.keypoints import (
     HALVES,
     VIEWS_DEG,
     find_keypoints,
-    joined_keypoints,
+    join_keypoints,
     perspective_views,
 )
 
@@ -87,7 +87,7 @@ def test_halves_of_the_views_are_every_other_one_and_find_what_all_find():
     is_valid = np.ones(gray.shape, bool)
     assert sorted(HALVES[0] + HALVES[1]) == list(range(len(VIEWS_DEG)))
     halves = [find_keypoints(gray, is_valid, Workers(2), views) for views in HALVES]
-    joined = joined_keypoints(halves)
+    joined = join_keypoints(halves)
     by_ray = [np.lexsort((found.sizes, *found.rays.T)) for found in (joined, whole)]
     for own, other in zip(joined.take(by_ray[0]), whole.take(by_ray[1]), strict=True):
         np.testing.assert_array_equal(np.sort(own, axis=0), np.sort(other, axis=0))
@@ -122,7 +122,7 @@ def test_same_bits_for_any_number_of_threads():
 def test_keypoints_turned_over_are_those_of_the_picture_turned_over():
     gray = np.ascontiguousarray(_gray()[:, ::-1])
     expected = find_keypoints(gray, np.ones(gray.shape, bool), Workers(2))
-    found = _found().mirrored()
+    found = _found().mirror()
     distance, nearest = cKDTree(np.hstack([expected.rays, expected.tangents])).query(
         np.hstack([found.rays, found.tangents])
     )

@@ -14,10 +14,10 @@ from piccolo.geometry.rotations import uniform_yaws
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
-from piccolo.localization.prior import allowed_rotations, apply_prior
+from piccolo.localization.prior import allow_rotations, apply_prior
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.scan_map import camera_positions
-from piccolo.scan_map.camera_positions import heights_above_floor, supported_cells, top_surfaces
+from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.prior import Prior
 from piccolo.scan_map.scan_map import prepare_map
 
@@ -140,7 +140,7 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
     cloud, whole = room(1)[1], scan_map(1)
     center = whole.centers[0]
     is_near = np.linalg.norm(whole.centers - center, axis=1) <= 1.0
-    num = len(supported_cells(top_surfaces(whole.octree)))
+    num = len(find_supported_cells(top_surfaces(whole.octree)))
     for most in (num - 1, 10):  # known when all have been counted, or from the surfaces alone
         monkeypatch.setattr(camera_positions, "MAX_POSITIONS", most)
         with pytest.raises(InputError, match=rf"more than {most} camera positions, .*--units, else .*--near"):
@@ -168,10 +168,10 @@ def test_a_long_preparation_is_announced(monkeypatch):
 
 def test_heading_counts_clockwise_from_y():
     yaws = uniform_yaws(36)
-    east = allowed_rotations(yaws, Prior(heading_deg=90.0, heading_tolerance_deg=1.0))
+    east = allow_rotations(yaws, Prior(heading_deg=90.0, heading_tolerance_deg=1.0))
     np.testing.assert_allclose(east[0, 0], [1.0, 0.0, 0.0], atol=1e-9)
-    assert len(allowed_rotations(yaws, Prior(heading_deg=0.0, heading_tolerance_deg=25.0))) == 5
-    assert len(allowed_rotations(yaws, Prior(heading_deg=4.0, heading_tolerance_deg=0.1))) == 1
+    assert len(allow_rotations(yaws, Prior(heading_deg=0.0, heading_tolerance_deg=25.0))) == 5
+    assert len(allow_rotations(yaws, Prior(heading_deg=4.0, heading_tolerance_deg=0.1))) == 1
 
 
 def test_heading_of_the_truth_keeps_it_and_another_makes_nothing_sure():

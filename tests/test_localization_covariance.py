@@ -33,7 +33,7 @@ def found():
 def _points(prepared, pose):
     """The points at a pose with channels in levels."""
     points = prepared.points_at(pose).around(pose.center_world)
-    return points._replace(channels=covariance.as_levels(points.channels))
+    return points._replace(channels=covariance.to_levels(points.channels))
 
 
 def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
@@ -43,7 +43,7 @@ def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
     right = np.einsum("bni,bn->bi", rows, wanted)
     x = np.linalg.solve(matrices.sum(axis=0), right.sum(axis=0))
     gradients = np.einsum("bni,bn->bi", rows, rows @ x - wanted)
-    found = covariance.as_left_out(gradients, matrices)
+    found = covariance.jackknife_gradients(gradients, matrices)
     for k in (0, 7, 19):
         others = np.delete(np.arange(20), k)
         alone = np.linalg.solve(matrices[others].sum(axis=0), right[others].sum(axis=0))
@@ -66,15 +66,15 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
     rng = np.random.default_rng(0)
     hessian = np.diag([4.0, 5.0, 6.0, 1.0, 2.0, 3.0])
     gradients = rng.normal(size=(5000, 6)) * np.sqrt(np.diag(hessian) / 5000)
-    found = covariance.covariance_of(hessian, gradients)
+    found = covariance.sandwich_covariance(hessian, gradients)
     np.testing.assert_allclose(found, np.linalg.inv(hessian), atol=0.05)
 
 
 def test_no_covariance_without_a_minimum_or_with_few_blocks():
     gradients = np.random.default_rng(0).normal(size=(100, 6))
-    assert covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
+    assert covariance.sandwich_covariance(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
     for least, count, is_known in ((1, 12, False), (1, 13, True), (1e-10, 100, False), (1e-8, 100, True)):
-        found = covariance.covariance_of(np.diag([1.0, 1, 1, 1, 1, least]), gradients[:count])
+        found = covariance.sandwich_covariance(np.diag([1.0, 1, 1, 1, 1, least]), gradients[:count])
         assert (found is not None) == is_known
 
 
@@ -115,7 +115,7 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "hessian_at", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.covariance_at(prepared, _points(prepared, pose), pose)
+    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose)
     assert asked == ways[: 2 if num_rough == 1 else 3]
     if num_rough == 3:
         assert matrix is None
@@ -151,7 +151,7 @@ def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
         channels = np.concatenate([taken.channels, wrong[:, None]], axis=1)
         return type(taken)(offsets, channels, np.ones(offsets.shape[1], np.float32), taken.center_map)
 
-    kept = [len(covariance.without_poles(with_one_at(d), pose).weights) for d in (down, away)]
+    kept = [len(covariance.remove_poles(with_one_at(d), pose).weights) for d in (down, away)]
     assert kept[1] == kept[0] + 1
     monkeypatch.setattr(type(prepared), "points_at", lambda query, pose: with_one_at(down))
     told = covariance.estimate_covariance(prepared, pose).matrix

@@ -17,7 +17,7 @@ from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
-from piccolo.paper.localize import localize, loss_of, prepare
+from piccolo.paper.localize import localize, make_loss, prepare
 from piccolo.paper.photometric import photometric_equations, photometric_loss, pixel_motion, view_gradient
 from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import View, render_view
@@ -122,7 +122,7 @@ def test_descent_recovers_the_true_pose(solver):
     points, panorama, true_pose = rooms.scene(1)
     settings = dataclasses.replace(PaperSettings(), loss="photometric", photometric_width=128, solver=solver)
     start = step(true_pose, np.array([0.06, -0.04, 0.08, 0.1, -0.12, 0.05]))
-    refined = refine(points, loss_of(panorama, settings), start, settings)
+    refined = refine(points, make_loss(panorama, settings), start, settings)
     distance, angle_deg = errors(refined.pose, true_pose)
     assert distance < 0.03
     assert angle_deg < 0.5

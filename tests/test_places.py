@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import rooms
 from measuring import confidence
-from measuring.confidence import MOST_RADIUS, occluded, outside_field, unevenly_lit, without_texture
+from measuring.confidence import MOST_RADIUS, light_unevenly, mask_outside_field, occlude, remove_texture
 from measuring.places import ALIKE_KINDS, CHANGED, make_alike
 
 from piccolo.geometry.sphere import pixel_rays, solid_angles
@@ -20,17 +20,17 @@ WIDTH = 256
 @pytest.mark.parametrize("fraction", [0.0, 0.2, 0.6])
 def test_occluders_hide_what_is_asked_and_hardly_more(fraction):
     rgb, other = np.full((WIDTH // 2, WIDTH, 3), 10, np.uint8), np.full((WIDTH // 2, WIDTH, 3), 200, np.uint8)
-    shown = occluded(rgb, other, fraction, np.random.default_rng(3))
+    shown = occlude(rgb, other, fraction, np.random.default_rng(3))
     hidden = ((shown == 200).all(axis=2) * solid_angles(WIDTH)[:, None]).sum() / (4 * np.pi)
     assert fraction <= hidden < fraction + 0.5 * (1 - np.cos(MOST_RADIUS)) + 0.01
     assert ((shown == 10) | (shown == 200)).all()
-    again = occluded(rgb, other, fraction, np.random.default_rng(3))
+    again = occlude(rgb, other, fraction, np.random.default_rng(3))
     np.testing.assert_array_equal(shown, again)
 
 
 @pytest.mark.parametrize(("fov_deg", "yaw"), [(65.0, 0.4), (90.0, -2.0), (120.0, 3.0)])
 def test_a_field_is_that_of_a_level_pinhole(fov_deg, yaw):
-    is_outside = outside_field(WIDTH, fov_deg, yaw)
+    is_outside = mask_outside_field(WIDTH, fov_deg, yaw)
     focal = 0.5 / np.tan(np.radians(fov_deg) / 2)  # of an image 1 wide and 0.75 high
     rays = pixel_rays(WIDTH).reshape(-1, 3)
     azimuth = np.arctan2(rays[:, 1], rays[:, 0]) - yaw
@@ -44,7 +44,7 @@ def test_a_field_is_that_of_a_level_pinhole(fov_deg, yaw):
 
 def test_light_is_uneven_by_the_stops_asked():
     rgb = np.full((WIDTH // 2, WIDTH, 3), 100, np.uint8)
-    lit = unevenly_lit(rgb, 1.0, np.random.default_rng(5))
+    lit = light_unevenly(rgb, 1.0, np.random.default_rng(5))
     assert (lit == lit[..., :1]).all()  # light has no colour
     stops = 2.2 * np.log2(np.maximum(lit[..., 0], 1) / 100)
     assert abs(stops.mean()) < 0.2
@@ -54,7 +54,7 @@ def test_light_is_uneven_by_the_stops_asked():
 
 def test_rooms_without_texture_keep_their_shape():
     world = rooms.room(1)[0]
-    bare = without_texture(world)
+    bare = remove_texture(world)
     assert (bare.rooms[0].materials[:, 0] == PLAIN).all()
     assert (world.rooms[0].materials[:, 0] != PLAIN).any()
     np.testing.assert_array_equal(bare.rooms[0].boxes, world.rooms[0].boxes)

@@ -76,11 +76,11 @@ def test_orthonormal_repairs_drift():
 
 def test_rotations_are_checked_to_a_tolerance():
     R = poses.exp_so3(VECTORS[2])
-    poses.checked_rotation(R + 4e-4, 1e-2, "R")
-    assert poses.checked_rotation(R, 1e-12, "R") is R
+    poses.check_rotation(R + 4e-4, 1e-2, "R")
+    assert poses.check_rotation(R, 1e-12, "R") is R
     for wrong in (R + 4e-4, R[::-1], np.full((3, 3), np.nan), R * 1e300, R[0], np.eye(4)):
         with pytest.raises(InputError, match="file: R is no rotation"):
-            poses.checked_rotation(wrong, 1e-4, "file: R")
+            poses.check_rotation(wrong, 1e-4, "file: R")
 
 
 @given(DIRECTIONS)

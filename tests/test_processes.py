@@ -70,7 +70,7 @@ def test_values_come_in_order_and_a_killed_process_costs_one_at_most(tmp_path):
     assert pairs == list(enumerate(expected))
     here = Here(_squares(tmp_path)).values(iter([1, 9, 2]))
     assert [_outcome(wait) for _, wait in here] == [1, "InputError: nine", 4]
-    assert list(here.finished()) == []
+    assert list(here.take_finished()) == []
 
 
 def test_an_error_brings_its_traceback(tmp_path):
@@ -110,7 +110,7 @@ def test_what_is_done_behind_the_last_value_taken_can_be_had(tmp_path):
         values = processes.values(iter([1, 2, 3, 4]))
         next(iter(values))
         values._pairs[2][1].result()  # the last; a process works in order
-        assert [(item, wait()) for item, wait in values.finished()] == [(2, 4), (3, 9), (4, 16)]
+        assert [(item, wait()) for item, wait in values.take_finished()] == [(2, 4), (3, 9), (4, 16)]
 
 
 def check_threads_and_signals():

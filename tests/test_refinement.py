@@ -55,7 +55,7 @@ def _query(seed):
     ],
 )
 def test_faint_poses_are_compared_only_where_the_best_is_not_plain(scores, kept):
-    found = refinement.plain([_fit(k, score) for k, score in enumerate(scores)])
+    found = refinement.keep_comparable([_fit(k, score) for k, score in enumerate(scores)])
     assert sorted((h.score for h in found), reverse=True) == kept
 
 
@@ -124,8 +124,8 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
         return Fit(pose, score[0])
 
     score = [0.5]
-    monkeypatch.setattr(query_module, "normalized_view", lambda *_: None)
-    monkeypatch.setattr(refinement, "fit_on", lambda *_: _fit(0.0, 0.5))  # whatever another view said
+    monkeypatch.setattr(query_module, "normalize_view", lambda *_: None)
+    monkeypatch.setattr(refinement, "score_on_cells", lambda *_: _fit(0.0, 0.5))  # whatever another view said
     monkeypatch.setattr(refinement, "descend_around", around)
     monkeypatch.setattr(refinement, "descend_fine", fine)
     query = _asked()
@@ -152,7 +152,7 @@ def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, sco
     monkeypatch.setattr(
         last_descent, "score_pose", lambda query, pose: at(place(pose), scores[int(place(pose))])
     )
-    monkeypatch.setattr(last_descent, "without_occluders", lambda query, pose: masked if is_masked else query)
+    monkeypatch.setattr(last_descent, "mask_occluders", lambda query, pose: masked if is_masked else query)
     for name in ("perturb_middle", "descend_fine"):
         monkeypatch.setattr(last_descent, name, lambda shown, pose: made.append(shown) or Fit(pose, 0.0))
     monkeypatch.setattr(
@@ -172,7 +172,7 @@ def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after,
     moved, start = at(0.04, after), at(0.0, 0.52)
     asked, descents = [], []
     monkeypatch.setattr(last_descent, "refine_unoccluded", lambda query, pose: (query, start))
-    monkeypatch.setattr(last_descent, "without_occluders", lambda query, pose: query)
+    monkeypatch.setattr(last_descent, "mask_occluders", lambda query, pose: query)
     monkeypatch.setattr(last_descent, "score_pose", lambda query, pose: Hypothesis(pose, after))
     monkeypatch.setattr(type(QUERY), "points_at", lambda query, pose: asked.append(place(pose)))
     monkeypatch.setattr(last_descent, "descend", lambda *how: descents.append(how[-1]) or moved.pose)
@@ -194,14 +194,14 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
     whole, pose = _query(1), at(0.0, 0.0, 70.0).pose
     is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
-    narrow = whole.without(is_hidden)
+    narrow = whole.mask_pixels(is_hidden)
     grid = make_grid(METHOD.full_view.num_rings)
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
     shown = narrow.photo.shown_cells(METHOD.full_view.num_rings, pose)
     assert whole.photo.shown_cells(METHOD.full_view.num_rings, pose).all()
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
-    monkeypatch.setattr(query_module, "normalized_view", lambda sums, center, config, shown: shown)
+    monkeypatch.setattr(query_module, "normalize_view", lambda sums, center, config, shown: shown)
     views = SimpleNamespace(
         averages=lambda *_: None, points=lambda place, config, shown, count: (shown, count)
     )
@@ -240,7 +240,7 @@ def test_descent_finds_the_true_pose_again():
     off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
     pose = refinement.descend(cells, image, off, (1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
-    before, after = (refinement.fit_on(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
+    before, after = (refinement.score_on_cells(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
     assert after > max(0.6, before)
     assert rooms.errors(refinement.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
@@ -254,7 +254,7 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     found, by_two = (refinement.descend_around(*problem, Workers(n)) for n in (1, 2))
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    expected = refinement.fit_on(cells, FINE_BLOCKS, images.middle(), found.pose)
+    expected = refinement.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)
     np.testing.assert_allclose(found.score, expected.score, atol=1e-5)
 
 

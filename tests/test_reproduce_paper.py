@@ -19,7 +19,7 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.scenes.evaluation.query_result import read_run
-from piccolo.scenes.reproduce_paper import EXPERIMENTS, flipped, identity, thin, with_random_rotation
+from piccolo.scenes.reproduce_paper import EXPERIMENTS, flip, identity, thin, with_random_rotation
 from piccolo.scenes.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
 
@@ -49,7 +49,7 @@ def _loss(scene, number):
 
 @pytest.mark.parametrize(
     "transform",
-    [identity, with_random_rotation, flipped, partial(thin, fraction=0.5), partial(thin, num_points=9000)],
+    [identity, with_random_rotation, flip, partial(thin, fraction=0.5), partial(thin, num_points=9000)],
 )
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_transformed_scene_fits_its_true_poses(rooms, tmp_path, transform, number):
@@ -72,7 +72,7 @@ def test_what_a_transform_leaves_alone(rooms, tmp_path):
     assert np.degrees(angles[0]) > 1.0
     assert turned.queries[0].image == scene.queries[0].image
     assert turned.cloud.read_bytes() == again.cloud.read_bytes()
-    changed = flipped(scene, folders[2])
+    changed = flip(scene, folders[2])
     assert changed.cloud == scene.cloud
     assert [changed.name_of(q) for q in changed.queries] == [scene.name_of(q) for q in scene.queries]
     up_in_camera = changed.queries[0].pose.R_cam_from_world @ [0.0, 0.0, 1.0]
@@ -88,7 +88,7 @@ def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_pa
     cv2.imwrite(str(tmp_path / "raw" / "a.png"), rgba)
     pose = read_scene(rooms / "000").queries[0].pose
     write_queries(tmp_path / "room", [Query(tmp_path / "raw" / "a.png", "clean", pose)])
-    transformed = flipped(read_scene(tmp_path / "room"), tmp_path / "new")
+    transformed = flip(read_scene(tmp_path / "room"), tmp_path / "new")
     (query,) = transformed.queries
     assert transformed.name_of(query) == "../raw/a.png"
     assert query.image.resolve().is_relative_to(tmp_path / "new")

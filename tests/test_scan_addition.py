@@ -22,7 +22,7 @@ from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
-from piccolo.scan_map.named_scans import named, scan_at, with_places
+from piccolo.scan_map.named_scans import add_places, name_scan, scan_at
 from piccolo.scan_map.prior import Prior
 from piccolo.scan_map.scan_addition import add_scan
 from piccolo.scan_map.scan_map import prepare_map
@@ -43,7 +43,7 @@ def _added(old, cloud, name):
 
 @functools.lru_cache
 def first():
-    return named(rooms.scan_map(1), "A")
+    return name_scan(rooms.scan_map(1), "A")
 
 
 @functools.lru_cache
@@ -54,7 +54,7 @@ def of_two_rooms():
 def _localized(scan_map, seed, prior=None):
     settings = CoarseToFineSettings(gravity="known", prior=prior or Prior())
     panorama = rooms.as_panorama(rooms.query(seed).rgb)
-    return with_places(scan_map, localize(scan_map, panorama, settings, WORKERS, Stopwatch()))
+    return add_places(scan_map, localize(scan_map, panorama, settings, WORKERS, Stopwatch()))
 
 
 def _rows(scan_map, centers):
@@ -187,7 +187,7 @@ def test_what_can_not_be_added_is_refused():
     cloud = rooms.room(2)[1]
     for name in ("", " A", "A\n", "x" * 101, "\x1b[31m"):
         with pytest.raises(InputError, match=r"^--name: found .*, wanted 1 to 100 printable characters$"):
-            named(rooms.scan_map(1), name)
+            name_scan(rooms.scan_map(1), name)
     with pytest.raises(InputError, match=r"^--name: found 'A', which the map has already: 'A'$"):
         _added(first(), cloud, "A")
     with pytest.raises(InputError, match=r"^--add: found a scan 30 km from the map's, wanted one coordinate"):
@@ -198,7 +198,7 @@ def test_what_can_not_be_added_is_refused():
     scan_map = _added(first(), _shifted(cloud, np.array([2000.0, 0.0, 0.0])), "B")
     assert "both need one coordinate system" in scan_map.warnings[-1]
     with pytest.raises(InputError, match=r"^--name: found a map of several scans: 'A', 'B'$"):
-        named(scan_map, "C")
+        name_scan(scan_map, "C")
 
 
 def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):

@@ -12,7 +12,7 @@ from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import search
-from piccolo.localization.query import images_of, prepare_query
+from piccolo.localization.query import make_images, prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama
 from piccolo.panorama.gpano import GPano
@@ -42,7 +42,7 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    black_and_white = (images_of(Panorama(rgb, is_valid), METHOD.scales).search() for rgb in (black, white))
+    black_and_white = (make_images(Panorama(rgb, is_valid), METHOD.scales).search() for rgb in (black, white))
     (a, valid), (b, _) = map(_levels, black_and_white)
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
@@ -67,7 +67,7 @@ def test_scores_equal_correlations_one_by_one():
     samples, validity = search.turn_panorama(_query().photo.images.search(), uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    panorama = search.turned(samples, validity, AREA, 1)
+    panorama = search.weigh_by_area(samples, validity, AREA, 1)
     candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
     row, views = scan_map.views.at(candidate, Workers(2))
     pairs = np.empty(40, np.float32)
@@ -91,7 +91,7 @@ def test_wide_samples_are_averages_by_area():
     validity = (rng.random((600, len(AREA))) < 0.6).astype(np.float32)
     matrix = (np.eye(len(areas))[cells] * whole_areas(24)[:, None]).astype(np.float32)
     for num_threads in (1, 2):
-        wide, is_valid = search.widened(samples, validity, Workers(num_threads))
+        wide, is_valid = search.widen_samples(samples, validity, Workers(num_threads))
         np.testing.assert_array_equal(wide, np.rint(samples) @ matrix / areas)
         np.testing.assert_array_equal(is_valid, np.rint(validity @ matrix / areas))
 
@@ -100,7 +100,7 @@ def test_sums_of_a_search_are_exact():
     """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
     for area, most_seen in ((AREA, 1), (wider_cells(12)[1], 255)):
         one = np.ones((1, 3, len(area)), np.float32)
-        panorama = search.turned(127.5 * one, one[:, 0], area, most_seen)
+        panorama = search.weigh_by_area(127.5 * one, one[:, 0], area, most_seen)
         assert 127 * panorama.samples.sum(dtype=float) < 2**24
         assert most_seen * panorama.energy.sum(dtype=float) < 2**24
         assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
@@ -111,7 +111,7 @@ def test_sums_of_a_search_are_exact():
     validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
     features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
     seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = search.turned(samples * validity[:, None], validity, AREA, 1)
+    panorama = search.weigh_by_area(samples * validity[:, None], validity, AREA, 1)
     expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
     shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))

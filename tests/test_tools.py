@@ -125,8 +125,8 @@ def test_wrong_answers_are_listed():
 
 
 def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys, monkeypatch):
-    without_scene = confidence.without_scene
-    monkeypatch.setattr(confidence, "without_scene", lambda *of: list(without_scene(*of))[:1])
+    without_scene = confidence.make_sceneless
+    monkeypatch.setattr(confidence, "make_sceneless", lambda *of: list(without_scene(*of))[:1])
     out = tmp_path / "trials.jsonl"
     assert benchmark.main(["confidence", "--seeds", "0", "0", "--scenes", str(scene), "--out", str(out)]) == 0
     table = capsys.readouterr().out

@@ -208,7 +208,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     whole, stopped = tmp_path / "whole.jsonl", tmp_path / "stopped.jsonl"
     assert _command(folder, *walk, str(whole)) == 0
     _assert_right(read_results([whole]), queries)
-    assert not walk_command.kept_in(whole).exists()
+    assert not walk_command.frames_file(whole).exists()
 
     def killed(self, show):
         raise MemoryError
@@ -216,7 +216,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     with monkeypatch.context() as patched:
         patched.setattr(Walk, "finish", killed)
         assert _command(folder, *walk, str(stopped)) != 0
-    kept = walk_command.kept_in(stopped)
+    kept = walk_command.frames_file(stopped)
     lines = kept.read_bytes().splitlines(keepends=True)
     assert len(lines) == 1 + len(queries)
     kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])

@@ -5,17 +5,25 @@ import pytest
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
-from piccolo.walk.frames import COPY_LOG_ODDS, OTHER_LOG_ODDS, Frame, Motion, State, centers_of, checked_times
+from piccolo.walk.frames import (
+    COPY_LOG_ODDS,
+    OTHER_LOG_ODDS,
+    Frame,
+    Motion,
+    State,
+    check_times,
+    state_centers,
+)
 from piccolo.walk.path import (
     LEAST_TOLD,
     TELLING_LOG,
     UNLISTED,
+    build_lattice,
     emissions,
-    entering,
-    lattice_of,
-    left,
+    fraction_moved,
+    log_entering,
+    log_leaving,
     log_transition,
-    share_moved,
 )
 
 MOTION = Motion(max_speed=1.0)
@@ -66,8 +74,8 @@ class Logs:
 
     def steps(self, m, k):
         """(S of m, S of k)."""
-        ends, seconds = centers_of(self.frames[k].states), self.frames[k].time - self.frames[m].time
-        gaps = np.linalg.norm(centers_of(self.frames[m].states)[:, None] - ends, axis=2)
+        ends, seconds = state_centers(self.frames[k].states), self.frames[k].time - self.frames[m].time
+        gaps = np.linalg.norm(state_centers(self.frames[m].states)[:, None] - ends, axis=2)
         return log_transition(gaps, seconds, MOTION, self.expected)
 
     def unlisted(self, k):
@@ -76,7 +84,7 @@ class Logs:
         telling = [m for m in range(k) if self.frames[m].is_telling]
         share = float(self.frames[k].is_telling)
         share *= (
-            max(share_moved(self.frames[telling[-1]], self.frames[k]), LEAST_TOLD)
+            max(fraction_moved(self.frames[telling[-1]], self.frames[k]), LEAST_TOLD)
             if telling and share
             else 1.0
         )
@@ -90,9 +98,9 @@ class Logs:
             if before is not None:
                 m, i = before
                 steps = self.steps(m, k)
-                log += left(steps, self.frames[k])[i] if j == UNLISTED else steps[i, j]
+                log += log_leaving(steps, self.frames[k])[i] if j == UNLISTED else steps[i, j]
             elif j != UNLISTED:
-                log += entering(self.frames[k])
+                log += log_entering(self.frames[k])
             before = None if j == UNLISTED else (k, j)
         return log
 
@@ -119,13 +127,13 @@ def test_probabilities_and_way_are_those_of_all_ways_there_are(seed):
         states = [(rng.uniform(0.0, 4.0, 3), float(rng.normal(1.5, 2.0))) for _ in range(rng.integers(0, 4))]
         how = rng.choice(["alone", "tracked"])
         frames.append(_frame(k + 0.3 * rng.random(), *states, how=how))
-    lattice = lattice_of(frames, Open(np.exp(-seed / 4)), MOTION)
-    path, (probabilities, chosen) = lattice.smoothed(), _naive(frames, seed / 4)
+    lattice = build_lattice(frames, Open(np.exp(-seed / 4)), MOTION)
+    path, (probabilities, chosen) = lattice.smooth(), _naive(frames, seed / 4)
     for found, wanted in zip(path.probabilities, probabilities, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
     assert path.chosen == chosen
     if frames[-1].states:
-        np.testing.assert_allclose(lattice.filtered(), probabilities[-1], rtol=1e-9, atol=1e-12)
+        np.testing.assert_allclose(lattice.filter_last(), probabilities[-1], rtol=1e-9, atol=1e-12)
 
 
 COPIES = [((9.0 * i, 0, 50), 4.0) for i in range(5)]  # with one more a list that does not end there
@@ -134,10 +142,10 @@ COPIES = [((9.0 * i, 0, 50), 4.0) for i in range(5)]  # with one more a list tha
 def test_what_is_only_followed_tells_nothing_of_places_that_are_not_listed():
     """A place as good as five others, and perhaps as more: only where there is one alone, all are sure."""
     followed = [_frame(0, ((0, 0, 0), 4.0), *COPIES), *(_followed(k, ((k, 0, 0), 6.0)) for k in range(1, 20))]
-    unknown = lattice_of(followed, Open(), MOTION).smoothed()
+    unknown = build_lattice(followed, Open(), MOTION).smooth()
     assert max(p[0] for p in unknown.probabilities) < 0.6
     searched = [*followed, *(_frame(k, ((k, 0, 0), 6.0)) for k in range(20, 23))]
-    told = lattice_of(searched, Open(), MOTION).smoothed()
+    told = build_lattice(searched, Open(), MOTION).smooth()
     assert told.chosen == [0] * 23
     assert min(p[0] for p in told.probabilities) > 0.9
 
@@ -148,9 +156,9 @@ def test_what_copies_say_of_each_other_does_not_add_up():
         _frame(k, ((0.1 * k, 0, 0), 3.0), ((0.1 * k + 20, 0, 0), 3.0 + 0.9 * COPY_LOG_ODDS))
         for k in range(20)
     ]
-    alone = lattice_of(twins, Open(), MOTION).smoothed()
+    alone = build_lattice(twins, Open(), MOTION).smooth()
     np.testing.assert_allclose([p[0] / p.sum() for p in alone.probabilities], 0.5, atol=0.01)
-    told = lattice_of([*twins, _frame(20, ((2.0, 0, 0), 6.0))], Open(), MOTION).smoothed()
+    told = build_lattice([*twins, _frame(20, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
     assert told.chosen == [0] * 21
     assert min(p[0] for p in told.probabilities) > 0.95
 
@@ -174,19 +182,19 @@ def test_a_jump_has_a_price_and_is_reported():
         *(_frame(k, ((k, 0, 0), 5.0)) for k in range(4)),
         *(_frame(k, ((k + 50, 0, 0), 5.0)) for k in range(4, 8)),
     ]
-    path = lattice_of(frames, Open(), MOTION).smoothed()
+    path = build_lattice(frames, Open(), MOTION).smooth()
     assert path.chosen == [0] * 8
     assert path.gaps == [None] * 4 + [(51.0, 1.0)] + [None] * 3
     lonely = [*frames[:4], _frame(4, ((54, 0, 0), 2.0)), _frame(5, ((5, 0, 0), 5.0))]
-    path = lattice_of(lonely, Open(), MOTION).smoothed()
+    path = build_lattice(lonely, Open(), MOTION).smooth()
     assert path.chosen == [0, 0, 0, 0, None, 0]
     assert path.probabilities[4][0] < 0.01
 
 
 def test_refusals():
     with pytest.raises(InputError, match=r"^times: found 1.0 after 2.0 at frame 2, wanted them to rise$"):
-        checked_times([0.0, 2.0, 1.0])
+        check_times([0.0, 2.0, 1.0])
     with pytest.raises(InputError, match=r"^times: found one that is no finite number, wanted seconds$"):
-        checked_times([0.0, np.nan])
+        check_times([0.0, np.nan])
     with pytest.raises(InputError, match=r"^max_speed: found -1.0, wanted a number above 0$"):
         Motion(max_speed=-1.0)

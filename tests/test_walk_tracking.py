@@ -13,12 +13,12 @@ from piccolo.walk import tracker as tracker_module
 from piccolo.walk.frames import Motion, State
 from piccolo.walk.tracker import (
     Follower,
+    find_everywhere,
+    find_near,
     follow,
-    found_everywhere,
-    found_near,
-    predicted,
-    tracked,
-    tracked_on,
+    predict,
+    track,
+    track_on,
 )
 
 SEED = 1
@@ -41,18 +41,18 @@ def _off(pose, metres, degrees):
 def test_a_descent_that_stopped_short_goes_on_farther_around(seen):
     query, true = seen
     short = score_pose(query, _off(true, 0.12, 2.5))
-    end = tracked_on(query, short)
+    end = track_on(query, short)
     assert end.score > 1.2 * short.score
     assert pose_errors(end.pose, true)[0] < 0.02
-    best = tracked(query, true, 0.2)
-    assert tracked_on(query, best).score >= best.score
+    best = track(query, true, 0.2)
+    assert track_on(query, best).score >= best.score
 
 
 def test_a_frame_that_explains_less_than_the_one_before_is_looked_for_farther_around(seen, monkeypatch):
     query, true = seen
     asked = []
-    monkeypatch.setattr(tracker_module, "tracked_on", lambda query, end: asked.append(end) or end)
-    best = tracked(query, true, 0.2)
+    monkeypatch.setattr(tracker_module, "track_on", lambda query, end: asked.append(end) or end)
+    best = track(query, true, 0.2)
     for usual, num_asked in ((1.0, 0), (1.05, 0), (1.3, 1), (2.0, 0)):  # as much; a little less; less; lost
         asked.clear()
         before = State(true, 5.0, usual * best.score)
@@ -64,17 +64,17 @@ def test_a_frame_that_explains_less_than_the_one_before_is_looked_for_farther_ar
 
 def test_a_frame_is_found_near_and_everywhere(seen):
     query, true = seen
-    for found in (found_near(query, _off(true, 0.8, 40.0), 1.5, 0.3), found_everywhere(query, 0.3)):
+    for found in (find_near(query, _off(true, 0.8, 40.0), 1.5, 0.3), find_everywhere(query, 0.3)):
         assert pose_errors(max(found, key=lambda h: h.score).pose, true)[0] < 0.02
-    assert found_near(query, _off(true, 50.0, 0.0), 1.0, 0.3) == []
-    assert found_everywhere(query, 2.0) == []
+    assert find_near(query, _off(true, 50.0, 0.0), 1.0, 0.3) == []
+    assert find_everywhere(query, 2.0) == []
 
 
 def test_a_camera_goes_on_as_it_went_but_no_farther_than_it_can(seen):
     _, true = seen
-    ahead = predicted(true, _off(true, -0.4, -10.0), 0.5, 9.0)
+    ahead = predict(true, _off(true, -0.4, -10.0), 0.5, 9.0)
     distance, angle = pose_errors(ahead, _off(true, 0.2, 5.0))
     assert (distance, np.degrees(angle)) == pytest.approx((0.0, 0.0), abs=1e-5)
     assert np.linalg.norm(
-        predicted(true, _off(true, -4.0, 0.0), 1.0, 0.5).center_world - true.center_world
+        predict(true, _off(true, -4.0, 0.0), 1.0, 0.5).center_world - true.center_world
     ) == (pytest.approx(0.5))

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..files.json_file import read_text
 from ..panorama.photo import photo_of
-from ..walk.frames import checked_times
+from ..walk.frames import check_times
 
 EXIF = "exif"
 NAMES = "names"
@@ -39,7 +39,7 @@ def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
         times = [_number_in(frame) for frame in frames]
     else:
         times = _times_in(Path(str(source)), frames)
-    checked_times(times)
+    check_times(times)
     return [time - times[0] for time in times]
 
 

@@ -13,7 +13,7 @@ from .. import __version__
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
 from ..files.json_file import reading_once
-from ..jobs.cluster import sent_file
+from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
@@ -37,7 +37,7 @@ class Task(NamedTuple):
     files: Mapping[str, bytes] | None = None  # what is at `pano`, where that is not to be seen
 
     @contextmanager
-    def placed(self, folder: Path) -> Iterator[Path]:
+    def place(self, folder: Path) -> Iterator[Path]:
         """Yield the panorama's path here: relative to a folder, or written from the files."""
         if self.files is None:
             yield folder / self.pano
@@ -101,7 +101,7 @@ class Localizer:
             return self.settings
         return replace(self.settings, prior=self.priors.prior_of(pano, self.settings.prior))
 
-    def expected(self, cloud_sha256: str) -> Callable[[Path], Mapping[str, Any]]:
+    def expect(self, cloud_sha256: str) -> Callable[[Path], Mapping[str, Any]]:
         """Return the fields of a panorama's line that say how it was made, the most telling first."""
 
         @lru_cache
@@ -120,7 +120,7 @@ class Localizer:
     def open_scan(self, workers: Workers) -> OpenedScan:
         """Read and prepare the scan."""
         if self.map_name:
-            scan_map = load_map(sent_file(self.map_name))
+            scan_map = load_map(find_sent_file(self.map_name))
             return OpenedScan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
         paths = [self.folder / path for path in self.paths]
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
@@ -128,7 +128,7 @@ class Localizer:
 
     def answer(self, scan: OpenedScan, task: Task) -> Answer:
         """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
-        with task.placed(self.folder) as path, reading_once():
+        with task.place(self.folder) as path, reading_once():
             try:
                 found = scan.localize_query(path, self.read_options, task.settings, None, task.calibration)
                 overlay, mask = self._pictures(scan, path, found)
@@ -156,7 +156,7 @@ class Localizer:
         pose = result.best_pose
         if pose is None:
             return overlay, mask
-        read_options = self.read_options.refined(result.cameras)
+        read_options = self.read_options.with_refined_camera(result.cameras)
         if self.makes_overlays:
             panorama = read_panorama(pano, read_options)
             overlay = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)

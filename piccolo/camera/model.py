@@ -229,7 +229,7 @@ class Camera:
         steps = np.linalg.norm(pixels[1:] - pixels[0], axis=1) / SMALL
         return max(float(np.sqrt(steps[0] * steps[1])), MIN_FOCAL)
 
-    def scaled(self, width: int, height: int) -> "Camera":
+    def scale_to_size(self, width: int, height: int) -> "Camera":
         """Return the same camera with its picture at another size; InputError if that has another shape."""
         if (width, height) == (self.width, self.height):
             return self
@@ -243,9 +243,9 @@ class Camera:
         params = tuple(value * factors.get(name, 1.0) for name, value in self._named.items())
         return replace(self, width=width, height=height, params=params)
 
-    def scaled_to_width(self, width: int) -> "Camera":
+    def scale_to_width(self, width: int) -> "Camera":
         """Return the same camera with its picture at another width [px]."""
-        return self.scaled(width, max(1, round(width * self.height / self.width)))
+        return self.scale_to_size(width, max(1, round(width * self.height / self.width)))
 
     def pixels(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
         """Pixels (..., 2) that rays (..., 3) of any length come to, and which are in the picture (...).

@@ -55,7 +55,7 @@ def sphere_of(views: Sequence[View], width: int) -> Pixels:
         axis = view.mount.rotation[0]
         for top, left in _blocks(view, width):
             block = slice(top, top + ROWS), slice(left, left + COLUMNS)
-            pixels, is_valid = _resampled(view, width, top, left)
+            pixels, is_valid = _resample_block(view, width, top, left)
             centers = np.arange(left, left + COLUMNS) + 0.5, np.arange(top, top + ROWS) + 0.5
             closeness = (rays_of(centers[0], centers[1][:, None], width) @ axis).astype(np.float32)
             is_better = is_valid & (closeness > nearest[block])
@@ -88,14 +88,16 @@ def _blocks(view: View, width: int) -> list[tuple[int, int]]:
     return [(int(i) * ROWS, int(j) * COLUMNS) for i, j in np.argwhere(is_met)]
 
 
-def _resampled(view: View, width: int, top: int, left: int) -> Pixels:
+def _resample_block(view: View, width: int, top: int, left: int) -> Pixels:
     """Colours and validity of a block of the sphere's pixels."""
     u = left + np.arange(0.0, COLUMNS + 1, CELL)
     v = top + np.arange(0.0, ROWS + 1, CELL)
     places, is_in = _places(view, width, u, v)
     num = _num_samples(places, is_in)
     if is_in.all() and view.mount.camera.lens != SPHERE:  # whose seam is no place between two others
-        places = _between(_between(places, num * CELL).swapaxes(0, 1), num * CELL).swapaxes(0, 1)
+        places = _interpolate_between(
+            _interpolate_between(places, num * CELL).swapaxes(0, 1), num * CELL
+        ).swapaxes(0, 1)
     else:
         u, v = (b + (np.arange(num * size) + 0.5) / num for b, size in ((left, COLUMNS), (top, ROWS)))
         places, is_in = _places(view, width, u, v)
@@ -107,7 +109,7 @@ def _resampled(view: View, width: int, top: int, left: int) -> Pixels:
     return np.asarray(pixels[..., :3], np.uint8), np.asarray(pixels[..., 3] == 255)
 
 
-def _between(values: Array, count: int) -> Array:
+def _interpolate_between(values: Array, count: int) -> Array:
     """Values (rows * count, ...) amid `count` equal steps from each of (rows + 1, ...) to the next."""
     step = ((np.arange(count) + 0.5) / count).reshape(-1, *[1] * (values.ndim - 1))
     found = values[:-1, None] + step * (values[1:] - values[:-1])[:, None]

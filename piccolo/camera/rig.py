@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, unreadable
-from ..geometry.pose import Array, Pose, checked_rotation
+from ..geometry.pose import Array, Pose, check_rotation
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -36,7 +36,7 @@ class Mount:
 
     def __post_init__(self) -> None:
         """Refuse what is no place."""
-        checked_rotation(self.rotation, MAX_SKEW, "R_lens_from_cam")
+        check_rotation(self.rotation, MAX_SKEW, "R_lens_from_cam")
         if len(self.center_cam) != 3 or not all(math.isfinite(x) for x in self.center_cam):
             raise InputError(f"found center_cam {self.center_cam}, wanted three finite numbers [m]")
         if len(self.offset) != 2 or not all(isinstance(x, int) and x >= 0 for x in self.offset):
@@ -56,7 +56,7 @@ class Mount:
         """Another camera at the same place."""
         return replace(self, camera=camera)
 
-    def turned(self, R_cam_from_new: Array) -> "Mount":
+    def turn(self, R_cam_from_new: Array) -> "Mount":
         """Return the same camera in a frame that is turned about the origin."""
         R = self.rotation @ R_cam_from_new
         center = R_cam_from_new.T @ np.array(self.center_cam)
@@ -99,7 +99,7 @@ class Calibration:
         Raises InputError if none fits, or several of a choice do.
         """
         if not self.is_choice:
-            return self._scaled(width, height)
+            return self._scale(width, height)
         sizes = {(m.camera.width, m.camera.height) for m in self.mounts}
         fits = [m for m in self.mounts if (m.camera.width, m.camera.height) == (width, height)]
         if not fits and len(self.mounts) == 1:
@@ -108,14 +108,14 @@ class Calibration:
             found = f"found {len(self.mounts)} cameras, {len(fits)} of them for {width} x {height}"
             wanted = f"wanted one; sizes there are {', '.join(f'{w} x {h}' for w, h in sorted(sizes)[:5])}"
             raise InputError(f"{self.path}: {found}, {wanted}")
-        return Calibration(self.path, (fits[0],))._scaled(width, height)
+        return Calibration(self.path, (fits[0],))._scale(width, height)
 
-    def _scaled(self, width: int, height: int) -> tuple[Mount, ...]:
+    def _scale(self, width: int, height: int) -> tuple[Mount, ...]:
         """All cameras with the whole picture at another size of the same shape."""
         full_width, full_height = extent_of(self.mounts)
         if len(self.mounts) == 1 and self.mounts[0].offset == (0, 0):
             try:
-                return (self.mounts[0].with_camera(self.mounts[0].camera.scaled(width, height)),)
+                return (self.mounts[0].with_camera(self.mounts[0].camera.scale_to_size(width, height)),)
             except InputError as error:
                 raise InputError(f"{self.path}: {error}") from error
         if (width, height) != (full_width, full_height):

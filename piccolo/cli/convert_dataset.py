@@ -67,7 +67,7 @@ def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
         option(parser, "--direction", text, choices=DIRECTIONS)
 
 
-def chosen(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
+def choose_scenes(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     """Return the scenes of some rooms, or all."""
     counts = Counter(spec.name for spec in specs)
     if twice := [name for name, count in counts.items() if count > 1]:
@@ -87,7 +87,7 @@ def main(arguments: argparse.Namespace) -> int:
     own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
     options = ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})
     found = DATASETS[arguments.dataset].list_scenes(options)
-    specs = chosen(found.specs, arguments.rooms)
+    specs = choose_scenes(found.specs, arguments.rooms)
     for note in found.notes:
         print_note(arguments, note)
     show = progress_bar(arguments.quiet)

@@ -46,9 +46,9 @@ def report_error(
 ) -> int:
     """Print the error that ended a command, and return its exit code; `lost` is that of raising_signals."""
     if isinstance(error, KeyboardInterrupt):
-        return _stopped(arguments, error)
+        return _report_stop(arguments, error)
     if not isinstance(error, OSError | InputError):
-        return _unforeseen(arguments, error, lost)  # the last line of defence: a code and one line
+        return _report_unforeseen(arguments, error, lost)  # the last line of defence: a code and one line
     discard_stdout()
     if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
         return EXIT_BROKEN_PIPE
@@ -56,9 +56,9 @@ def report_error(
     return print_error(arguments, text_of(error), code)
 
 
-def _unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:
+def _report_unforeseen(arguments: argparse.Namespace, error: Exception, lost: list[KeyboardInterrupt]) -> int:
     if lost:  # what was called back by C has failed for it
-        return _stopped(arguments, lost[0])
+        return _report_stop(arguments, lost[0])
     if is_shortage(error):
         text = " ".join(str(error).split()) or "none is left"
         return print_error(arguments, SHORTAGE.format(text), EXIT_BAD_INPUT)
@@ -102,7 +102,7 @@ def _terminate(signum: int, frame: FrameType | None) -> None:
     raise Terminated
 
 
-def _stopped(arguments: argparse.Namespace, stop: KeyboardInterrupt) -> int:
+def _report_stop(arguments: argparse.Namespace, stop: KeyboardInterrupt) -> int:
     if isinstance(stop, Terminated):
         return print_error(arguments, "terminated", EXIT_TERMINATED)
     return print_error(arguments, "interrupted", EXIT_INTERRUPTED)

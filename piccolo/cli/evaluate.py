@@ -14,7 +14,7 @@ import numpy as np
 from ..batch.localizer import Localizer
 from ..errors import InputError
 from ..files.atomic import check_output, is_stream, write_atomically
-from ..files.line_file import LineFile, locked
+from ..files.line_file import LineFile, open_locked
 from ..jobs.cluster import Cluster
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
@@ -191,7 +191,7 @@ def run_scenes(
     check_variants(scenes, variants)
     check_output(path)
     settings = settings_json(config.settings, config.cloud_settings, config.read_options)
-    with locked(path) as file, ExitStack() as stack:
+    with open_locked(path) as file, ExitStack() as stack:
         rows, size = read_run(path)
         check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
         pairs = [(scene, query) for scene in scenes for query in scene.queries]
@@ -239,7 +239,7 @@ class Evaluation:
             cluster.forget()  # a worker may not have room for the last scene's map and this one's
         localizer = replace(self.config, paths=(scene.cloud,))
         if has_labels := localizer.read_options.labels is not None:
-            queries = self.labelled(scene, queries)
+            queries = self.select_labelled(scene, queries)
         num_jobs = count_jobs(self.arguments, len(queries))
         with ExitStack() as stack:
             place = executing(self.arguments, localizer, num_jobs, cluster, open_scan)
@@ -251,7 +251,7 @@ class Evaluation:
             pictures = (query.labels if has_labels and query.labels else query.image for query in queries)
             tasks = (localizer.task(p, q.calibration) for p, q in zip(pictures, queries, strict=True))
             values = executor.values(tasks)
-            pairs = interruption.each(show(iter(values), len(queries), scene.name), values.finished())
+            pairs = interruption.each(show(iter(values), len(queries), scene.name), values.take_finished())
             for query, is_inside, (task, wait) in zip(queries, are_inside, pairs, strict=False):
                 try:
                     result = wait().result
@@ -259,7 +259,7 @@ class Evaluation:
                     result = localizer.lost(task, error, None).result
                 self.record(scene, query, result, is_inside)
 
-    def labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:
+    def select_labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:
         """Return the queries that have labels; the others are reported."""
         for query in queries:
             if query.labels is None:

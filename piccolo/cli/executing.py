@@ -15,7 +15,7 @@ from typing import TypeVar
 from ..batch.localizer import Localizer
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
-from ..jobs.cluster import LOCAL, Cluster, connected
+from ..jobs.cluster import LOCAL, Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Processes
 from ..jobs.tasks import Here
@@ -88,7 +88,7 @@ def connecting(arguments: argparse.Namespace, num_jobs: int) -> AbstractContextM
     if not arguments.dask:
         return nullcontext()
     num_threads = arguments.threads or (1 if is_remote(arguments) else max(1, num_cores() // num_jobs))
-    return connected(arguments.dask, num_jobs, num_threads)
+    return connect(arguments.dask, num_jobs, num_threads)
 
 
 @contextmanager

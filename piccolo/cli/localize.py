@@ -20,7 +20,7 @@ from ..batch.results_file import Records
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import printable
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
-from ..files.line_file import LineFile, locked, write_line
+from ..files.line_file import LineFile, open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import WorkerLostError
@@ -149,7 +149,7 @@ def open_output(out: Path) -> Iterator[tuple[LineFile | None, Write]]:
         with out.open("wb", buffering=0) as stream:
             yield None, lambda line: write_line(stream.fileno(), out, line)
     else:
-        with locked(out) as file:
+        with open_locked(out) as file:
             yield file, file.append
 
 
@@ -157,7 +157,7 @@ def take_up_results(run: Run, file: LineFile | None) -> Records:
     """Return the results of earlier runs in the output, which are to be as those of this run would be."""
     records = Records(file.path if file else None)
     if file and file.size and not run.arguments.overwrite:
-        expected = run.localizer.expected(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
+        expected = run.localizer.expect(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
         records.read(expected, None if run.total is None else run.panoramas)
     return records
 
@@ -191,7 +191,7 @@ def localize_all(
     with interruptible() as interruption:
         pairs = shown(values, is_quiet, **bar)
         # behind the photo after which a signal has ended it come those that are done already
-        for task, wait in pairs if run.total == 1 else interruption.each(pairs, values.finished()):
+        for task, wait in pairs if run.total == 1 else interruption.each(pairs, values.take_finished()):
             try:
                 answer = wait()
             except WorkerLostError as error:

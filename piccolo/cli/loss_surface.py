@@ -56,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--gravity", "yaws, or all of SO(3)", choices=["known", "unknown"], default="known")
 
 
-def known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
+def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
     """Return the pose found and the true one of the panorama, as far as files are given."""
     name = arguments.pano.name
     known: KnownPoses = {}
@@ -131,7 +131,7 @@ def main(arguments: argparse.Namespace) -> int:
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     cloud = open_points(arguments.cloud, cloud_settings, workers)
     print_warnings(arguments, cloud.warnings)
-    known = known_poses(arguments, cloud)
+    known = read_known_poses(arguments, cloud)
     grid = grid_from(arguments, cloud, known)
     begin = time.perf_counter()
     surface = loss_surface(cloud.points, texels, grid, MAX_POINTS, workers)

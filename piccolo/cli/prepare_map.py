@@ -5,8 +5,8 @@ import json
 
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers, num_cores
-from ..scan_map.named_scans import check_name, named
-from ..scan_map.open_map import CachePolicy, extended_map, open_map, write_map
+from ..scan_map.named_scans import check_name, name_scan
+from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
 from .command import command, option
 from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
@@ -48,12 +48,12 @@ def main(arguments: argparse.Namespace) -> int:
     watch = Stopwatch()
     workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
     if arguments.add:
-        scan_map = extended_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
+        scan_map = extend_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
         no_cache = CachePolicy(is_used=False)
         scan_map = open_map(arguments.cloud, cloud_settings, no_cache, workers, watch, has_features=True)
         if arguments.name is not None or not scan_map.scan_names:  # a map keeps its names
-            scan_map = named(scan_map, name)
+            scan_map = name_scan(scan_map, name)
     write_map(scan_map, arguments.out, workers)
     report = {
         "map": str(arguments.out),

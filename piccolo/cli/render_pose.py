@@ -16,7 +16,7 @@ from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
-from ..geometry.pose import Pose, checked_rotation, orthonormal, pose_errors
+from ..geometry.pose import Pose, check_rotation, orthonormal, pose_errors
 from ..geometry.rotations import R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
@@ -197,7 +197,7 @@ def read_pose_matrix(path: Path) -> Pose:
         raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
     if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
-    R_world_from_cam = checked_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
+    R_world_from_cam = check_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
     return Pose(orthonormal(R_world_from_cam).T, T[:3, 3])
 
 
@@ -227,7 +227,7 @@ def draw_pictures(
         raise InputError(f"{arguments.out}: panoramas of the same name; choose one with --pano")
 
     def write(folder: Path, name: str, shot: Shot) -> dict[str, object]:
-        camera = shot.camera and shot.camera.scaled_to_width(arguments.width)
+        camera = shot.camera and shot.camera.scale_to_width(arguments.width)
         width = sphere_width_for(camera) if camera else arguments.width
         view = render_points(cloud.points, cloud.from_world(shot.pose), width, workers)
         view = view._replace(rgb=fill_holes(view.rgb, view.is_seen))

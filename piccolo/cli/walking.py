@@ -19,7 +19,7 @@ from ..batch.results_file import WAYS, Records
 from ..camera import Calibration
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stream, write_atomically
-from ..files.line_file import LineFile, locked, whole_lines, whole_size
+from ..files.line_file import LineFile, open_locked, whole_lines, whole_size
 from ..files.temporary import temporary_folder
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
@@ -140,13 +140,15 @@ def run_walk(
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
         if interruption.number:
-            how = "the same command goes on" if kept_in(arguments.out) else "with --out FILE it would go on"
+            how = (
+                "the same command goes on" if frames_file(arguments.out) else "with --out FILE it would go on"
+            )
             return interruption.stop(arguments, f"{len(walk.taken)} frames", how)
         results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
     write_all(arguments.out, results)
     write_plan(arguments.plan, scan, results)
     counts = Counter(result.status for result in results)
-    if (path := kept_in(arguments.out)) and not counts[FAILED]:
+    if (path := frames_file(arguments.out)) and not counts[FAILED]:
         path.unlink(missing_ok=True)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
     gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
@@ -181,7 +183,7 @@ def key_of(walk: Walk) -> dict[str, Any]:
     return {"settings": settings, "cloud_sha256": digest, "version": __version__}
 
 
-def kept_in(out: Path | None) -> Path | None:
+def frames_file(out: Path | None) -> Path | None:
     """Return where what was found of each frame is kept until the walk is finished; None for a stream."""
     return None if out is None or is_stream(out) else out.with_name(f"{out.name}.frames")
 
@@ -190,8 +192,8 @@ def follow_all(
     arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkInput], key: str
 ) -> Interruption:
     """Follow the frames, and keep what was found of each; say why one can't be read."""
-    path = kept_in(arguments.out)
-    with locked(path) if path else nullcontext() as file, ThreadPoolExecutor(1) as pool:
+    path = frames_file(arguments.out)
+    with open_locked(path) if path else nullcontext() as file, ThreadPoolExecutor(1) as pool:
         if file is not None:
             take_up(walk, frames, file, key, arguments.overwrite)
         bar = {"desc": "frames", "total": len(frames), "initial": len(walk.taken), "unit": ""}

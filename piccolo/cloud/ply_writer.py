@@ -150,7 +150,7 @@ def _write_copy(
     num_chunks = math.ceil(header.counts[header.index] / CHUNK)
     with writing_ply(out, dtype, comments, more) as writer:
         for some in cloud.show(columns, num_chunks, "write"):
-            writer.add(_transformed_rows(_rows(some, found), dtype, T_target_from_source))
+            writer.add(_transform_rows(_rows(some, found), dtype, T_target_from_source))
         if copied:
             offset, count, row = place_of_vertices(header)
             with header.path.open("rb") as file:
@@ -172,7 +172,7 @@ def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
     return rows
 
 
-def _transformed_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
+def _transform_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
     """Vertices with x y z moved and nx ny nz turned, all else as it is."""
     target = rows.astype(dtype)
     turn = T_target_from_source.copy()

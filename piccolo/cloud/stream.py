@@ -14,7 +14,7 @@ from ..files.cache import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .readers.reader import CHUNK, PointSource, RawCloud, brightest_of, colored_chunks
+from .readers.reader import CHUNK, PointSource, RawCloud, brightest_of, color_chunks
 from .settings import UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
@@ -206,5 +206,5 @@ def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | N
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
     brightest = brightest_of(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
-    chunks = colored_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
+    chunks = color_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
     return replace(stream_of(ARRAYS, next(iter(chunks))), sha256=sha256_of_arrays(points, colors))

@@ -31,7 +31,7 @@ def surface_variance(octree: Octree) -> Array:
     for levels_up in CELLS:
         cells = residual_moments(octree, levels_up)
         if len(cells[1]) >= MIN_CELLS:
-            return fitted_tensor(*cells)
+            return fit_tensor(*cells)
     return np.zeros((3, 3))
 
 
@@ -72,7 +72,7 @@ def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, NDArray[np.in
     return octree.nodes[index, :3].astype(np.float64), first, counts
 
 
-def fitted_tensor(normals: Array, variances: Array) -> Array:
+def fit_tensor(normals: Array, variances: Array) -> Array:
     """Return positive tensor T (3, 3) with n T n nearest to each variance (C,) along its normal n (C, 3)."""
     rows, columns = np.triu_indices(3)
     twice = np.where(rows == columns, 1.0, 2.0)

@@ -22,12 +22,12 @@ class Hypothesis:
     score: float  # more is better; in the end what of the panorama it explains, as in `localization.Evidence`
 
 
-def by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:
+def sort_by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Sort hypotheses by falling score, equal ones in their order."""
     return sorted(poses, key=lambda p: -p.score)
 
 
-def suppressed(
+def suppress_near(
     ranked: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
 ) -> list[Hypothesis]:
     """Return the first `count` poses that are not near an earlier one (distance [m] and angle [rad])."""
@@ -42,12 +42,12 @@ def best_distinct(
     poses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
 ) -> list[Hypothesis]:
     """Return at most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
-    return suppressed(by_score(poses), count, min_distance, min_angle)
+    return suppress_near(sort_by_score(poses), count, min_distance, min_angle)
 
 
 def alternative_poses(
     best: Pose, hypotheses: Sequence[Hypothesis], count: int = MAX_ALTERNATIVES
 ) -> list[Hypothesis]:
     """Return the `count` best-scoring hypotheses that are distinct from `best` and from each other."""
-    ranked = [Hypothesis(best, math.inf), *by_score(hypotheses)]
-    return suppressed(ranked, count + 1, MIN_DISTANCE, MIN_ANGLE)[1:]
+    ranked = [Hypothesis(best, math.inf), *sort_by_score(hypotheses)]
+    return suppress_near(ranked, count + 1, MIN_DISTANCE, MIN_ANGLE)[1:]

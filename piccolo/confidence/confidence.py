@@ -46,7 +46,7 @@ NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
 
 
-def features_of(standing: Standing) -> Array:
+def pose_features(standing: Standing) -> Array:
     """Return the features (3,) of a pose's odds, as FEATURES names them."""
     share = min(max(standing.share, LEAST_SHARE), MOST_SHARE)
     return np.log([share, max(standing.score, LEAST_SCORE), standing.num_matches + NOISE_MATCHES])
@@ -54,10 +54,10 @@ def features_of(standing: Standing) -> Array:
 
 def log_odds(standing: Standing, model: ChoiceModel = MODEL) -> float:
     """Return the logarithm of a pose's odds, up to a constant."""
-    return float(features_of(standing) @ np.array(model.weights)) + standing.log_prior
+    return float(pose_features(standing) @ np.array(model.weights)) + standing.log_prior
 
 
-def none_features_of(covariance: PoseCovariance | None) -> Array:
+def none_features(covariance: PoseCovariance | None) -> Array:
     """Return the features (2,) of the odds that no pose is right, as NONE_FEATURES names them."""
     if covariance is None:
         return np.array([1.0, math.log10(MOST_STD)])
@@ -74,7 +74,7 @@ def posterior(
     more where the best pose's own deviation makes 0.1 m doubtful.
     """
     logits = [log_odds(standing, model) for standing in standings]
-    logits.append(float(none_features_of(covariance) @ np.array(model.none_weights)))
+    logits.append(float(none_features(covariance) @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))
     probabilities = odds / odds.sum()
     if covariance is not None:

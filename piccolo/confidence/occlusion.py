@@ -65,22 +65,22 @@ class Occlusion:
 
 def occlusion_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Occlusion:
     """Compare photo and scan at a pose."""
-    view = _filled_view(points, pose)
+    view = _fill_view(points, pose)
     small = resize(panorama, view.depth.shape[1])
     is_shared = view.is_seen & small.is_valid
     of_photo = opponent_channels(small.rgb.astype(np.float32) / np.float32(255.0))
     of_scan = opponent_channels(view.rgb)
     shared = weight = is_shared.astype(np.float32)
-    coverage = _smoothed(shared)
+    coverage = _smooth(shared)
     for global_weight in GLOBAL_WEIGHTS:
         square = _squared_difference(of_photo, of_scan, is_shared, weight, global_weight)
-        difference = _smoothed(square * shared)
+        difference = _smooth(square * shared)
         difference /= np.maximum(coverage, np.float32(1e-6))
         weight = np.asarray(shared / (1.0 + difference / WEIGHT_SCALE) ** 2, np.float32)
     return Occlusion(difference, coverage, small.is_valid)
 
 
-def _filled_view(points: PackedPoints, pose: Pose) -> View:
+def _fill_view(points: PackedPoints, pose: Pose) -> View:
     """Render the scan at a pose on the smallest cells that its points fill."""
     view = render_view(points, pose, WIDTHS[0])
     for width in WIDTHS[1:]:
@@ -101,7 +101,7 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDAr
 
     def exceeds(values: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
         levels = np.clip(values * np.float32(LEVEL / threshold), 0.0, 255.0).astype(np.uint8)
-        return _enlarged(levels, shape) > LEVEL
+        return _enlarge(levels, shape) > LEVEL
 
     mask = np.full(shape, NOT_SCANNED, np.uint8)
     is_compared = exceeds(small.coverage, LEAST_COVERED) & panorama.is_valid
@@ -164,10 +164,10 @@ def _statistics(
     sums = blur_sphere(moments, SIGMA_DEG)
     sums += (full * total / max(total[0], 1e-9)).astype(np.float32)
     finish_statistics(sums)
-    return _enlarged(sums[..., 1:], weight.shape)
+    return _enlarge(sums[..., 1:], weight.shape)
 
 
-def _smoothed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     """Smooth a map (H, W) by a narrow Gaussian on the sphere: rows, wider at the poles, then columns."""
     height, width = values.shape
     cosine = np.cos((0.5 - (np.arange(height) + 0.5) / height) * math.pi)
@@ -188,7 +188,7 @@ def _extreme(
     return np.asarray(of(padded, np.ones((3, 3), np.uint8))[:, 1:-1])
 
 
-def _enlarged(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
+def _enlarge(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
     """Enlarge a map (h, w, ...) to a shape (H, W), bilinearly; columns wrap."""
     border = math.ceil(shape[1] / small.shape[1])
     padded = np.concatenate([small[:, -1:], small, small[:, :1]], axis=1)

@@ -97,7 +97,7 @@ class LineFile:
 
 
 @contextmanager
-def locked(path: Path) -> Iterator[LineFile]:
+def open_locked(path: Path) -> Iterator[LineFile]:
     """Yield a file of lines, made if there is none, and then removed at the end if nothing is in it.
 
     Raises InputError if another process is writing the file.
@@ -116,5 +116,5 @@ def locked(path: Path) -> Iterator[LineFile]:
                 if is_new and file.size == 0 and file.is_in_place:
                     path.resolve().unlink()
             return
-    with locked(path) as file:  # as it was removed or replaced by whoever had the lock before
+    with open_locked(path) as file:  # as it was removed or replaced by whoever had the lock before
         yield file

@@ -20,14 +20,14 @@ def temporary_folder() -> Iterator[Path]:
         with suppress(OSError):  # it is in use, or not ours
             status = left.lstat()
             if status.st_uid == os.getuid() and time.time() - status.st_mtime > YOUNG_S:
-                with _locked(left):
+                with _hold_lock(left):
                     shutil.rmtree(left)
-    with tempfile.TemporaryDirectory(prefix=PREFIX) as name, _locked(Path(name)):
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as name, _hold_lock(Path(name)):
         yield Path(name)
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def _hold_lock(folder: Path) -> Iterator[None]:
     """Hold a folder's lock, which ends with the process; OSError if another has it."""
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
     try:

@@ -83,7 +83,7 @@ def orthonormal(R: Array) -> Array:
     return R
 
 
-def checked_rotation(R: Array, tolerance: float, label: str) -> Array:
+def check_rotation(R: Array, tolerance: float, label: str) -> Array:
     """`R` as it is; InputError, naming it `label`, if R R^T is off the identity (3, 3) or R is a mirror."""
     # the bound on the entries keeps the product finite; NaN is not below it either
     is_tame = R.shape == (3, 3) and np.abs(R).max() < 2.0

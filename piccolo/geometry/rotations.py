@@ -50,7 +50,7 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
     return rotation_from_quaternion_wxyz(quaternion / np.linalg.norm(quaternion))
 
 
-def turned(pose: Pose, other_from_cam: Array) -> Pose:
+def turn_axes(pose: Pose, other_from_cam: Array) -> Pose:
     """Return the camera with its rotation to other axes."""
     return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
 

@@ -40,7 +40,7 @@ _opening = threading.Lock()
 
 
 @contextmanager
-def connected(address: str, num_processes: int, num_threads: int) -> Iterator["Cluster"]:
+def connect(address: str, num_processes: int, num_threads: int) -> Iterator["Cluster"]:
     """Yield the cluster of a scheduler's address or file; or of so many processes here, if it is "local".
 
     Raises InputError if dask.distributed is missing, or no scheduler or worker of this version answers.
@@ -174,7 +174,7 @@ class Cluster:
             raise InputError(text) from error
 
 
-def sent_file(name: str) -> Path:
+def find_sent_file(name: str) -> Path:
     """Return where a worker has what `Cluster.send_file` has sent it."""
     worker = import_optional("`dask`", "distributed", "distributed").get_worker()
     return Path(worker.local_directory) / name

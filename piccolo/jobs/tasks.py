@@ -36,7 +36,7 @@ class Here:
         """Yield each, taken when it is asked for."""
         return ((item, partial(self.function, item)) for item in self.items)
 
-    def finished(self) -> Iterator[Pair]:
+    def take_finished(self) -> Iterator[Pair]:
         """Yield nothing."""
         return iter(())
 
@@ -77,7 +77,7 @@ class InFlight:
             yield pair[0], pair[1].result
             self._room.release()
 
-    def finished(self) -> Iterator[Pair]:
+    def take_finished(self) -> Iterator[Pair]:
         """Yield what is done already of those that come next."""
         while self._pairs and (pair := self._pairs[0]) is not None and pair[1].done():
             self._pairs.popleft()

@@ -104,7 +104,7 @@ class Workers:
                     values.append(function(item))
                     next(shown)
             else:
-                with submitted(self.num_threads, [partial(function, item) for item in items]) as futures:
+                with submit(self.num_threads, [partial(function, item) for item in items]) as futures:
                     for future in futures:
                         values.append(future.result())
                         next(shown)
@@ -121,12 +121,12 @@ class Workers:
         if self.num_threads == 1 or hasattr(_thread, "is_of_pool"):
             yield
             return
-        with submitted(1, functions):
+        with submit(1, functions):
             yield
 
 
 @contextmanager
-def submitted(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterator[list[Future[Value]]]:
+def submit(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterator[list[Future[Value]]]:
     """Tasks on so many threads; at the end, those that have not begun are dropped, and others waited for."""
     with pool_of(num_threads) as pool:
         futures = [pool.submit(task) for task in tasks]

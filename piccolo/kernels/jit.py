@@ -124,15 +124,15 @@ def read_whole(path: Path) -> bytes | None:
     return payload
 
 
-def captured_by(function: Any) -> list[Any]:
+def find_captured(function: Any) -> list[Any]:
     """The functions that a function takes from around it, and those that these take: they are compiled in."""
     found = []
     for cell in getattr(function, "py_func", function).__closure__ or ():
-        found += [cell.cell_contents, *captured_by(cell.cell_contents)]
+        found += [cell.cell_contents, *find_captured(cell.cell_contents)]
     return found
 
 
-def rebuilt(
+def rebuild(
     target_context: Any, library: tuple[str, str, tuple[bytes, bytes]], description: Any, *others: object
 ) -> Any:
     """A compiled kernel from its pickled parts.
@@ -155,7 +155,7 @@ class KernelCache:
 
     def __init__(self, function: Any) -> None:
         """Remember which kernel; nothing is opened."""
-        self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *captured_by(function)))
+        self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *find_captured(function)))
         self.cache_path = None  # Numba's `stats` shows it
 
     def _file(self, signature: object, codegen: Any) -> Path | None:
@@ -172,7 +172,7 @@ class KernelCache:
             rtsys.initialize(target_context)
             path = self._file(signature, target_context.codegen())
             if payload := path and read_whole(path):
-                return rebuilt(target_context, *pickle.loads(payload))
+                return rebuild(target_context, *pickle.loads(payload))
         except Exception as error:  # Numba's insides are not as they were
             warn_not_kept(f"Numba {numba.__version__}: {error!r}")
         compiling.start()

@@ -37,7 +37,7 @@ class Keypoints(NamedTuple):
         taken: list[Any] = [values[indices] for values in self]
         return Keypoints(*taken)
 
-    def mirrored(self) -> "Keypoints":
+    def mirror(self) -> "Keypoints":
         """Those of the picture turned over, left for right: rays and descriptors alike."""
         left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
         histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
@@ -105,10 +105,10 @@ def find_keypoints(
         is_own = np.argmax(keypoints.rays @ middles.T, axis=1) == k  # what views share counts once
         return keypoints.take(np.flatnonzero(is_own))
 
-    return joined_keypoints(list(workers.map(find, chosen, "find keypoints")))
+    return join_keypoints(list(workers.map(find, chosen, "find keypoints")))
 
 
-def joined_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
+def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
     """Keypoints of several views, one after the other."""
     return Keypoints(*(np.concatenate(values) for values in zip(_nothing(), *parts, strict=True)))
 

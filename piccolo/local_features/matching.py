@@ -129,7 +129,7 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
     )
 
 
-def joined_matches(parts: Sequence[Matches], counts: Sequence[int]) -> Matches:
+def join_matches(parts: Sequence[Matches], counts: Sequence[int]) -> Matches:
     """Matches of parts of a photo, of so many features each, which are numbered one part after the other."""
     first = np.repeat(np.cumsum([0, *counts])[:-1], [len(part.query) for part in parts])
     query, *others = (np.concatenate(values) for values in zip(NO_MATCHES, *parts, strict=True))

@@ -23,7 +23,7 @@ POLISHING = 4  # Newton steps on the distances
 
 
 @inline_kernel
-def scaled(factor, a):
+def scale(factor, a):
     """A vector times a number."""
     return factor * a[0], factor * a[1], factor * a[2]
 
@@ -34,9 +34,9 @@ def axes_of(a, b):
     normal = cross(a, b)
     across = cross(normal, a)
     return (
-        scaled(1.0 / math.sqrt(dot(a, a)), a),
-        scaled(1.0 / math.sqrt(dot(across, across)), across),
-        scaled(1.0 / math.sqrt(dot(normal, normal)), normal),
+        scale(1.0 / math.sqrt(dot(a, a)), a),
+        scale(1.0 / math.sqrt(dot(across, across)), across),
+        scale(1.0 / math.sqrt(dot(normal, normal)), normal),
     )
 
 
@@ -273,9 +273,9 @@ def p3p(bearings, points, rotations, centers):
         d = work[3, k % 2]
         if k % 2 >= num_met or not polish_distances(d, cosines, sides2):
             continue
-        x, y, z = scaled(math.sqrt(longest2), d)
-        d01 = minus(scaled(y, b1), scaled(x, b0))
-        d02 = minus(scaled(z, b2), scaled(x, b0))
+        x, y, z = scale(math.sqrt(longest2), d)
+        d01 = minus(scale(y, b1), scale(x, b0))
+        d02 = minus(scale(z, b2), scale(x, b0))
         R = rotations[count]
         pose_of_triangle(d01, d02, e01, e02, R)
         for i in range(3):

@@ -98,20 +98,20 @@ def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     pyramid = [(gray, weight)]
     for _ in range(FILL_LEVELS):
         size = gray.shape[1] >> len(pyramid), gray.shape[0] >> len(pyramid)
-        pyramid.append((_resized(pyramid[-1][0], size), _resized(pyramid[-1][1], size)))
+        pyramid.append((_resize_image(pyramid[-1][0], size), _resize_image(pyramid[-1][1], size)))
     total, known = pyramid.pop()
     filled: Floats = total / np.maximum(known, 1e-6)
     counts: Floats = (known > LEAST_FILLED).astype(np.float32)
     for total, known in reversed(pyramid):
         size = total.shape[1], total.shape[0]
-        wider = _resized(filled * counts, size)
-        counts = known + (1.0 - known) * _resized(counts, size)
+        wider = _resize_image(filled * counts, size)
+        counts = known + (1.0 - known) * _resize_image(counts, size)
         filled = (total + (1.0 - known) * wider) / np.maximum(counts, 1e-6)
         counts = (counts > LEAST_FILLED).astype(np.float32)
     return filled, counts > 0.0
 
 
-def _resized(image: Floats, size: tuple[int, int]) -> Floats:
+def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
     """An image at another (width, height): means where that is smaller, else bilinear."""
     how = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, size, interpolation=how))

@@ -44,7 +44,7 @@ Found = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make furth
 Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Found]
 
 
-def attempts_for(query: Query) -> list[tuple[int, Attempt]]:
+def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
     """Return the searches for a photo in order, each with the number of feature halves that it matches.
 
     A first look by whole views (0 halves) may settle a whole upright sphere. Then come poses from feature
@@ -67,13 +67,13 @@ def attempts_for(query: Query) -> list[tuple[int, Attempt]]:
 def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
     first = brief_query(query)
-    of_mirror = Once(partial(mirror_score, query))
+    of_mirror = Once(partial(score_mirror, query))
     with query.workers.beside(of_mirror):
         with watch.stage("search"):
             starts = search_poses(first, "known")
         with watch.stage("refine"):
             found = known + refine(first, starts, FIRST_BEAM)
-            return found, is_clear(query, found) and first_score(first, starts) >= MIRROR_RATIO * of_mirror()
+            return found, is_clear(query, found) and score_starts(first, starts) >= MIRROR_RATIO * of_mirror()
 
 
 def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
@@ -82,7 +82,7 @@ def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> F
     Poses from half of the features are dropped unless they are sure: all features find better ones.
     """
     with watch.stage("match"):
-        poses = matched_poses(query)
+        poses = match_poses(query)
         is_half = query.num_halves < ALL_HALVES
         if is_half and (not poses or count_matches(query.matches, poses[0]) < CLEAR_MATCHES):
             return known, False
@@ -120,7 +120,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
         return refine(anywhere, starts, FIRST_BEAM)
 
 
-def matched_poses(query: Query) -> list[Pose]:
+def match_poses(query: Query) -> list[Pose]:
     """Return poses from feature matches, best first; without whole views, those that the prior allows."""
     level = query.photo.R_cam_from_level if query.settings.gravity == "known" else None
     poses = [f.pose for f in poses_of(query.matches, level, NUM_MATCHED, query.workers)]
@@ -150,16 +150,16 @@ def tilted_query(query: Query) -> Query:
     cells = np.floor(query.scan_map.centers[query.scan_map.sparse] / COARSE_SPACING).astype(np.int64)
     is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
     settings = replace(brief.settings, num_rotations=min(FIRST_ROTATIONS, query.settings.num_rotations))
-    return replace(brief, scan_map=query.scan_map.narrowed(is_even), settings=settings)
+    return replace(brief, scan_map=query.scan_map.narrow(is_even), settings=settings)
 
 
-def mirror_score(query: Query) -> float:
+def score_mirror(query: Query) -> float:
     """Search the mirrored photo, and return its first score."""
-    mirror = mirrored(query)
-    return first_score(mirror, search_poses(mirror, "known"))
+    mirror = mirror_query(query)
+    return score_starts(mirror, search_poses(mirror, "known"))
 
 
-def first_score(query: Query, starts: Starts) -> float:
+def score_starts(query: Query, starts: Starts) -> float:
     """Return the best score after short descents from the best starts on prepared views."""
     best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
     image = query.photo.images.search()
@@ -167,7 +167,7 @@ def first_score(query: Query, starts: Starts) -> float:
     return float(scores.max(initial=0.0))
 
 
-def mirrored(query: Query) -> Query:
+def mirror_query(query: Query) -> Query:
     """Return the query of the photo mirrored left to right, without the heading prior, for a first score."""
     search = query.photo.images.search()
     rgbx = np.ascontiguousarray(search.rgbx.reshape(-1, search.width + 2)[:, ::-1]).reshape(-1)

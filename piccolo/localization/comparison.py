@@ -187,7 +187,7 @@ def score_pose(query: Query, pose: Pose) -> Hypothesis:
     return Hypothesis(pose, compare(query, pose).score)
 
 
-def without_occluders(query: Query, pose: Pose) -> Query:
+def mask_occluders(query: Query, pose: Pose) -> Query:
     """Mask the photo's blocks that contradict the scan at a pose; the query itself if there are none."""
     seen = compare(query, pose)
     contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
@@ -195,7 +195,7 @@ def without_occluders(query: Query, pose: Pose) -> Query:
         return query
     key = contradicts.tobytes()
     if key not in query.cache.unoccluded:
-        query.cache.unoccluded[key] = query.without(contradicts[pixel_blocks()])
+        query.cache.unoccluded[key] = query.mask_pixels(contradicts[pixel_blocks()])
     return query.cache.unoccluded[key]
 
 

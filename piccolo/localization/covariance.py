@@ -14,9 +14,9 @@ from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..views.view import Cells
-from .comparison import without_occluders
+from .comparison import mask_occluders
 from .query import Query
-from .refinement import FULL_LOSS, as_levels
+from .refinement import FULL_LOSS, to_levels
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 MOST_SHARE = 1.001  # above 1, so that one block may hold all information
@@ -51,7 +51,7 @@ def gradient_at(image: Texels, points: Cells, pose: Pose) -> Array:
     return sums[GRADIENT:MATRIX].copy()
 
 
-def symmetric(upper: Array) -> Array:
+def fill_symmetric(upper: Array) -> Array:
     """Return symmetric matrices (..., 6, 6) from their upper triangles (..., 21), row by row."""
     matrix = np.zeros((*upper.shape[:-1], 6, 6))
     rows, columns = np.triu_indices(6)
@@ -59,7 +59,7 @@ def symmetric(upper: Array) -> Array:
     return matrix
 
 
-def without_poles(points: Cells, pose: Pose) -> Cells:
+def remove_poles(points: Cells, pose: Pose) -> Cells:
     """Remove the points around a pose that lie within POLE_DEG of the photo's poles."""
     heights = pose.R_cam_from_world[2] @ points.offsets
     ranges = np.linalg.norm(points.offsets, axis=0)
@@ -93,19 +93,19 @@ def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[
     return sums
 
 
-def blocks_of(points: Cells) -> NDArray[np.integer]:
+def assign_blocks(points: Cells) -> NDArray[np.integer]:
     """Return the block (N,) of the sphere in which each point lies."""
     return cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], ERROR_RINGS)
 
 
 def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
     """Return jackknife gradients (B, 6), in the camera's frame, of the blocks around it."""
-    sums = equations_by_block(image, points, pose, blocks_of(points))
+    sums = equations_by_block(image, points, pose, assign_blocks(points))
     shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
-    return as_left_out(shown[:, GRADIENT:MATRIX], symmetric(shown[:, MATRIX:]))
+    return jackknife_gradients(shown[:, GRADIENT:MATRIX], fill_symmetric(shown[:, MATRIX:]))
 
 
-def as_left_out(gradients: Array, matrices: Array) -> Array:
+def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
     """Return gradients (B, 6) as at a pose found without each block, by matrices (B, 6, 6).
 
     The more information one block holds, the more the pose has followed its errors, and the less of them its
@@ -116,7 +116,7 @@ def as_left_out(gradients: Array, matrices: Array) -> Array:
     return np.asarray(np.linalg.solve(MOST_SHARE * np.eye(6) - shares, gradients[..., None])[..., 0])
 
 
-def covariance_of(hessian: Array, gradients: Array) -> Array | None:
+def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, for errors correlated within blocks.
 
     The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the points
@@ -129,7 +129,7 @@ def covariance_of(hessian: Array, gradients: Array) -> Array | None:
     return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
 
 
-def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
+def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, by the image that determines it best.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
@@ -139,7 +139,7 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     def by(steps: DifferenceSteps) -> Array | None:
         image = query.photo.images[steps.scale]()
         hessian = hessian_at(image, points, pose, steps)
-        covariance = covariance_of(hessian, block_gradients(image, points, pose))
+        covariance = sandwich_covariance(hessian, block_gradients(image, points, pose))
         return covariance if covariance is None else steps.inflation * covariance
 
     found = [c for c in query.workers.map(by, STEPS, "covariance") if c is not None]
@@ -148,7 +148,7 @@ def covariance_at(query: Query, points: Cells, pose: Pose) -> Array | None:
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
-def errors_of_source(query: Query, points: Cells, pixel_share: float) -> Array:
+def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the photo and of the scan.
 
     These are correlated over many blocks: a photo's grid and stitching, in pixels, and a scan's noise and
@@ -168,16 +168,16 @@ def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None
 
     `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration.
     """
-    query = without_occluders(query, pose)
-    points = without_poles(query.points_at(pose).around(pose.center_world), pose)
-    points = points._replace(channels=as_levels(points.channels))
-    covariance = covariance_at(query, points, pose)
+    query = mask_occluders(query, pose)
+    points = remove_poles(query.points_at(pose).around(pose.center_world), pose)
+    points = points._replace(channels=to_levels(points.channels))
+    covariance = compute_covariance(query, points, pose)
     if covariance is None:
         return None
     J = np.eye(6)
     J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
     pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
-    covariance_map = J @ covariance @ J.T + errors_of_source(query, points, pixel_share)
+    covariance_map = J @ covariance @ J.T + source_covariance(query, points, pixel_share)
     std_of_fit = None
     if of_camera is not None:
         std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))

@@ -26,11 +26,11 @@ from ..jobs.threads import Once
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
 from ..views.view import Cells
-from .comparison import score_pose, without_occluders
-from .covariance import blocks_of, equations_by_block, without_poles
+from .comparison import mask_occluders, score_pose
+from .covariance import assign_blocks, equations_by_block, remove_poles
 from .last_descent import refine_to_the_end
-from .query import Features, Query, images_of, prepare_query
-from .refinement import FINE_LOSS, FULL_LOSS, as_levels, descend
+from .query import Features, Query, make_images, prepare_query
+from .refinement import FINE_LOSS, FULL_LOSS, descend, to_levels
 from .selection import Selection
 
 FOCALS = "f", "fx", "fy"
@@ -79,7 +79,7 @@ class FocalFit(NamedTuple):
         """Covariance (6, 6) of a pose by that of the calibration: rotation, then centre in the map."""
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
-    def moved(self, pose: Pose) -> Pose:
+    def move(self, pose: Pose) -> Pose:
         """Move a pose in the map with the change."""
         delta = self.motion @ self.change
         return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:])
@@ -151,9 +151,9 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     middle = np.zeros(num)
     found: Crest | None = None
     for _ in range(MOST_DESIGNS):
-        changes = middle + design(num, reach)
+        changes = middle + make_design(num, reach)
         losses, ends = take_profile(query, pose, changes)
-        crest = crest_of(changes, losses, ends, pose)
+        crest = fit_crest(changes, losses, ends, pose)
         has_crest = bool(crest.information.any())
         is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
         if not is_inside and (found is not None or not has_crest):
@@ -168,7 +168,7 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     return found or Crest(np.zeros(num), np.zeros((num, num)), crest.motion)
 
 
-def design(num: int, reach: float) -> Array:
+def make_design(num: int, reach: float) -> Array:
     """Return changes (K, num) of a camera on a grid within a reach on either side."""
     values = np.linspace(-reach, reach, NUM_VALUES if num == 1 else NUM_VALUES_OF_TWO)
     scales = [values, values * K1_PER_FOCAL]
@@ -181,35 +181,35 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     Returns the losses (K, B) of each block of the sphere at the ends, and the ends.
     """
     given = query.photo.given
-    shown = without_occluders(query, pose)
+    shown = mask_occluders(query, pose)
     whole = query.photo.panorama
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
     def retake(change: Array) -> Panorama:
-        found = given.retaken(change_camera(given.cameras[0].camera, change), whole.rgb.shape[1])
+        found = given.resample(change_camera(given.cameras[0].camera, change), whole.rgb.shape[1])
         return replace(found, is_valid=found.is_valid & is_left)
 
     narrowest = retake(changes.max(axis=0)).is_valid
-    points = within(shown.points_at(pose), pose, narrowest)
+    points = mask_edge(shown.points_at(pose), pose, narrowest)
     fine = shown.view_at(pose, query.method.fine_view)
-    around = without_poles(points.around(pose.center_world), pose)
-    block = blocks_of(around)
+    around = remove_poles(points.around(pose.center_world), pose)
+    block = assign_blocks(around)
     middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
-        images = images_of(retake(change), query.method.scales)
+        images = make_images(retake(change), query.method.scales)
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
         near = pose if is_near else descend(fine, images.fine(), pose, NEARBY)
         end = descend(points, images.full(), near, CLOSE)
         seen = around.around(end.center_world)
-        seen = seen._replace(channels=as_levels(seen.channels))
+        seen = seen._replace(channels=to_levels(seen.channels))
         return end, equations_by_block(images.full(), seen, end, block)[:, LOSS]
 
     ends = query.workers.map(end_with, list(changes), "fit the focal length")
     return np.array([losses for _, losses in ends]), [end for end, _ in ends]
 
 
-def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
+def mask_edge(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
     """Remove the points near the edge of what a photo (H, W) shows."""
     inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
     offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
@@ -218,7 +218,7 @@ def within(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def crest_of(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Crest:
+def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Crest:
     """Find the crest of a profile by a quadratic function (least squares), and how poses follow the camera.
 
     The changes (K, p) of the camera have losses (K, B) by block and poses; `pose` is that of none.
@@ -259,7 +259,7 @@ def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFi
         if fit.is_at_rest:
             break
         query = recalibrate(query, fit.change)
-        poses = [fit.moved(found.best.pose), *(h.pose for h in found.alternatives)]
+        poses = [fit.move(found.best.pose), *(h.pose for h in found.alternatives)]
         moved = query.workers.map(partial(score_pose, query), poses, "compare")
         found = refine_to_the_end(query, moved)
     else:
@@ -272,7 +272,7 @@ def recalibrate(query: Query, change: Array) -> Query:
     given = query.photo.given
     before = given.cameras[0]
     after = before.with_camera(change_camera(before.camera, change))
-    taken = given.retaken(after.camera, given.rgb.shape[1])
+    taken = given.resample(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
     features = tuple(Once(partial(_turn_features, half, before, after)) for half in query.features)
     return replace(fresh, features=features, num_halves=query.num_halves)

@@ -8,7 +8,7 @@ from functools import partial
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches
-from .comparison import score_pose, without_occluders
+from .comparison import mask_occluders, score_pose
 from .query import Query
 from .refinement import (
     FULL_LOSS,
@@ -80,7 +80,7 @@ def refine_unoccluded(query: Query, pose: Pose) -> tuple[Query, Hypothesis]:
     """
     h = score_pose(query, pose)
     for _ in range(MAX_UNOCCLUDED):
-        shown = without_occluders(query, h.pose)
+        shown = mask_occluders(query, h.pose)
         start = Fit(h.pose, h.score)
         if shown is not query:
             start = descend_fine(shown, perturb_middle(shown, h.pose).pose)
@@ -100,7 +100,7 @@ def refine_full_resolution(query: Query, pose: Pose) -> Hypothesis:
 
 def settle(query: Query, h: Hypothesis) -> Hypothesis:
     """Descend until the pose rests, so that it does not depend on where the search began."""
-    shown = without_occluders(query, h.pose)
+    shown = mask_occluders(query, h.pose)
     return descend_on_points(query, shown, h, LAST_LIMITS, MAX_LAST_ROUNDS, SETTLED)
 
 

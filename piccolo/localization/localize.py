@@ -14,7 +14,7 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
-from .attempts import attempts_for, search_beyond_prior
+from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, calibrate, change_camera
 from .last_descent import HOPELESS_SCORE, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
@@ -51,7 +51,7 @@ def localize(
     # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, query.photo.colors):
         hypotheses: list[Hypothesis] = []
-        for num_halves, attempt in attempts_for(query):
+        for num_halves, attempt in plan_attempts(query):
             query = replace(query, num_halves=num_halves)
             hypotheses, is_enough = attempt(query, hypotheses, watch)
             if is_enough:
@@ -75,11 +75,13 @@ def localize_guessed(
     """Localize a photo with several focal lengths around a guess, and return the most confident result."""
     camera = panorama.cameras[0].camera
     width = panorama.rgb.shape[1]
-    taken = [panorama.retaken(change_camera(camera, np.array([guess])), width) for guess in GUESSES]
-    return likeliest([localize(scan_map, photo, settings, workers, watch) for photo in taken], settings)
+    taken = [panorama.resample(change_camera(camera, np.array([guess])), width) for guess in GUESSES]
+    return select_likeliest(
+        [localize(scan_map, photo, settings, workers, watch) for photo in taken], settings
+    )
 
 
-def likeliest(found: Sequence[Localization], settings: CoarseToFineSettings) -> Localization:
+def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettings) -> Localization:
     """Return the most confident of several results, its confidence reduced by results at other poses."""
     ranked = sorted(found, key=lambda f: -f.confidence)
     best = ranked[0]

@@ -14,7 +14,7 @@ from ..scan_map.scan_map import ScanMap
 STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
 
 
-def allowed_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
+def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
     """Which candidates (N,) each option allows, by half a grid spacing more than it says."""
     allowed: dict[str, NDArray[np.bool_]] = {}
     if prior.near_world is not None and prior.radius is not None:
@@ -44,7 +44,7 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
     num = len(scan_map.centers)
     if num == 0:
         return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
-    counts = [f"{name} allows {mask.sum()}" for name, mask in allowed_by_option(scan_map, prior).items()]
+    counts = [f"{name} allows {mask.sum()}" for name, mask in check_options(scan_map, prior).items()]
     text = f"no position is left of the scan's {num}: {', '.join(counts)}"
     if prior.near_world is None:
         return text
@@ -57,14 +57,14 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     """The map, of which those cells of the coarse grid are searched in which the prior allows a candidate."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
-    for mask in allowed_by_option(scan_map, prior).values():
+    for mask in check_options(scan_map, prior).values():
         is_allowed &= mask
     if is_allowed.all():
         return scan_map
-    return scan_map.narrowed(np.isin(scan_map.sparse, scan_map.searched_for[is_allowed]))
+    return scan_map.narrow(np.isin(scan_map.sparse, scan_map.searched_for[is_allowed]))
 
 
-def allowed_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
+def allow_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
     """The rotations (N, 3, 3) whose image centre looks where the prior says; else the nearest."""
     if prior.heading_deg is None:
         return R_cam_from_world
@@ -97,11 +97,11 @@ def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ..
         low, high = prior.height
         if not low - MAX_DISTANCE <= height <= high + MAX_DISTANCE:
             found.append(f"the pose found is {height:.2f} m above the floor, not {low:g} to {high:g} m")
-    found += contradicted_heading(world, prior)
+    found += find_contradicted_heading(world, prior)
     return tuple(found)
 
 
-def contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
+def find_contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
     """Say how a pose contradicts a heading; nothing of a camera that looks steeply up or down."""
     forward = pose_world.R_cam_from_world[0]
     if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:

@@ -14,8 +14,8 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import indices_of, make_grid
 from ..jobs.threads import Once, Workers
-from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, joined_keypoints
-from ..local_features.matching import Matches, joined_matches, match
+from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, join_keypoints
+from ..local_features.matching import Matches, join_matches, match
 from ..panorama import Panorama
 from ..panorama.gpano import rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
@@ -23,7 +23,7 @@ from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
 from ..views.points_around import RecentViews, place_of
-from ..views.view import Cells, ViewConfig, normalized_view
+from ..views.view import Cells, ViewConfig, normalize_view
 from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
 
 COMPARED_WIDTH = 256  # [px]
@@ -43,7 +43,7 @@ class Images(NamedTuple):
     search: Once[Texels]  # for prepared views
 
 
-def images_of(panorama: Panorama, scales: ImageScales) -> Images:
+def make_images(panorama: Panorama, scales: ImageScales) -> Images:
     """Return the images of a panorama, each resized from the one before."""
     images = []
     for scale in scales:
@@ -106,29 +106,29 @@ class Query:
     @cached_property
     def keypoints(self) -> Keypoints:
         """The photo's keypoints."""
-        return joined_keypoints([half().keypoints for half in self.features[: self.num_halves]])
+        return join_keypoints([half().keypoints for half in self.features[: self.num_halves]])
 
     @cached_property
     def matches(self) -> Matches:
         """The photo's keypoints and the features of the map that look alike."""
         halves = [half() for half in self.features[: self.num_halves]]
-        return joined_matches([h.matches for h in halves], [len(h.keypoints.rays) for h in halves])
+        return join_matches([h.matches for h in halves], [len(h.keypoints.rays) for h in halves])
 
-    def without(self, is_hidden: NDArray[np.bool_]) -> "Query":
+    def mask_pixels(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """Mask pixels (h, 2 h) of the photo, and normalise the rest again."""
         panorama = self.photo.panorama
         height, width = panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(panorama, is_valid=panorama.is_valid & (enlarged == 0))
-        small = texels_of(resize(rest, COMPARED_WIDTH))
-        photo = replace(self.photo, panorama=rest, images=images_of(rest, self.method.scales), small=small)
+        small = make_texels(resize(rest, COMPARED_WIDTH))
+        photo = replace(self.photo, panorama=rest, images=make_images(rest, self.method.scales), small=small)
         return replace(self, photo=photo, cache=Cache(self.cache.views))
 
     def view_at(self, pose: Pose, config: ViewConfig) -> Cells:
         """Return the cells seen from near a pose that the photo shows."""
         place = place_of(pose)
         shown = self.photo.shown_cells(config.num_rings, pose)
-        return normalized_view(self.cache.views.averages(place, config), place, config, shown)
+        return normalize_view(self.cache.views.averages(place, config), place, config, shown)
 
     def points_at(self, pose: Pose) -> Cells:
         """Return the points of the last descent: seen from near a pose, and shown by the photo."""
@@ -156,25 +156,25 @@ def prepare_query(
     photo = Photo(
         panorama,
         resized,
-        images_of(resized, method.scales),
-        texels_of(resize(resized, COMPARED_WIDTH)),
-        Once(partial(texels_of, panorama)),
+        make_images(resized, method.scales),
+        make_texels(resize(resized, COMPARED_WIDTH)),
+        Once(partial(make_texels, panorama)),
         np.eye(3) if R_level_from_cam is None else R_level_from_cam.T,
         math.tau / min(panorama.rgb.shape[1], width),
     )
     photo.images.search()  # each search begins with it
-    features = tuple(Once(partial(features_of, resized, scan_map, workers, views)) for views in HALVES)
+    features = tuple(Once(partial(find_features, resized, scan_map, workers, views)) for views in HALVES)
     return Query(photo, scan_map, settings, workers, method, features, Cache(RecentViews(scan_map.octree)))
 
 
-def features_of(panorama: Panorama, scan_map: ScanMap, workers: Workers, views: Sequence[int]) -> Features:
+def find_features(panorama: Panorama, scan_map: ScanMap, workers: Workers, views: Sequence[int]) -> Features:
     """Find the features in several views of a panorama, and match them to the map."""
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     keypoints = find_keypoints(gray, panorama.is_valid, workers, views)
     return Features(keypoints, match(keypoints, scan_map.features_now(workers), workers))
 
 
-def texels_of(panorama: Panorama) -> Texels:
+def make_texels(panorama: Panorama) -> Texels:
     """Pack a panorama into texels, at most MAX_WIDTH wide."""
     panorama = shrink(panorama, MAX_WIDTH)
     return pack_texels(panorama.rgb, panorama.is_valid)

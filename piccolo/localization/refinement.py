@@ -7,7 +7,14 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, best_distinct, by_score, suppressed
+from ..confidence.alternatives import (
+    MIN_ANGLE,
+    MIN_DISTANCE,
+    Hypothesis,
+    best_distinct,
+    sort_by_score,
+    suppress_near,
+)
 from ..geometry.pose import Pose, orthonormal
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Workers
@@ -64,11 +71,11 @@ def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     perturbed = workers.map(partial(perturb_middle, query), narrowed, "descend")
     fine = workers.map(partial(descend_fine, query), narrow(perturbed, beam.num_fine), "descend")
     best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
-    others = plain(distinct(fine, middle))[len(best) :]  # these most likely stay
+    others = keep_comparable(keep_distinct(fine, middle))[len(best) :]  # these most likely stay
     with workers.beside(*(partial(compare, query, f.pose) for f in others)):
         ends = workers.map(partial(refine_by_perturbation, query), best, "descend")
-    poses = [f.pose for f in plain(distinct([*ends, *fine], middle))]
-    return by_score(workers.map(partial(score_pose, query), poses, "descend"))
+    poses = [f.pose for f in keep_comparable(keep_distinct([*ends, *fine], middle))]
+    return sort_by_score(workers.map(partial(score_pose, query), poses, "descend"))
 
 
 def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
@@ -78,7 +85,7 @@ def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
         end = descend_fine(query, pose).pose
         return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
 
-    return by_score(query.workers.map(refine_match, poses, "descend"))
+    return sort_by_score(query.workers.map(refine_match, poses, "descend"))
 
 
 def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:
@@ -101,7 +108,7 @@ def descend_fine(query: Query, pose: Pose) -> Fit:
 def descend_view(query: Query, config: ViewConfig, image: Texels, pose: Pose, limits: Limits) -> Fit:
     """Descend on the cells seen from a pose, and score the end on them."""
     cells = query.view_at(pose, config)
-    return fit_on(cells, config.arrays.blocks, image, descend(cells, image, pose, limits))
+    return score_on_cells(cells, config.arrays.blocks, image, descend(cells, image, pose, limits))
 
 
 def perturb_middle(query: Query, pose: Pose) -> Fit:
@@ -120,7 +127,7 @@ def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
     blocks = config.arrays.blocks
     images = query.photo.images.middle(), query.photo.images.fine()
     cells = query.view_at(fit.pose, config)
-    fit = fit_on(cells, blocks, images[1], fit.pose)
+    fit = score_on_cells(cells, blocks, images[1], fit.pose)
     for _ in range(MAX_PERTURBATIONS):
         around = descend_around(cells, blocks, images, fit.pose, PERTURBATION, query.workers)
         refined = descend_fine(query, around.pose)
@@ -148,18 +155,18 @@ def best_and_alternatives(
 
 def narrow(fits: Sequence[Fit], count: int) -> list[Pose]:
     """Return the `best_and_alternatives` of the fits, ranked by score."""
-    ranked = [f.pose for f in by_score(fits)]
+    ranked = [f.pose for f in sort_by_score(fits)]
     rotations = np.array([pose.R_cam_from_world for pose in ranked])
     centers = np.array([pose.center_world for pose in ranked])
     return [ranked[k] for k in best_and_alternatives(rotations, centers, count, CLOSE_DISTANCE)]
 
 
-def distinct(fine: Sequence[Fit], middle: Sequence[Fit]) -> list[Fit]:
+def keep_distinct(fine: Sequence[Fit], middle: Sequence[Fit]) -> list[Fit]:
     """Return the best poses of fine cells, then of middle cells, by non-maximum suppression."""
-    return suppressed([*by_score(fine), *by_score(middle)], NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
+    return suppress_near([*sort_by_score(fine), *sort_by_score(middle)], NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
 
 
-def plain(ranked: Sequence[Fit]) -> list[Fit]:
+def keep_comparable(ranked: Sequence[Fit]) -> list[Fit]:
     """Drop the fits that score far below a good best: a comparison could not bring them near it."""
     best = max((f.score for f in ranked), default=0.0)
     least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
@@ -218,7 +225,7 @@ def descend_perturbed(
         scores[k] = score(points, levels, weights, blocks, narrow[0], narrow[1], R[k], t[k])
 
 
-def as_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+def to_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
     """Convert channels in standard deviations to 8-bit levels, not rounded."""
     return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
 
@@ -257,15 +264,15 @@ def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
     R = pose.R_cam_from_world.copy()
     t = pose.center_world - cells.center_map
     scale = loss_scale * LEVELS_PER_UNIT
-    problem = cells.offsets, as_levels(cells.channels), cells.weights, image.rgbx, image.width, scale
+    problem = cells.offsets, to_levels(cells.channels), cells.weights, image.rgbx, image.width, scale
     descend_channels(problem, num_iterations, tolerance, R, t)
     return Pose(orthonormal(R), t + cells.center_map)
 
 
-def fit_on(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
+def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
     """Score a pose on cells, each in its block of the sphere."""
     t = pose.center_world - cells.center_map
-    shown = cells.offsets, as_levels(cells.channels), cells.weights
+    shown = cells.offsets, to_levels(cells.channels), cells.weights
     return Fit(pose, float(score(*shown, blocks, image.rgbx, image.width, pose.R_cam_from_world, t)))
 
 
@@ -284,7 +291,7 @@ def descend_around(
     scores = np.empty(len(steps))
     both = [(image.rgbx, image.width) for image in images]
     scale = COARSE_LOSS * LEVELS_PER_UNIT
-    problem = cells.offsets, as_levels(cells.channels), cells.weights, blocks, *both, scale
+    problem = cells.offsets, to_levels(cells.channels), cells.weights, blocks, *both, scale
 
     def run(lo: int) -> None:
         part = slice(lo, lo + PERTURBED_BATCH)

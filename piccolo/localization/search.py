@@ -23,7 +23,7 @@ from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
-from .prior import allowed_rotations
+from .prior import allow_rotations
 from .query import Query
 
 EXACT = (1 << 24) - 1  # whole numbers up to this are exact in float32
@@ -48,7 +48,7 @@ class TurnedPanorama(NamedTuple):
     validity: Samples  # (rotations, cells) 1 where the panorama shows something
 
 
-def whole(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
+def to_whole_numbers(values: Samples, most: float, most_other: int, num_terms: int) -> Samples:
     """Scale and round values up to `most`, so that sums of products with numbers up to another are exact."""
     return np.asarray(np.rint(values * whole_scale(most, most_other, num_terms)))
 
@@ -58,14 +58,14 @@ def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
     return np.float32(EXACT // (most_other * num_terms) / most)
 
 
-def turned(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
+def weigh_by_area(samples: Samples, validity: Samples, area: Samples, most_seen: int) -> TurnedPanorama:
     """Weight channels (rotations, 3, cells) [levels] by area, as whole numbers."""
     num_cells = len(area)
     relative = area / area.max()
     energy = np.square(samples).sum(axis=1) * relative
     return TurnedPanorama(
-        whole(samples * relative, MOST_LEVEL, 127, 3 * num_cells),
-        whole(energy, MOST_ENERGY, most_seen, num_cells),
+        to_whole_numbers(samples * relative, MOST_LEVEL, 127, 3 * num_cells),
+        to_whole_numbers(energy, MOST_ENERGY, most_seen, num_cells),
         validity,
     )
 
@@ -104,7 +104,7 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
             valid[wide] = np.rint(valid[wide] / areas[wide])
 
 
-def widened(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
+def widen_samples(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
     """Average channels of the search grid to (rotations, 3, wide cells) [levels], and validity."""
     cells, areas = wider_cells(WIDE_RINGS)
     parts = cells, whole_areas(SEARCH_RINGS), areas
@@ -211,7 +211,7 @@ def best_poses_wide(
     In parts of the candidates: a campus in all rotations would have a gigabyte of scores.
     """
     area = wider_cells(WIDE_RINGS)[1]
-    panorama = turned(*widened(samples, validity, workers), area, 255)
+    panorama = weigh_by_area(*widen_samples(samples, validity, workers), area, 255)
     num_views = views_at_once(len(samples))
     least = LOWEST
     sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
@@ -289,7 +289,7 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
         rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)
     else:
         rotations = uniform_rotations(settings.num_rotations)
-    rotations = allowed_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
+    rotations = allow_rotations(rotations @ m.R_map_from_world, settings.prior) @ m.R_map_from_world.T
     num_views = min(views_at_once(len(rotations)), len(m.sparse))
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
@@ -304,7 +304,7 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     candidate = candidate[kept]
     scores = np.empty(len(kept), np.float32)
     used, row_of_turn = np.unique(turn[kept], return_inverse=True)
-    panorama = turned(samples[used], validity[used], make_grid(SEARCH_RINGS).solid_angle, 1)
+    panorama = weigh_by_area(samples[used], validity[used], make_grid(SEARCH_RINGS).solid_angle, 1)
     row, views = m.views.at(candidate, query.workers)
     areas = whole_areas(SEARCH_RINGS)
     correlate_pairs(views.features, views.is_seen, areas, panorama, row, row_of_turn, scores)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis, alternative_poses, by_score
+from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
 from ..confidence.confidence import CLEAR_MATCHES, CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches
@@ -44,18 +44,18 @@ def rank(hypotheses: Sequence[Hypothesis], count: int = MAX_COMPARED) -> Selecti
     """Return the best hypothesis by score, and at most `count` elsewhere; NOTHING if there are none."""
     if not hypotheses:
         return NOTHING
-    best = by_score(hypotheses)[0]
+    best = sort_by_score(hypotheses)[0]
     return Selection(best, tuple(alternative_poses(best.pose, hypotheses, count=count)))
 
 
-def standings_of(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
+def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
     """Return the evidence for the best pose and for others, compared over what both views show."""
     at_best = compare(query, best.pose)
     ratios = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
-    return [s._replace(share=v) for s, v in zip(standings_alone(query, [best, *others]), ratios, strict=True)]
+    return [s._replace(share=v) for s, v in zip(assess_alone(query, [best, *others]), ratios, strict=True)]
 
 
-def standings_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
+def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
     """Return the evidence for each of several poses by itself.
 
     Poses that contradict the prior divide the odds that it is wrong among them. Without features, each pose
@@ -80,7 +80,7 @@ def select(query: Query, found: Selection) -> Selection:
         return found
     ranked = [found.best, *found.alternatives]
     seen = [compare(query, h.pose) for h in ranked]
-    alone = standings_alone(query, ranked)
+    alone = assess_alone(query, ranked)
     ratios = [[other.ratio_to(one) for other in seen] for one in seen]
     odds = np.array(
         [[log_odds(a._replace(share=v)) for a, v in zip(alone, row, strict=True)] for row in ratios]

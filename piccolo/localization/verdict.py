@@ -22,7 +22,7 @@ from .covariance import estimate_covariance
 from .focal_length import FocalFit
 from .prior import contradictions
 from .query import Query
-from .selection import SURE_MATCHES, Selection, standings_of
+from .selection import SURE_MATCHES, Selection, assess_poses
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 MIRROR_RATIO = 1.2  # least ratio of matches, mirrored photo to photo
@@ -54,9 +54,9 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     covariance, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return Localization()
-    evidence = evidence_of(query, found, agreement, fractions)
+    evidence = collect_evidence(query, found, agreement, fractions)
     reported = found.alternatives[:MAX_ALTERNATIVES]
-    standings = standings_of(query, found.best, reported)
+    standings = assess_poses(query, found.best, reported)
     probabilities = posterior(standings, covariance)
     warnings = contradictions(query.scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
@@ -64,7 +64,7 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     if warnings or (fit is not None and fit.conflict > MOST_CONFLICT):
         probabilities = np.append(np.zeros(len(standings)), 1.0)
     if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
-        warnings += doubts_of(query.photo.given, fit)
+        warnings += explain_doubts(query.photo.given, fit)
     matches = [s.num_matches if query.num_halves else None for s in standings[1:]]
     alternatives = tuple(
         Alternative(query.scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
@@ -85,7 +85,7 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     )
 
 
-def doubts_of(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
+def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     """Explain how the focal length makes a pose doubtful, as warnings."""
     focal = fit.focal_length(panorama)
     found = f"focal length: found {focal.px:.0f} px within {focal.std_px:.0f}"
@@ -96,7 +96,7 @@ def doubts_of(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     return (f"{found}, {given}: this leaves the position open by {std:.2f} m",) if std > TELLING_STD else ()
 
 
-def evidence_of(
+def collect_evidence(
     query: Query, found: Selection, agreement: Agreement, fractions: tuple[float, float]
 ) -> Evidence:
     """Collect the evidence for the best pose, from the fractions explained and contradicted."""
@@ -121,6 +121,6 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """
     if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False
-    matches = match(query.keypoints.mirrored(), query.scan_map.features_now(query.workers), query.workers)
+    matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
     found = poses_of(matches, None, 1, query.workers)
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

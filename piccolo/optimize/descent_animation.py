@@ -14,7 +14,7 @@ from ..geometry.pose import Pose, step
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.texels import Texels
-from ..views.pictures import checkerboard, fill_holes, resized_rgb
+from ..views.pictures import checkerboard, fill_holes, resize_rgb
 from ..views.surfels import render_surfels, surfels_of, visible_indices
 from .refine import DescentSettings, Refined, refine, sampling_loss_of
 
@@ -68,7 +68,7 @@ def frames_of(
     """One image for each pose, with iteration and loss written on top; the last one stays for a while."""
     ends = [visible_indices(points, p.pose.center_world) for p in (history[0], history[-1])]
     surfels = surfels_of(points.take(np.union1d(*ends)).subsample(MAX_SURFELS), workers)
-    photo = resized_rgb(panorama, width)
+    photo = resize_rgb(panorama, width)
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
     def frame(k: int) -> Image:

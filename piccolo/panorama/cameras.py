@@ -59,7 +59,7 @@ def cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bo
 def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
     width, height = picture.size
     if options.calibration is not None:
-        mounts = _calibrated(path, picture, options.calibration)
+        mounts = _calibrate(path, picture, options.calibration)
         return Cameras(() if _is_sphere(mounts) else mounts)
     if options.focal_px is not None:
         return Cameras((Mount(pinhole(width, height, options.focal_px)),), OF_PIXELS)
@@ -87,7 +87,7 @@ def _is_sphere(mounts: tuple[Mount, ...]) -> bool:
     return mounts == (Mount(mounts[0].camera),) and MODELS[mounts[0].camera.model][0] == SPHERE
 
 
-def _calibrated(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
+def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
     """Return the calibration at the picture's size; of the stored picture, if only that has its shape."""
     try:
         return calibration.for_picture(*picture.size)
@@ -99,7 +99,7 @@ def _calibrated(path: Path, picture: Picture, calibration: Calibration) -> tuple
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     R_stored_from_shown, _ = TURNED[picture.orientation]
-    return tuple(mount.turned(R_stored_from_shown) for mount in mounts)
+    return tuple(mount.turn(R_stored_from_shown) for mount in mounts)
 
 
 def views_of(
@@ -139,7 +139,7 @@ def rig_cameras(path: Path, pictures: list[Picture], rig: Calibration) -> list[t
         width, height = picture.size
         if rig.has_sizes:
             one = Calibration(rig.path, (replace(mount, image=None),))
-            mounts = tuple(replace(m, image=mount.image) for m in _calibrated(path, picture, one))
+            mounts = tuple(replace(m, image=mount.image) for m in _calibrate(path, picture, one))
         else:
             camera = mount.camera
             mounts = (mount.with_camera(Camera(camera.model, width, height, camera.params)),)

@@ -67,7 +67,7 @@ def equirectangular(faces: Faces) -> Pixels:
     A pixel is valid if all four that go into it are.
     """
     size = len(faces["f"])
-    padded = {letter: _padded(faces, letter) for letter in faces}
+    padded = {letter: _pad_face(faces, letter) for letter in faces}
     rgb = np.empty((2 * size, 4 * size, 3), dtype=np.uint8)
     is_valid = np.empty((2 * size, 4 * size), dtype=np.bool_)
     for top in range(0, 2 * size, BAND):
@@ -75,13 +75,13 @@ def equirectangular(faces: Faces) -> Pixels:
         rays = pixel_rays(4 * size, rows).astype(np.float32)
         for left in range(0, 4 * size, size // 2):  # half a face: one face around, and up or down
             columns = slice(left, left + size // 2)
-            pixels = _sampled(padded, rays[:, columns], rim=1)
+            pixels = _sample_faces(padded, rays[:, columns], rim=1)
             rgb[rows, columns] = pixels[..., :3]
             is_valid[rows, columns] = pixels[..., 3] == 255
     return rgb, is_valid
 
 
-def _padded(faces: Faces, letter: str) -> NDArray[np.uint8]:
+def _pad_face(faces: Faces, letter: str) -> NDArray[np.uint8]:
     """Return a face with a rim of one pixel from the faces around it, for interpolation across the edge."""
     size = len(faces[letter])
     padded = cv2.copyMakeBorder(faces[letter], 1, 1, 1, 1, cv2.BORDER_CONSTANT)
@@ -91,11 +91,11 @@ def _padded(faces: Faces, letter: str) -> NDArray[np.uint8]:
         right = (2.0 * columns - 1.0) / size - 1.0
         down = (2.0 * rows - 1.0) / size - 1.0
         in_face = np.stack(np.broadcast_arrays(right, down, 1.0), axis=-1).astype(np.float32)
-        padded[rows, columns] = _sampled(faces, in_face @ R_FACE_FROM_CAM[letter], rim=0)
+        padded[rows, columns] = _sample_faces(faces, in_face @ R_FACE_FROM_CAM[letter], rim=0)
     return np.asarray(padded)
 
 
-def _sampled(faces: Faces, directions: NDArray[np.float32], rim: int) -> NDArray[np.uint8]:
+def _sample_faces(faces: Faces, directions: NDArray[np.float32], rim: int) -> NDArray[np.uint8]:
     """Pixels (H, W, 4) along directions (H, W, 3), each from the face it meets; faces have a rim of `rim`."""
     pixels = np.empty((*directions.shape[:2], 4), dtype=np.uint8)
     largest = np.abs(directions).max(axis=2)

@@ -70,15 +70,15 @@ def black_borders(
             if is_black.mean() < min_fraction:
                 continue
             depth = _depth_of_black(inwards, is_black)
-            core = np.maximum(_filtered(cv2.erode, depth) - RIM, 0)
+            core = np.maximum(_filter_depths(cv2.erode, depth) - RIM, 0)
             if _black_fraction(inwards, core if core.any() else depth) >= MIN_PURE:
                 depth = np.where(depth > 0, depth + RIM, 0)
                 border = found.swapaxes(0, axis)[::step][: depth.max()]
-                border |= np.arange(len(border))[:, None] < _filtered(cv2.dilate, depth)
+                border |= np.arange(len(border))[:, None] < _filter_depths(cv2.dilate, depth)
     return found if found.any() else None
 
 
-def _filtered(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArray[np.int64]:
+def _filter_depths(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return the least (cv2.erode) or largest (cv2.dilate) of the depths (columns,) within RIM of each."""
     column = depth[:, None].astype(np.float32)  # whole numbers that small are exact
     return np.asarray(which(column, np.ones((2 * RIM + 1, 1), np.uint8))[:, 0], np.int64)

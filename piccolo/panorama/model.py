@@ -48,7 +48,7 @@ class Panorama:
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
     focal_prior: FocalPrior | None = None  # of one camera whose focal length is not exact
 
-    def retaken(self, camera: Camera, width: int) -> "Panorama":
+    def resample(self, camera: Camera, width: int) -> "Panorama":
         """Return the panorama, `width` x width / 2, by another calibration of its camera.
 
         It has a focal_prior.
@@ -101,7 +101,7 @@ class ReadOptions:
         """The rig whose pictures a panorama is made of; None for pictures that stand alone."""
         return self.calibration if self.calibration is not None and self.calibration.is_rig else None
 
-    def refined(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
+    def with_refined_camera(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
         """Return the options with the camera that a result refined as a calibration of the stored picture."""
         if len(cameras) != 1:
             return self

@@ -23,7 +23,7 @@ from ..errors import InputError
 from ..files.cache import sha256_of_arrays
 from ..files.json_file import read_bytes, reading_once
 from .cube import face_paths
-from .picture import PNG_MAGIC, WANTED, opened
+from .picture import PNG_MAGIC, WANTED, open_picture
 
 TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
 OFFSET = re.compile(r"[+-]\d\d:\d\d")
@@ -79,7 +79,7 @@ def photo_of(path: Path, rig: Calibration | None = None) -> PhotoFacts:
     InputError if the file is missing or no picture. Metadata that are damaged count as missing.
     """
     files = _files_of(path, rig)
-    with reading_once(), opened(files[0], content := read_bytes(files[0], WANTED)) as image:
+    with reading_once(), open_picture(files[0], content := read_bytes(files[0], WANTED)) as image:
         exif: Mapping[int, Any]
         try:
             if chunk := _exif_chunk(content):

@@ -102,11 +102,11 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
     Raises InputError if the file is missing or damaged, of no format read here, or its size is out of range.
     """
     data = read_bytes(path, WANTED)
-    with opened(path, data) as image:
+    with open_picture(path, data) as image:
         _check(path, image, len(data), min_size)
         mode = "RGBA" if image.has_transparency_data else "RGB"
         is_16_bit_grey = image.mode.startswith("I;16")
-        pixels = np.array(_decoded(path, data, image, image.mode if is_16_bit_grey else mode))
+        pixels = np.array(_decode(path, data, image, image.mode if is_16_bit_grey else mode))
         if is_16_bit_grey:
             is_valid = pixels != image.info.get("transparency", -1)
             pixels = cv2.cvtColor((pixels >> 8).astype(np.uint8), cv2.COLOR_GRAY2RGB)
@@ -126,12 +126,12 @@ def read_labels(path: Path, labels: Labels) -> Picture:
     keeps labels.
     """
     data = read_bytes(path, WANTED)
-    with opened(path, data) as image:
+    with open_picture(path, data) as image:
         _check(path, image, len(data), (MIN_WIDTH, MIN_HEIGHT))
         if image.format != "PNG" or data[24:26] not in LABEL_KINDS or image.has_transparency_data:
             wanted = "wanted a PNG, grey of 8 or 16 bits or RGB of 8, without alpha"
             raise InputError(f"{path}: this kind of picture holds no labels, {wanted}")
-        pixels = np.array(_decoded(path, data, image, image.mode)).astype(np.int32)
+        pixels = np.array(_decode(path, data, image, image.mode)).astype(np.int32)
         if pixels.ndim == 3:
             pixels = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
         return Picture(colors_of(pixels), labels.are_kept(pixels), _xmp(image), _warnings(image))
@@ -139,18 +139,18 @@ def read_labels(path: Path, labels: Labels) -> Picture:
 
 def picture_size(path: Path) -> tuple[int, int]:
     """Width and height [px] of the picture in a file, without decoding it."""
-    with opened(path, read_bytes(path, WANTED)) as image:
+    with open_picture(path, read_bytes(path, WANTED)) as image:
         return image.size
 
 
 def picture_orientation(path: Path) -> object:
     """EXIF's number of how the picture in a file is to be turned, without decoding it; None without."""
-    with opened(path, read_bytes(path, WANTED)) as image:
+    with open_picture(path, read_bytes(path, WANTED)) as image:
         return _orientation(image)
 
 
 @contextmanager
-def opened(path: Path, data: bytes) -> Iterator[ImageFile]:
+def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
     """Yield the picture in `data` as Pillow opens it, not decoded.
 
     What Pillow raises becomes an InputError.
@@ -193,11 +193,11 @@ def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, in
         raise InputError(f"{path}: the {image.format}'s numbers are signed, inverted or of 32 bits, {wanted}")
 
 
-def _decoded(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Image:
+def _decode(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Image:
     """Return the picture decoded, turned as EXIF says, and converted to Pillow's `mode`."""
     if isinstance(image, TiffImageFile):  # which Pillow turns while it decodes
         if image.use_load_libtiff:
-            return _decoded_apart(path, data, mode, image.size)
+            return _decode_apart(path, data, mode, image.size)
         image.im = Image.new(image.mode, image._tile_size).im  # else Pillow does, with a limit of its own
     if isinstance(image, PngImageFile):
         PngImageFile(BytesIO(data)).verify()  # of checksums, which decoding leaves aside
@@ -228,7 +228,7 @@ def exif_of(image: ImageFile) -> dict[int, object]:
         return {}
 
 
-def _decoded_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
+def _decode_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
     """Return the packed TIFF in `data`, decoded by a process of its own."""
     command = [sys.executable, "-P", "-c", DECODE_TIFF, mode]
     done = subprocess.run(command, input=data, capture_output=True, check=False)

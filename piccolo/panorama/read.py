@@ -56,14 +56,14 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     if options.rig is not None:
         return _read_rig(path, options.rig, options)
     if path.is_dir():
-        return _embedded_and_masked(path, read_cube_folder(path), CropRegion(), options, None)
+        return _embed_and_mask(path, read_cube_folder(path), CropRegion(), options, None)
     return panorama_of(path, read_picture(path), options)
 
 
 def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
     """Return the panorama of a picture; `path` names it in errors and warnings."""
     if cube := cube_of_cells(path, picture, options.cube_order):
-        return _embedded_and_masked(path, cube, CropRegion(), options, None)
+        return _embed_and_mask(path, cube, CropRegion(), options, None)
     fields = gpano_fields(picture.xmp)
     cameras = cameras_of(path, picture, options, bool(fields))
     gpano = attitude(fields) if fields else None
@@ -74,7 +74,7 @@ def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
         return _on_sphere(path, [(path, picture, cameras.mounts)], options, gpano, cameras.deviation)
     region, more = _region_of(path, picture, fields, options)
     picture = replace(picture, warnings=(*picture.warnings, *more))
-    return _embedded_and_masked(path, picture, region, options, gpano)
+    return _embed_and_mask(path, picture, region, options, gpano)
 
 
 def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
@@ -127,7 +127,7 @@ def _on_sphere(
         notes += [*picture.warnings, *more]
     rgb, is_valid = sphere_of(views, width)
     panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
-    masked = _masked(path, panorama, counts, options)
+    masked = _mask(path, panorama, counts, options)
     if deviation == 0.0:
         return masked
     prior = FocalPrior(cameras[0].camera.focal[0], deviation, views[0], is_valid & ~masked.is_valid)
@@ -158,7 +158,7 @@ def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama
     counts = _user_masks(path, [picture.size], options, notes).get(0)
     fields = gpano_fields(picture.xmp)
     gpano = attitude(fields) if fields else None
-    return _masked(path, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts, options)
+    return _mask(path, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts, options)
 
 
 def _region_of(
@@ -186,7 +186,7 @@ def _region_of(
     return region, notes
 
 
-def _embedded_and_masked(
+def _embed_and_mask(
     path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
 ) -> Panorama:
     """Return the picture at its place in the sphere, with everything masked that is not to be counted."""
@@ -206,12 +206,10 @@ def _embedded_and_masked(
         if half_angle:
             notes.append(f"masked a {pole} patch of {half_angle:.1f} deg")
             is_valid = mask_pole(is_valid, pole, half_angle)
-    return _masked(path, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0), options)
+    return _mask(path, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0), options)
 
 
-def _masked(
-    path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions
-) -> Panorama:
+def _mask(path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions) -> Panorama:
     """Return the panorama less what a mask of its size, or the option for the nadir, takes out."""
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)

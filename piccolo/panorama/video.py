@@ -33,10 +33,10 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
     """
     best: tuple[float, float, NDArray[np.uint8]] | None = None  # sharpness, time, RGB
     slot = 0
-    for time, frame in _decoded(video):
+    for time, frame in _decode(video):
         while time > (slot + NEIGHBORHOOD) * every:
             if best is not None:
-                yield _written(video, folder, best)
+                yield _write_frame(video, folder, best)
             best = None
             slot += 1
         if time >= (slot - NEIGHBORHOOD) * every:
@@ -45,16 +45,18 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
             if best is None or sharpness > best[0]:
                 best = sharpness, time, rgb
     if best is not None:
-        yield _written(video, folder, best)
+        yield _write_frame(video, folder, best)
 
 
 def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[VideoFrame]:
     """Write the frames at some times [s], in whole milliseconds, into a folder; as of frames_of."""
     left = {round(1000.0 * time) for time in times}
-    for time, frame in _decoded(video) if left else ():
+    for time, frame in _decode(video) if left else ():
         if round(1000.0 * time) in left:
             left.remove(round(1000.0 * time))
-            yield _written(video, folder, (0.0, time, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)))
+            yield _write_frame(
+                video, folder, (0.0, time, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8))
+            )
         if not left:
             return
 
@@ -66,7 +68,7 @@ def sharpness_of(rgb: NDArray[np.uint8]) -> float:
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
 
 
-def _decoded(video: Path) -> Iterator[tuple[float, Any]]:
+def _decode(video: Path) -> Iterator[tuple[float, Any]]:
     """Yield times [s] from the first frame, and the frames as PyAV has them."""
     av = import_optional(video, "av", "video")
     begin: float | None = None
@@ -89,7 +91,7 @@ def _decoded(video: Path) -> Iterator[tuple[float, Any]]:
         raise InputError(f"{video}: found {error.strerror}, {WANTED}") from error
 
 
-def _written(video: Path, folder: Path, best: tuple[float, float, NDArray[np.uint8]]) -> VideoFrame:
+def _write_frame(video: Path, folder: Path, best: tuple[float, float, NDArray[np.uint8]]) -> VideoFrame:
     _, time, rgb = best
     path = folder / f"{video.stem}_{round(1000.0 * time):08d}.jpg"
     if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):

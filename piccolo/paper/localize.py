@@ -19,7 +19,7 @@ from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
-from .photometric import photometric_loss_of
+from .photometric import make_photometric_loss
 from .search import free_grid, search
 from .settings import PaperSettings
 
@@ -44,10 +44,10 @@ def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     return PaperMap(points, np.eye(3), cloud.origin_world, cloud.warnings, positions)
 
 
-def loss_of(panorama: Panorama, settings: PaperSettings) -> Loss:
+def make_loss(panorama: Panorama, settings: PaperSettings) -> Loss:
     """Return the loss that the settings select."""
     if settings.loss == "photometric":
-        return photometric_loss_of(shrink(panorama, settings.photometric_width))
+        return make_photometric_loss(shrink(panorama, settings.photometric_width))
     return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
 
 
@@ -58,7 +58,7 @@ def localize(
     points = paper_map.points
     known = settings.gravity == "known"
     rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
-    loss = loss_of(panorama, settings)
+    loss = make_loss(panorama, settings)
     with watch.stage("search"):
         starts = search(points, panorama, loss, (paper_map.positions, rotations), settings, workers)
     with watch.stage("refine"):

@@ -30,11 +30,11 @@ LEAST_NORM = 0.5 / 255.0  # a residual below half an 8-bit level has the weight 
 
 def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> float:
     """Return the loss in [0, sqrt(3)] at `pose`, over the panorama's own pixels; inf if too few are shown."""
-    found = _compared(points, panorama, pose)
+    found = _compare(points, panorama, pose)
     return math.inf if found is None else float(np.linalg.norm(found[1], axis=-1).mean(dtype=np.float64))
 
 
-def photometric_loss_of(panorama: Panorama) -> Loss:
+def make_photometric_loss(panorama: Panorama) -> Loss:
     """Return the photometric loss of a panorama, at its own size."""
     return Loss(
         lambda points, pose: photometric_loss(points, panorama, pose),
@@ -44,7 +44,7 @@ def photometric_loss_of(panorama: Panorama) -> Loss:
 
 def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) -> Equations:
     """Return the loss at `pose`, its gradient (6,) and the matrix (6, 6) of reweighted least squares."""
-    found = _compared(points, panorama, pose)
+    found = _compare(points, panorama, pose)
     if found is None:
         return math.inf, np.zeros(6), np.eye(6)
     view, residuals, counts = found
@@ -61,7 +61,7 @@ def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) 
     return float(norms.mean(dtype=np.float64)), gradient / count, matrix / count
 
 
-def _compared(
+def _compare(
     points: PackedPoints, panorama: Panorama, pose: Pose
 ) -> tuple[View, Image, NDArray[np.bool_]] | None:
     """Render the view at `pose`; return it, its differences (N, 3) in [-1, 1], and their mask (H, W).

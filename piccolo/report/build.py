@@ -30,7 +30,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, surfels_of
 from .entries import Entry, document_of_entry, entries_of, names_of, short_names_of
-from .pictures import make_pictures, read_options_of, taken_out
+from .pictures import extract_frames, make_pictures, read_options_of
 from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 
@@ -149,7 +149,7 @@ def write_pictures(
         write_photo_script(folder, task.key, script)  # last: it says that both are there
         return ""
 
-    with taken_out([task.photo for task in todo]) as files:
+    with extract_frames([task.photo for task in todo]) as files:
         taken = [task._replace(photo=files.get(task.photo, task.photo)) for task in todo]
         return tuple(warning for warning in workers.map(write, taken, "photos") if warning)
 

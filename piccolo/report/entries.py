@@ -84,7 +84,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
         "key": key,
         "status": UNREADABLE if result.status == FAILED else result.status,  # the page has no word for it
         "confidence": round(result.confidence, 5),
-        "probabilityNone": _rounded(result.probability_none, 5),
+        "probabilityNone": _round(result.probability_none, 5),
         "error": result.error and _below(result.error, result.pano, name),
         "warnings": [_below(warning, result.pano, name) for warning in result.warnings],
         "isOnPlan": result.best_pose is not None and not is_hopeless,
@@ -94,11 +94,11 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
         "walk": entry.walk,
         "time": entry.time if entry.walk is not None else None,
         "gap": bool(result.walk and result.walk.gap),
-        **(found_document(result, result.best_pose, scan_map) if result.best_pose else NOTHING_FOUND),
+        **(document_of_found(result, result.best_pose, scan_map) if result.best_pose else NOTHING_FOUND),
     }
 
 
-def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
+def document_of_found(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
     """Return what was found: the best pose, the others, and what speaks for them."""
     poses = [best_pose, *(alternative.pose for alternative in result.alternatives)]
     centers = np.array([scan_map.from_world(pose).center_world for pose in poses])
@@ -108,7 +108,7 @@ def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[s
         {
             **pose_document(other.pose, scan_map),
             "score": round(other.score, 3),
-            "probability": _rounded(other.probability, 5),
+            "probability": _round(other.probability, 5),
             "scan": other.scan,
             "storey": storey,
         }
@@ -122,7 +122,7 @@ def found_document(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[s
         "storey": storeys[0],
         "height": None if storeys[0] is None else round(float(height[0]), 3),
         "alternatives": alternatives,
-        "evidence": evidence and {name: _rounded(getattr(evidence, name), 4) for name in EVIDENCE},
+        "evidence": evidence and {name: _round(getattr(evidence, name), 4) for name in EVIDENCE},
         "spread": covariance and spread_document(covariance, R_map_from_world),
     }
 
@@ -165,5 +165,5 @@ def _list(values: Array, digits: int = DIGITS) -> list[float]:
     return [round(float(value), digits) for value in values]
 
 
-def _rounded(value: float | None, digits: int) -> float | None:
+def _round(value: float | None, digits: int) -> float | None:
     return None if value is None else round(value, digits)

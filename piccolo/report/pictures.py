@@ -144,7 +144,7 @@ def _base64(content: bytes) -> str:
 
 
 @contextmanager
-def taken_out(photos: Sequence[Path]) -> Iterator[dict[Path, Path]]:
+def extract_frames(photos: Sequence[Path]) -> Iterator[dict[Path, Path]]:
     """Files of those photos that are frames of a video, until the end; of others none.
 
     A video that can't be read has none either: its frames are then photos that are not there.

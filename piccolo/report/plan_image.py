@@ -71,7 +71,7 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
     columns = ((x - left) / pixel).astype(np.int64)
     rows = ((top - y) / pixel).astype(np.int64)
     shape = math.ceil(height / pixel), math.ceil(width / pixel)
-    painted = _painted(columns, rows, above, rgb, shape, pixel)
+    painted = _paint(columns, rows, above, rgb, shape, pixel)
     return PlanImage(painted, (pixel, 0.0, 0.0, -pixel, left, top))
 
 
@@ -97,7 +97,7 @@ def _of_storey(
     return x, y, above[kept], unpack_rgb(points.rgbx[kept])
 
 
-def _painted(
+def _paint(
     columns: NDArray[np.int64],
     rows: NDArray[np.int64],
     above: Array,

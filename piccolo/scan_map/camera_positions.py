@@ -79,7 +79,9 @@ class TooManyPositionsError(InputError):
         super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
 
 
-def supported_cells(surfaces: NDArray[np.float32], within: Ball | Box | None = None) -> NDArray[np.int64]:
+def find_supported_cells(
+    surfaces: NDArray[np.float32], within: Ball | Box | None = None
+) -> NDArray[np.int64]:
     """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3).
 
     Those `within` a part of the scan, by a spacing more than it says. TooManyPositionsError if they
@@ -160,7 +162,7 @@ def candidate_centers(
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
-    cells = supported_cells(top_surfaces(octree), within)
+    cells = find_supported_cells(top_surfaces(octree), within)
     points = octree.level(CLEARANCE_VOXEL)[:, :3]
     if within is not None:
         points = points[within.holds(points, 3 * COARSE_SPACING)]  # of what is farther none is near

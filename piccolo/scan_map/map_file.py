@@ -27,7 +27,7 @@ from ..files.cache import WRITABLE, is_own, key_of, mark_used, own_names, privat
 from ..local_features.feature_map import FeatureMap
 from ..views.candidate_views import CandidateViews
 from .map_validation import LAYOUT, check_arrays, clean_warnings
-from .scan_map import ScanMap, with_late_features
+from .scan_map import ScanMap, defer_features
 
 FORMAT = "piccolo-map/8"
 NAME = own_names("piccolo-map")  # in a cache
@@ -65,7 +65,7 @@ def is_map_file(path: Path) -> bool:
 
 
 @contextmanager
-def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
+def hold_unchanged(path: Path, is_copied: bool) -> Iterator[Path | None]:
     """Provide a map's file that may be mapped: itself, or a copy in the user's cache; else None.
 
     A file of the cache, where nobody else may write, is only ever replaced whole. Any other may be cut off or
@@ -76,7 +76,7 @@ def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
         yield path
         return
     folder = private_folder("maps", NAME) if is_copied else None
-    copy = folder and copied(path, folder)
+    copy = folder and copy_into(path, folder)
     try:
         yield copy
     except BaseException:
@@ -85,7 +85,7 @@ def lasting(path: Path, is_copied: bool) -> Iterator[Path | None]:
         raise
 
 
-def copied(path: Path, folder: Path) -> Path | None:
+def copy_into(path: Path, folder: Path) -> Path | None:
     """Copy a file into a folder unless its current copy is there; None if that fails."""
     with path.open("rb") as file:
         copy = folder / f"{key_of('copy', os.fstat(file.fileno()))}.piccolo-map"
@@ -105,7 +105,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
     All of it is read and checked; with `remembers` only once, as long as the file stays as it is.
     """
     what = f"checked as {FORMAT} by {__version__}"
-    with damage_named(path, WANTED), lasting(path, remembers) as place:
+    with damage_named(path, WANTED), hold_unchanged(path, remembers) as place:
         archive = ArrayArchive(place or path, is_mapped=place is not None)
         if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
             text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"
@@ -134,4 +134,4 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
         crs=arrays["crs"].tobytes().decode(),
         **own,
     )
-    return with_late_features(scan_map) if scan_map.lacks_features else scan_map
+    return defer_features(scan_map) if scan_map.lacks_features else scan_map

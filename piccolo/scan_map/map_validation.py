@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
-from ..geometry.pose import Array, checked_rotation
+from ..geometry.pose import Array, check_rotation
 from ..geometry.sphere import make_grid
 from ..kernels.jit import F0, F1, inline_kernel, kernel
 from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS
@@ -132,7 +132,7 @@ def _reach(arrays: Arrays) -> float:
 
 def _check_frame(path: Path, arrays: Arrays) -> None:
     """Check the rotation and the variance, and that the origin is at whole metres of the map's axes."""
-    R = checked_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
+    R = check_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
     origin: Array = arrays["origin_world"]
     if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
         _refuse(path, f"an origin_world of {origin.tolist()}")

@@ -25,20 +25,20 @@ def check_name(name: str, taken: Sequence[str]) -> None:
     if not is_name(name):
         raise InputError(f"`name`: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
     if name in taken:
-        raise InputError(f"`name`: found {name!r}, which the map has already: {_listed(taken)}")
+        raise InputError(f"`name`: found {name!r}, which the map has already: {_list_names(taken)}")
     if len(taken) >= MAX_SCANS:
         raise InputError(f"`add`: found a map of {len(taken)} scans, the most that one holds")
 
 
-def named(scan_map: ScanMap, name: str) -> ScanMap:
+def name_scan(scan_map: ScanMap, name: str) -> ScanMap:
     """Name the scan of a map of one scan."""
     check_name(name, ())
     if len(scan_map.scan_names) > 1:
-        raise InputError(f"`name`: found a map of several scans: {_listed(scan_map.scan_names)}")
+        raise InputError(f"`name`: found a map of several scans: {_list_names(scan_map.scan_names)}")
     return replace(scan_map, scan_names=(name,), scan_of_candidate=np.zeros_like(scan_map.scan_of_candidate))
 
 
-def _listed(names: Sequence[str]) -> str:
+def _list_names(names: Sequence[str]) -> str:
     return ", ".join(map(repr, names))
 
 
@@ -51,7 +51,7 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
         )
     for name in within:
         if name not in names:
-            raise InputError(f"`within`: found {name!r}, wanted of {_listed(names)}")
+            raise InputError(f"`within`: found {name!r}, wanted of {_list_names(names)}")
 
 
 def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:
@@ -69,7 +69,7 @@ def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
     return scan_map.scan_names[int(scan_map.scan_of_candidate[nearest])]
 
 
-def with_places(scan_map: ScanMap, found: Localization) -> Localization:
+def add_places(scan_map: ScanMap, found: Localization) -> Localization:
     """Return a result with the scans, the storey (from 1, the lowest) and the height above the floor."""
     pose = found.pose
     if pose is None:

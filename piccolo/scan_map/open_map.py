@@ -19,10 +19,10 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..local_features.feature_map import FeatureMap
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
-from .named_scans import named
+from .named_scans import name_scan
 from .prior import NOTHING_KNOWN, Prior
 from .scan_addition import add_scan
-from .scan_map import LateFeatures, ScanMap, prepare_map, with_features
+from .scan_map import LateFeatures, ScanMap, add_features, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
@@ -51,7 +51,7 @@ def open_map(
     A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
     Local features come late, and into the cache then, unless `has_features`.
     """
-    map_path = prepared_map_among(paths)
+    map_path = find_prepared_map(paths)
     if map_path:
         if len(paths) > 1 or replace(cloud_settings, labels=None, crs=None) != IN_METRES:
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
@@ -77,7 +77,7 @@ def open_map(
     key = content_key(digest, cloud_settings) if digest else ""
     if not (cache.is_used and key):
         return build()
-    scan_map, warning = cached_map(cache.folder, key, digest, build, watch)
+    scan_map, warning = open_cached_map(cache.folder, key, digest, build, watch)
     if not warning:
         return scan_map
     workers.warn(warning)
@@ -88,10 +88,10 @@ def write_map(scan_map: ScanMap, path: Path, workers: Workers) -> None:
     """Write a map with its local features; InputError if it is of a part of a scan."""
     if scan_map.is_partial:
         raise InputError(f"{path}: found a map prepared within `near_world` only, wanted a whole map")
-    save_map(with_features(scan_map, workers), path)
+    save_map(add_features(scan_map, workers), path)
 
 
-def extended_map(
+def extend_map(
     map_path: Path,
     paths: Sequence[Path],
     cloud_settings: CloudSettings,
@@ -100,10 +100,10 @@ def extended_map(
     watch: Stopwatch,
 ) -> ScanMap:
     """A prepared map with the scan of some files put in under a name; a map without names gets its file's."""
-    if not prepared_map_among([map_path]):
+    if not find_prepared_map([map_path]):
         found = "no prepared map" if map_path.exists() else "no such file"
         raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
-    if path := prepared_map_among(paths):
+    if path := find_prepared_map(paths):
         raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
     if cloud_settings.up != "auto":
         raise InputError("`up`: found beside `add`, wanted without; a scan is added in the map's axes")
@@ -115,8 +115,8 @@ def extended_map(
     check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")
-    old = with_features(old, workers)
-    old = old if old.scan_names else named(old, map_path.stem)
+    old = add_features(old, workers)
+    old = old if old.scan_names else name_scan(old, map_path.stem)
     both = "\n".join(sorted([old.scan_sha256, digest]))
     added = add_scan(old, cloud, name, workers, watch)
     return replace(added, scan_sha256=hashlib.sha256(both.encode()).hexdigest(), crs=old.crs or crs)
@@ -129,14 +129,14 @@ def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSetting
         raise InputError(f"{map_path}: found a prepared map of {kind}")
 
 
-def prepared_map_among(paths: Sequence[Path]) -> Path | None:
+def find_prepared_map(paths: Sequence[Path]) -> Path | None:
     """The first of some files that is a prepared map."""
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
 def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
     """The digest of a scan's files, or the one of what the prepared map in place of them was made from."""
-    map_path = prepared_map_among(paths)
+    map_path = find_prepared_map(paths)
     if map_path:
         return load_map(map_path, cache.is_used).scan_sha256
     return sha256_of_files(paths, cache.is_used)
@@ -148,7 +148,7 @@ def content_key(scan_sha256: str, settings: CloudSettings) -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 
-def cached_map(
+def open_cached_map(
     folder: Path | None, key: str, scan_sha256: str, build: Callable[[], ScanMap], watch: Stopwatch
 ) -> tuple[ScanMap, str]:
     """The map named `key` of a cache within a folder, or built and put there; the user's cache if None.
@@ -165,7 +165,7 @@ def cached_map(
                 mark_used(path)
                 scan_map = load_map(path, remembers=True)
             if scan_map.scan_sha256 == scan_sha256:
-                return kept_late(scan_map, path), ""
+                return keep_when_made(scan_map, path), ""
             warning = f"{path}: found the map of another scan; it is made anew"
     except InputError as error:
         warning = f"{error}; it is made anew"
@@ -179,10 +179,10 @@ def cached_map(
             save_map(scan_map, path)
     except OSError as error:
         return scan_map, f"{kept_in}: {error.strerror or error}; the prepared map is not kept"
-    return kept_late(scan_map, path), warning
+    return keep_when_made(scan_map, path), warning
 
 
-def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
+def keep_when_made(scan_map: ScanMap, path: Path) -> ScanMap:
     """The map; when its local features are made, it is written once more, if no other process has done so."""
     late = scan_map.late
     if late is None:
@@ -203,7 +203,7 @@ def kept_late(scan_map: ScanMap, path: Path) -> ScanMap:
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
     """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
-    if prepared_map_among(paths):
+    if find_prepared_map(paths):
         m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
         return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
     cloud = open_cloud(paths, settings, workers.show).read()

@@ -45,7 +45,7 @@ class GpsPrior:
     radius: float  # [m] within which the camera is searched first
     is_used: bool = True  # the result lies there; else it was found, or not found, without it
 
-    def applied_to(self, prior: Prior) -> Prior:
+    def apply_to(self, prior: Prior) -> Prior:
         """The prior with this position in place of none."""
         return replace(prior, near_world=(*self.center_world, None), radius=self.radius)
 

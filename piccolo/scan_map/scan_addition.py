@@ -23,7 +23,7 @@ from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, rend
 from ..views.view import BLOCK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
 from .named_scans import check_name
-from .scan_map import ScanMap, Voxelized, seen_by, sparse_candidates
+from .scan_map import ScanMap, Voxelized, look_from, sparse_candidates
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -53,32 +53,32 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
     """Add another scan in the same coordinates to a map, under a name of its own."""
     check_name(name, old.scan_names)
     with watch.stage("read"):
-        new, warnings = read_beside(old, cloud)
+        new, warnings = read_added_scan(old, cloud)
     for warning in warnings:
         workers.warn(warning)
     with watch.stage("prepare"):
         own, added = (o.level(LEAF_SIZE) for o in (old.octree, new))
         octree = build_octree(join_voxels(own, added, old.R_map_from_world @ old.origin_world))
-        found = joined_candidates(old, new, octree, workers)
+        found = join_candidates(old, new, octree, workers)
         sparse, _ = sparse_candidates(found.centers)
-        wide = joined_views(old, octree, found, sparse, workers)
+        wide = join_views(old, octree, found, sparse, workers)
         return replace(
             old,
             octree=octree,
             surface_variance=surface_variance(octree),
             centers=found.centers,
-            scan_of_candidate=scans_of(old, found),
+            scan_of_candidate=assign_scans(old, found),
             sparse=sparse,
             wide_features=wide.features,
             wide_seen=wide.seen,
             views=CandidateViews(octree, found.centers),
-            local_features=joined_features(old, octree, found, workers),
+            local_features=join_features(old, octree, found, workers),
             scan_names=(*old.scan_names, name),
             warnings=tuple(dict.fromkeys(old.warnings + warnings)),
         )
 
 
-def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]]:
+def read_added_scan(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]]:
     """Read a scan into an octree of its own, in a map's frame; with warnings."""
     if old.octree.leaf_size != LEAF_SIZE:
         found = f"found a map of voxels of {old.octree.leaf_size} m"
@@ -98,7 +98,7 @@ def read_beside(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]
     return build_octree(Voxels(voxels.codes, nodes, voxels.origin)), warnings
 
 
-def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers) -> Candidates:
+def join_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers) -> Candidates:
     """Join the candidates of a map and a new scan, by the octrees of the new one alone and of both."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
@@ -111,15 +111,15 @@ def joined_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Worker
     more = positions[box.holds(positions) & (gap > 0.0)]
     in_front, behind = np.zeros((2, len(rows)))
     scan = Box(points.min(axis=0) - CLEARANCE_VOXEL, points.max(axis=0) + CLEARANCE_VOXEL)
-    near = most_of_sphere(scan, old.centers[rows]) > LEAST_CHANGED
-    in_front[near], behind[near] = compared(new, old.octree, old.centers[rows[near]], workers)
-    of_more = compared(new, old.octree, more, workers)
+    near = bound_sphere_fraction(scan, old.centers[rows]) > LEAST_CHANGED
+    in_front[near], behind[near] = compare_ranges(new, old.octree, old.centers[rows[near]], workers)
+    of_more = compare_ranges(new, old.octree, more, workers)
     fraction = np.concatenate([in_front, np.ones(len(more))])
     is_new = np.concatenate([in_front > behind, of_more[0] > of_more[1]]) & (fraction > LEAST_CHANGED)
     return Candidates(rows, np.concatenate([old.centers[rows], more]), fraction, is_new)
 
 
-def most_of_sphere(box: Box, centers: Array) -> Array:
+def bound_sphere_fraction(box: Box, centers: Array) -> Array:
     """Bound the fraction (N,) of the sphere that a box takes around centres (N, 3), by a ball around it.
 
     Half within that ball, where it may be all.
@@ -130,7 +130,7 @@ def most_of_sphere(box: Box, centers: Array) -> Array:
     return np.asarray(0.5 * (1.0 - np.sqrt(1.0 - sine**2)))
 
 
-def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
+def compare_ranges(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
     """Return fractions (N,) of the sphere around centres (N, 3) with a new scan in front, and behind."""
     area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
 
@@ -146,7 +146,7 @@ def compared(new: Octree, old: Octree, centers: Array, workers: Workers) -> tupl
     return in_front / area.sum(), behind / area.sum()
 
 
-def joined_views(
+def join_views(
     old: ScanMap, octree: Octree, found: Candidates, sparse: NDArray[np.int64], workers: Workers
 ) -> WideViews:
     """Join wide views of the sparse candidates: render those that have changed or that the map lacks."""
@@ -166,7 +166,7 @@ def joined_views(
     return WideViews(*joined)
 
 
-def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
+def assign_scans(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
     """Assign a scan to each candidate (N,): its old one, the nearest candidate's, or the new one."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
@@ -180,7 +180,7 @@ def scans_of(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
     return scans
 
 
-def joined_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
+def join_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
     """Join features: extract them again in changed views, and in new views where they are needed."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
@@ -192,7 +192,7 @@ def joined_features(old: ScanMap, octree: Octree, found: Candidates, workers: Wo
     looked_at = np.concatenate([place[has_place], found.changed])
     centers = found.centers[looked_at]
     num_known = int(np.count_nonzero(has_place))
-    more = view_positions(centers, seen_by(octree, centers), SEARCH_VIEW.num_rings, num_known)
+    more = view_positions(centers, look_from(octree, centers), SEARCH_VIEW.num_rings, num_known)
     anew = np.concatenate([place[has_place & ~is_kept], looked_at[more]])
     if np.count_nonzero(is_kept) + len(anew) > MOST_VIEWS:
         raise InputError(f"`add`: found more than {MOST_VIEWS} views with features, the most of one map")

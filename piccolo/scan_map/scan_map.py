@@ -94,7 +94,7 @@ class ScanMap:
         first, cell = sparse_candidates(self.centers)
         return first[cell]
 
-    def narrowed(self, is_kept: NDArray[np.bool_]) -> "ScanMap":
+    def narrow(self, is_kept: NDArray[np.bool_]) -> "ScanMap":
         """Return the map of which some (sparse,) of the candidates are searched."""
         return replace(
             self,
@@ -136,7 +136,7 @@ def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], 
     return first, cell.reshape(-1)
 
 
-def candidates_of(
+def find_candidates(
     octree: Octree, frame: tuple[Array, Array], prior: Prior, workers: Workers
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """Find candidates (N, 3) [m]; in a scan too large as a whole, near the prior's place, with a warning.
@@ -178,12 +178,12 @@ def prepare_map(
         origin_world = R_map_from_world.T @ voxels.origin
         warnings = voxels.warnings
         if isinstance(up, str) and up == "auto":
-            warnings += doubts_about_up(octree, R_map_from_world, cloud.up)
+            warnings += check_up(octree, R_map_from_world, cloud.up)
     for warning in warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):
         frame = (R_map_from_world, origin_world)
-        centers, notes = candidates_of(octree, frame, prior, workers)
+        centers, notes = find_candidates(octree, frame, prior, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], view, workers)
         scan_map = ScanMap(
@@ -201,11 +201,11 @@ def prepare_map(
             warnings=warnings + notes,
             is_partial=bool(notes),
         )
-        scan_map = with_late_features(scan_map)
-        return with_features(scan_map, workers) if has_features else scan_map
+        scan_map = defer_features(scan_map)
+        return add_features(scan_map, workers) if has_features else scan_map
 
 
-def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
+def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
     """Warn if the floors face clearly away from the map's z, naming the nearest axis."""
     axis, sense, reason, _ = find_up(octree)
     cosine = sense * axis[2]
@@ -222,20 +222,20 @@ def doubts_about_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> t
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
     """Find local features in views from few of a map's candidates, chosen by what they see."""
     centers = scan_map.centers
-    chosen = view_positions(centers, seen_by(scan_map.octree, centers), SEARCH_VIEW.num_rings)
+    chosen = view_positions(centers, look_from(scan_map.octree, centers), SEARCH_VIEW.num_rings)
     return make_feature_map(scan_map.octree, centers[chosen], workers)
 
 
-def seen_by(octree: Octree, centers: NDArray[np.float64]) -> Look:
+def look_from(octree: Octree, centers: NDArray[np.float64]) -> Look:
     """Return a function that gives the ranges seen from a centre of (N, 3) by its index."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 
 
-def with_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
+def add_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
     """Add the local features to a map, made now if they are missing."""
     return replace(scan_map, local_features=scan_map.features_now(workers), late=None)
 
 
-def with_late_features(scan_map: ScanMap) -> ScanMap:
+def defer_features(scan_map: ScanMap) -> ScanMap:
     """Let a map make its local features when they are first needed."""
     return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, workers)))

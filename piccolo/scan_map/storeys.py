@@ -84,9 +84,9 @@ def find_storeys(octree: Octree) -> Storeys:
     is_top = _is_standable(ijk)
     tops = ijk[is_top]
     top_xyz = xyz[is_top]
-    masks = _levels(ijk, tops)
+    masks = _find_levels(ijk, tops)
     storeys = []
-    for group in _united(masks):
+    for group in _unite_levels(masks):
         level_z = [float(np.median(top_xyz[tops[:, 2] == k, 2])) for k in group]
         above = top_xyz[:, 2, None] - np.array(level_z)
         is_of = ((above > -BELOW_LEVEL) & (above < ABOVE_LEVEL)).any(axis=1)
@@ -108,7 +108,7 @@ def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
     return is_free
 
 
-def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArray[np.bool_]]:
+def _find_levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArray[np.bool_]]:
     """Find the floors by their height [voxels], ascending, with the cells (I, J) of each.
 
     `ijk` (N, 3) are all voxels, `tops` those that have room above. The largest floor first, then what is
@@ -123,7 +123,7 @@ def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArra
     while thick.max() > most:
         around = slice(max(int(thick.argmax()) - THICKNESS, 0), int(thick.argmax()) + THICKNESS + 1)
         level = around.start + int(counts[around].argmax())
-        mask = _opened(ijk, tops, level)
+        mask = _open_level(ijk, tops, level)
         is_apart = all(
             abs(level - other) * SURFACE_VOXEL >= LEAST_APART or _overlap(mask, below) < LEAST_OVERLAP
             for other, below in found.items()
@@ -135,7 +135,7 @@ def _levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArra
     return dict(sorted(found.items()))
 
 
-def _opened(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
+def _open_level(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
     """Cells (I, J) of a level on which a disc fits, small gaps closed."""
     mask = np.zeros(ijk.max(axis=0)[:2] + 2, np.uint8)
     own = tops[np.abs(tops[:, 2] - level) <= THICKNESS]
@@ -160,7 +160,7 @@ def _overlap(mask: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
     return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))
 
 
-def _united(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
+def _unite_levels(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
     """Group levels to storeys: a level that is hardly above those before it joins them."""
     groups: list[list[int]] = []
     for level, mask in masks.items():

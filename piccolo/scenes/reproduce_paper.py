@@ -47,7 +47,7 @@ def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | No
         raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
     chosen = np.sort(_rng(scene).choice(len(cloud.points), count, replace=False))
     points = cloud.points[chosen].astype(np.float64) + cloud.origin_world
-    return replace(scene, cloud=_written(folder, points, cloud.colors[chosen]))
+    return replace(scene, cloud=_write_cloud(folder, points, cloud.colors[chosen]))
 
 
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
@@ -56,16 +56,16 @@ def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     turn = RigidTransform(random_rotation(_rng(scene)), np.zeros(3))
     points = turn.of_points(cloud.points.astype(np.float64) + cloud.origin_world)
     queries = tuple(replace(query, pose=turn.of_pose(query.pose)) for query in scene.queries)
-    return replace(scene, cloud=_written(folder, points, cloud.colors), queries=queries)
+    return replace(scene, cloud=_write_cloud(folder, points, cloud.colors), queries=queries)
 
 
-def _written(folder: Path, points: Array, colors: NDArray[np.uint8]) -> Path:
+def _write_cloud(folder: Path, points: Array, colors: NDArray[np.uint8]) -> Path:
     path = folder / CLOUD_NAME
     write_ply(path, vertex_rows(points, colors))
     return path
 
 
-def flipped(scene: Scene, folder: Path) -> Scene:
+def flip(scene: Scene, folder: Path) -> Scene:
     """Every picture taken with the camera upside down: turned by half a turn about the view axis.
 
     They are PNG under the scene's own names, so that results of both can be compared by name.
@@ -165,7 +165,7 @@ def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Cond
 GRAVITY_CASES: dict[str, dict[str, Any]] = {
     "gravity known": {"gravity": "known"},
     "gravity unknown": {"gravity": "unknown"},
-    "images upside down": {"gravity": "unknown", "transform": flipped},
+    "images upside down": {"gravity": "unknown", "transform": flip},
     "clouds turned at random": {"gravity": "unknown", "transform": with_random_rotation},
 }
 PERCENTS = (100, 50, 20, 10, 5, 2, 1)

@@ -15,7 +15,7 @@ from ..camera.files import document_of, mounts_of
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.json_file import DAMAGE, describe, read_json
-from ..geometry.pose import Pose, checked_rotation
+from ..geometry.pose import Pose, check_rotation
 from ..geometry.sphere import CONVENTION
 
 QUERIES_NAME = "queries.json"
@@ -112,7 +112,7 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
     center_world = np.array(entry["center_world"], float)
     if center_world.shape != (3,) or not np.isfinite(center_world).all():
         raise ValueError(f"{entry['image']}: a center_world that is not three finite numbers")
-    checked_rotation(R_cam_from_world, MAX_SKEW, f"{entry['image']}: an R_cam_from_world that")
+    check_rotation(R_cam_from_world, MAX_SKEW, f"{entry['image']}: an R_cam_from_world that")
     labels = folder / entry["labels"] if entry.get("labels") else None
     cameras = mounts_of(entry["camera"]) if entry.get("camera") else ()
     pose = Pose(R_cam_from_world, center_world)

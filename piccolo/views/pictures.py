@@ -64,7 +64,7 @@ def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, qua
     return content.tobytes()
 
 
-def resized_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
+def resize_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
     """The panorama's colours, resized to (width / 2, width, 3)."""
     rgb = shrink(panorama, width).rgb
     return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
@@ -85,9 +85,9 @@ def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: W
     if len(panorama.cameras) != 1:
         view = render_points(points, pose, OVERLAY_WIDTH, workers)
         cloud = fill_holes(view.rgb, view.is_seen)
-        return encode_image(checkerboard(resized_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")
+        return encode_image(checkerboard(resize_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")
     (mount,) = panorama.cameras
-    camera = mount.camera.scaled_to_width(OVERLAY_WIDTH)
+    camera = mount.camera.scale_to_width(OVERLAY_WIDTH)
     view = render_points(points, mount.pose(pose), sphere_width_for(camera), workers)
     cloud = cut(fill_holes(view.rgb, view.is_seen), camera)
     photo = cut(panorama.rgb, camera, mount.rotation)

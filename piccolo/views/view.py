@@ -344,7 +344,7 @@ def empty_cells(n: int, center_map: Center) -> Cells:
     return Cells(offsets, channels, np.empty(n, np.float32), np.asarray(center_map, np.float64))
 
 
-def normalized_view(sums: Array32, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_]) -> Cells:
+def normalize_view(sums: Array32, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_]) -> Cells:
     """A view around a centre (3,) [m] by its sums (N, 8): those cells (N,) of `config` that are shown."""
     cells = empty_cells(len(sums), center_map)
     normalize_cells(sums, config.arrays, shown, *cells[:3])

@@ -102,7 +102,7 @@ class Frame:
         return cls(float(document["time"]), states, document["how"], alone)
 
 
-def checked_times(times: Sequence[float]) -> None:
+def check_times(times: Sequence[float]) -> None:
     """Refuse times that do not rise."""
     if not all(math.isfinite(time) for time in times):
         raise InputError("times: found one that is no finite number, wanted seconds")
@@ -111,7 +111,7 @@ def checked_times(times: Sequence[float]) -> None:
             raise InputError(f"times: found {after} after {before} at frame {k + 1}, wanted them to rise")
 
 
-def states_of(scan_map: ScanMap, found: Localization) -> list[State]:
+def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
     """List the poses that a frame has alone, with its own probabilities."""
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
@@ -133,7 +133,7 @@ def log_ratio(probability: float, other: float) -> float:
     return min(max(ratio, -2.0 * MOST_ODDS), MOST_ODDS)
 
 
-def centers_of(states: Sequence[State]) -> Array:
+def state_centers(states: Sequence[State]) -> Array:
     """Return the positions (N, 3) [m] of states."""
     return np.array([state.pose.center_world for state in states]).reshape(-1, 3)
 

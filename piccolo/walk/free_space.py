@@ -52,7 +52,7 @@ class FreeSpace:
         both = np.concatenate([pairs, pairs[:, ::-1]])  # there and back
         order = np.argsort(both[:, 0], kind="stable")
         seen = np.empty(len(both), np.int64)
-        seen[order] = looks(m, both[order, 0], both[order, 1], self.workers)
+        seen[order] = look_past(m, both[order, 0], both[order, 1], self.workers)
         is_free = seen[: len(pairs)] + seen[len(pairs) :] > 0
         first, second = pairs[is_free].T
         length = np.linalg.norm(m.centers[second] - m.centers[first], axis=1)
@@ -65,17 +65,17 @@ class FreeSpace:
         far = (straight > NEAR) & (straight <= limit)
         if far.any():
             _, nodes = self._tree.query(np.concatenate([start[None], ends[far]]))
-            along = self._from(int(nodes[0]), nodes[1:], DETOUR * (limit + 2.0 * ENDS))
+            along = self._path_lengths(int(nodes[0]), nodes[1:], DETOUR * (limit + 2.0 * ENDS))
             walked[far] = np.maximum(straight[far], along / DETOUR - ENDS)
         walked[walked > limit] = np.inf
         return np.asarray(walked)
 
-    def share_within(self, center: Array, radius: float) -> float:
+    def fraction_within(self, center: Array, radius: float) -> float:
         """Fraction of the map's candidates within a radius [m] of a place (3,), at least one."""
         near = self._tree.query_ball_point(center, radius, return_length=True)
         return max(int(near), 1) / max(len(self.scan_map.centers), 1)
 
-    def _from(self, node: int, ends: NDArray[np.int64], limit: float) -> NDArray[np.float64]:
+    def _path_lengths(self, node: int, ends: NDArray[np.int64], limit: float) -> NDArray[np.float64]:
         """Lengths (N,) of the shortest paths from a node to others (N,), inf beyond the limit [m]."""
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 
@@ -88,7 +88,7 @@ class FreeSpace:
         return np.asarray(np.where(known.nodes[place] == ends, known.lengths[place], np.inf))
 
 
-def looks(
+def look_past(
     scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any], workers: Workers
 ) -> NDArray[np.int64]:
     """Return 1 (N,) where candidates see past their neighbours, 0 where they see nothing, else -2.

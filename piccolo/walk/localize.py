@@ -54,10 +54,10 @@ class WalkFrame:
     gap: Gap | None  # before it
 
 
-def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, WalkFrame]]:
+def make_localizations(tracker: Tracker, path: Path) -> list[tuple[Localization, WalkFrame]]:
     """Return the result of each frame of a walk, poses smoothed together."""
     found = [
-        localization_of(tracker, frame, probabilities, chosen)
+        make_localization(tracker, frame, probabilities, chosen)
         for frame, probabilities, chosen in zip(tracker.frames, path.probabilities, path.chosen, strict=True)
     ]
     sure = [k for k, f in enumerate(found) if f.pose and f.covariance and f.confidence > SURE]
@@ -65,22 +65,24 @@ def localizations_of(tracker: Tracker, path: Path) -> list[tuple[Localization, W
     begins = [0, *(n for n, k in enumerate(sure) if n and path.gaps[k]), len(sure)]
     for lo, hi in pairwise(begins):
         times = [tracker.frames[k].time for k in sure[lo:hi]]
-        parts = smoothed(located[lo:hi], times, tracker.motion)
+        parts = smooth_positions(located[lo:hi], times, tracker.motion)
         for k, (pose, covariance) in zip(sure[lo:hi], parts, strict=True):
             found[k] = replace(found[k], pose=pose, covariance=covariance)
     return [
-        (f, WalkFrame(frame.time, k, frame.how, alone_of(frame), Gap(*gap) if gap else None))
+        (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), Gap(*gap) if gap else None))
         for k, (f, frame, gap) in enumerate(zip(found, tracker.frames, path.gaps, strict=True))
     ]
 
 
-def alone_of(frame: Frame) -> Alone | None:
+def result_alone(frame: Frame) -> Alone | None:
     """Return a frame's result without regard to the others, if it was searched so."""
     a = frame.alone
     return None if a is None else Alone(a.status, a.confidence, a.pose)
 
 
-def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None) -> Localization:
+def make_localization(
+    tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None
+) -> Localization:
     """Make the result of a frame with the probabilities that a walk gives its poses."""
     if not frame.states:
         return frame.alone or Localization()
@@ -112,7 +114,7 @@ def localization_of(tracker: Tracker, frame: Frame, probabilities: Array, chosen
     )
 
 
-def smoothed(located: Sequence[Located], times: Sequence[float], motion: Motion) -> list[Located]:
+def smooth_positions(located: Sequence[Located], times: Sequence[float], motion: Motion) -> list[Located]:
     """Poses, and their covariances, that agree best with their own and with small accelerations.
 
     Minimizes sum (x_k - z_k)' C_k^-1 (x_k - z_k) + sum |a_k|^2 / s^2 over the positions x_k, where a_k is the
@@ -139,7 +141,7 @@ def smoothed(located: Sequence[Located], times: Sequence[float], motion: Motion)
     moves = solveh_banded(information, right).reshape(-1, 3)
     variances = marginal_covariances(information)
     return [
-        moved(pose, covariance, move, variance)
+        move_pose(pose, covariance, move, variance)
         for (pose, covariance), move, variance in zip(located, moves, variances, strict=True)
     ]
 
@@ -170,7 +172,7 @@ def marginal_covariances(information: NDArray[np.float64]) -> list[Array]:
     return found
 
 
-def moved(pose: Pose, covariance: PoseCovariance, move: Array, variance: Array) -> Located:
+def move_pose(pose: Pose, covariance: PoseCovariance, move: Array, variance: Array) -> Located:
     """Move a pose by the smoothing of its position, and update its covariance.
 
     Rotation and position are jointly Gaussian: the one follows the other by C_wd C_dd^-1.

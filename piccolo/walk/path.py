@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from .frames import COPY_LOG_ODDS, MOST_ODDS, OTHER_LOG_ODDS, Frame, Motion, centers_of
+from .frames import COPY_LOG_ODDS, MOST_ODDS, OTHER_LOG_ODDS, Frame, Motion, state_centers
 from .free_space import FreeSpace
 
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
@@ -54,10 +54,10 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
         if len(odds) == 0:
             found.append(odds)
             continue
-        share = 1.0 if last is None else share_moved(last, frame)
+        share = 1.0 if last is None else fraction_moved(last, frame)
         last = frame
         total = np.clip(np.logaddexp.reduce(odds), -MOST_ODDS, MOST_ODDS)
-        of_place = odds[places_of(odds, centers_of(frame.states))]
+        of_place = odds[group_by_place(odds, state_centers(frame.states))]
         behind = -new_differences(odds.max() - of_place, share) - (of_place - odds)
         found.append(total + behind - np.logaddexp.reduce(behind))
     return found
@@ -72,14 +72,14 @@ def new_differences(behind: Array, share: float) -> Array:
     return np.asarray(is_other * behind + (1.0 - is_other) * share * np.maximum(behind - COPY_LOG_ODDS, 0.0))
 
 
-def share_moved(before: Frame, frame: Frame) -> float:
+def fraction_moved(before: Frame, frame: Frame) -> float:
     """Fraction of a new place that a frame shows, by how far the camera has moved at least."""
-    starts, ends = (centers_of(f.likely) for f in (before, frame))
+    starts, ends = (state_centers(f.likely) for f in (before, frame))
     moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
     return min(moved / TELLING_DISTANCE, 1.0)
 
 
-def places_of(odds: Array, centers: Array) -> NDArray[np.int64]:
+def group_by_place(odds: Array, centers: Array) -> NDArray[np.int64]:
     """Index (S,) of the likeliest pose in the place of each pose (S, 3) [m], by their log odds (S,)."""
     leaders: list[int] = []
     place = np.empty(len(odds), np.int64)
@@ -100,13 +100,13 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
     return np.maximum(expected - 0.5 * (excess / REACH_SIGMA) ** 2, jump)
 
 
-def left(log: Array, frame: Frame) -> Array:
+def log_leaving(log: Array, frame: Frame) -> Array:
     """Log odds (S,) of leaving states for a place that is not listed, by the steps (S, N) to a frame."""
     is_kept = (log.max(axis=1) > JUMPED) & (frame.how == "tracked" or frame.is_telling)
     return np.asarray(np.where(is_kept, GAP_LOG, LOST_LOG))
 
 
-def entering(frame: Frame) -> float:
+def log_entering(frame: Frame) -> float:
     """Log odds of coming to a frame's poses from a place that is not listed."""
     return 0.0 if frame.how == "alone" else FOLLOWED_LOG
 
@@ -156,8 +156,8 @@ class Lattice:
         unlisted, begin = (self.unlisted[-1], (k - 1, UNLISTED)) if k else (_Unlisted(), None)
         self.unlisted.append(self._unlisted_at(k, unlisted))
         num = len(frame.states)
-        sums = np.full(num, entering(frame) + unlisted.forward)
-        best = np.full(num, entering(frame) + unlisted.best)
+        sums = np.full(num, log_entering(frame) + unlisted.forward)
+        best = np.full(num, log_entering(frame) + unlisted.best)
         back: list[tuple[int, int] | None] = [begin] * num
         for s in steps:
             sums = np.logaddexp(sums, np.logaddexp.reduce(self.forward[s.begin][:, None] + s.log, axis=0))
@@ -179,12 +179,12 @@ class Lattice:
         """
         gained = max([0.0, *(float(s.log.max()) for s in self.steps[k])])
         emitted = float(self.emitted[k].max(initial=-math.inf)) + gained
-        emitted = max(emitted - self._telling(k) * (TELLING_LOG + gained), 0.0)
+        emitted = max(emitted - self._new_fraction(k) * (TELLING_LOG + gained), 0.0)
         forward = before.forward
         best = before.best
         back = (k - 1, UNLISTED) if k else None
         for s in self.steps[k]:
-            leave = left(s.log, self.frames[k])
+            leave = log_leaving(s.log, self.frames[k])
             forward = float(np.logaddexp(forward, np.logaddexp.reduce(self.forward[s.begin] + leave)))
             ways = self.best[s.begin] + leave
             if ways.max() > best:
@@ -192,17 +192,17 @@ class Lattice:
                 back = (s.begin, int(ways.argmax()))
         return _Unlisted(emitted, forward + emitted, best + emitted, back)
 
-    def _telling(self, k: int) -> float:
+    def _new_fraction(self, k: int) -> float:
         """Fraction of what a search of the whole scan can tell that is new in a frame."""
         frame = self.frames[k]
         if not frame.is_telling:
             return 0.0
         last = next((f for f in reversed(self.frames[:k]) if f.is_telling), None)
-        return 1.0 if last is None else max(share_moved(last, frame), LEAST_TOLD)
+        return 1.0 if last is None else max(fraction_moved(last, frame), LEAST_TOLD)
 
     def _steps_to(self, k: int) -> list[_Steps]:
         """Return steps from all earlier frames from which the way may lead to a frame."""
-        ends = centers_of(self.frames[k].states)
+        ends = state_centers(self.frames[k].states)
         steps: list[_Steps] = []
         passed = 0.0
         if len(ends) == 0:
@@ -213,7 +213,7 @@ class Lattice:
                 continue
             seconds = self.frames[k].time - frame.time
             limit = self.motion.max_speed * seconds + REACH_SLACK + 5.0 * REACH_SIGMA
-            starts = centers_of(frame.states)
+            starts = state_centers(frame.states)
             distances = [self.space.distance(start, ends, limit) for start in starts]
             expected = np.array([[self._expected(start, limit)] for start in starts])
             steps.append(_Steps(m, log_transition(np.array(distances), seconds, self.motion, expected)))
@@ -227,9 +227,9 @@ class Lattice:
 
         A frame's own odds hold where each place of the map is as likely as the others.
         """
-        return min(-math.log(self.space.share_within(start, reach)), MOST_EXPECTED)
+        return min(-math.log(self.space.fraction_within(start, reach)), MOST_EXPECTED)
 
-    def filtered(self) -> Array:
+    def filter_last(self) -> Array:
         """Probability (S,) of each state of the last frame by all that was before."""
         return np.asarray(np.exp(self.forward[-1] - self._total()))
 
@@ -237,7 +237,7 @@ class Lattice:
         """Log of the sum over all ways."""
         return float(np.logaddexp(self.unlisted[-1].forward, self.ended))
 
-    def smoothed(self) -> Path:
+    def smooth(self) -> Path:
         """Return the likeliest path, and the probability of each state by all frames."""
         backward = [np.zeros(len(f.states)) for f in self.frames]
         unlisted = 0.0
@@ -245,10 +245,10 @@ class Lattice:
             onward = self.emitted[k] + backward[k]
             unlisted += self.unlisted[k].emitted
             for s in self.steps[k]:
-                leave = left(s.log, self.frames[k]) + unlisted
+                leave = log_leaving(s.log, self.frames[k]) + unlisted
                 ways = np.concatenate([s.log + onward[None], leave[:, None]], axis=1)
                 backward[s.begin] = np.logaddexp(backward[s.begin], np.logaddexp.reduce(ways, axis=1))
-            unlisted = float(np.logaddexp.reduce([unlisted, *(entering(self.frames[k]) + onward)]))
+            unlisted = float(np.logaddexp.reduce([unlisted, *(log_entering(self.frames[k]) + onward)]))
         total = self._total() if self.frames else 0.0
         probabilities = [np.exp(f + b - total) for f, b in zip(self.forward, backward, strict=True)]
         chosen = self._likeliest()
@@ -277,14 +277,14 @@ class Lattice:
                 m, i = before
                 log = next((s.log[i, j] for s in self.steps[k] if s.begin == m), GAP_LOG)
                 if log < JUMPED:
-                    ends = centers_of([self.frames[m].states[i], self.frames[k].states[j]])
+                    ends = state_centers([self.frames[m].states[i], self.frames[k].states[j]])
                     metres = float(np.linalg.norm(ends[1] - ends[0]))
                     gaps[k] = metres, self.frames[k].time - self.frames[m].time
             before = k, j
         return gaps
 
 
-def lattice_of(frames: Sequence[Frame], space: FreeSpace, motion: Motion) -> Lattice:
+def build_lattice(frames: Sequence[Frame], space: FreeSpace, motion: Motion) -> Lattice:
     """Build the lattice of frames in their order."""
     lattice = Lattice(space, motion)
     for frame in frames:

@@ -17,19 +17,19 @@ from ..localization.query import Query, prepare_query
 from ..localization.selection import CLEAR_SCORE
 from ..localization.settings import METHOD
 from ..panorama import Panorama
-from .frames import MAX_STEP, Frame, Motion, State, centers_of, states_of
-from .path import REACH_SLACK, Path, lattice_of, places_of
+from .frames import MAX_STEP, Frame, Motion, State, list_states, state_centers
+from .path import REACH_SLACK, Path, build_lattice, group_by_place
 from .tracker import (
     MAX_RADIUS,
     Follower,
     Tracker,
-    beside,
+    associate,
+    find_near,
     follow,
-    followed,
-    found_near,
+    follow_all,
     is_same,
     least_score,
-    states_at,
+    make_states,
 )
 
 MAX_SWEEPS = 4
@@ -47,14 +47,14 @@ Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it ca
 
 
 @one_blas_thread
-def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
+def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
     """Find the path of all frames of a tracker, and search doubtful and lost ones again.
 
     Where the path is in doubt, each place that a frame may show is looked for in its neighbours, so that no
     copy loses by not having been listed. Then lost frames are looked for from those that are sure.
     """
     num = len(tracker.frames)
-    tracker.motion = motion_of(tracker)
+    tracker.motion = estimate_motion(tracker)
     path = _path_of(tracker)
     for step in (1, -1):
         unsure = [k for k in range(num)[::step] if not _is_certain(path, k)]
@@ -70,14 +70,14 @@ def finished(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path
                 follower = _follower_of_lost(tracker, path, k, step, tried)
                 panorama = read(k) if follower else None
                 if follower and panorama is not None and panorama.is_valid.any():
-                    num_found += _found_again(tracker, k, follower, panorama, searched)
+                    num_found += _find_again(tracker, k, follower, panorama, searched)
             path = _path_of(tracker)
         if num_found == 0:
             break
     return path
 
 
-def motion_of(tracker: Tracker) -> Motion:
+def estimate_motion(tracker: Tracker) -> Motion:
     """Estimate the motion of the camera, if it is not given, from the frames that are localized alone."""
     motion = tracker.motion
     if motion.is_timed or not motion.is_guess:
@@ -90,7 +90,7 @@ def motion_of(tracker: Tracker) -> Motion:
 
 
 def _path_of(tracker: Tracker) -> Path:
-    return lattice_of(tracker.frames, tracker.lattice.space, tracker.motion).smoothed()
+    return build_lattice(tracker.frames, tracker.lattice.space, tracker.motion).smooth()
 
 
 def _is_certain(path: Path, k: int) -> bool:
@@ -108,9 +108,9 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
     panorama = read(k) if missing else None
     if panorama is None:
         return
-    query = tracker.prepared(panorama)
-    for follower, end in zip(missing, followed(query, missing, frame.time, tracker.motion), strict=True):
-        more = beside(query, frame.states, end)
+    query = tracker.prepare(panorama)
+    for follower, end in zip(missing, follow_all(query, missing, frame.time, tracker.motion), strict=True):
+        more = associate(query, frame.states, end)
         if more is not None and _is_within(tracker, follower, more, frame.time):
             frame.states.append(more)
 
@@ -121,7 +121,7 @@ def _rivals(tracker: Tracker, m: int) -> list[Follower]:
     if len(likely) < 2:
         return []
     odds = np.array([state.log_odds for state in likely])
-    places = {int(j) for j in places_of(odds, centers_of(likely))}
+    places = {int(j) for j in group_by_place(odds, state_centers(likely))}
     leaders = sorted(places, key=lambda j: (-odds[j], j))[:MOST_RIVALS]
     return [Follower(likely[j], tracker.frames[m].time) for j in leaders] if len(leaders) > 1 else []
 
@@ -145,13 +145,11 @@ def _follower_of_lost(
     if sure is None or (k, sure) in tried:
         return None
     tried.add((k, sure))
-    follower = _follower(tracker, path, sure, step)
+    follower = _make_follower(tracker, path, sure, step)
     return None if _is_reached(tracker, follower, k, LEAST_ODDS) else follower
 
 
-def _found_again(
-    tracker: Tracker, k: int, follower: Follower, panorama: Panorama, searched: set[int]
-) -> bool:
+def _find_again(tracker: Tracker, k: int, follower: Follower, panorama: Panorama, searched: set[int]) -> bool:
     """Search a frame near where a follower leads, by features only once; True if it gains a pose."""
     frame = tracker.frames[k]
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
@@ -160,29 +158,29 @@ def _found_again(
     found = [end] if is_there else []
     radius = tracker.motion.max_speed * abs(frame.time - follower.time) + REACH_SLACK
     if not found and radius <= MAX_RADIUS:
-        found = found_near(query, follower.state.pose, radius, CLEAR_SCORE)
+        found = find_near(query, follower.state.pose, radius, CLEAR_SCORE)
     if not found and not frame.states and radius <= MAX_RADIUS and k not in searched:
         searched.add(k)
-        return _searched_near(tracker, frame, follower, radius, panorama)
+        return _search_near(tracker, frame, follower, radius, panorama)
     if found and frame.states:
-        return _joined(query, frame, found[0])
+        return _join(query, frame, found[0])
     if found:
-        frame.put(states_at(query, found), "tracked" if is_there else "near")
+        frame.put(make_states(query, found), "tracked" if is_there else "near")
     return len(found) > 0
 
 
-def _joined(query: Query, frame: Frame, found: Hypothesis) -> bool:
+def _join(query: Query, frame: Frame, found: Hypothesis) -> bool:
     """Add a pose to a frame, or replace a worse one nearby; True if the frame has changed."""
     for j, state in enumerate(frame.states):
         if is_same(state.pose, found.pose) and found.score > MIN_GAIN * state.score:
-            frame.states[j] = states_at(query, [found])[0]
+            frame.states[j] = make_states(query, [found])[0]
             return True
-    more = beside(query, frame.states, found)
+    more = associate(query, frame.states, found)
     frame.states += [] if more is None else [more]
     return more is not None
 
 
-def _searched_near(
+def _search_near(
     tracker: Tracker, frame: Frame, follower: Follower, radius: float, panorama: Panorama
 ) -> bool:
     """Search a frame near a pose by local features; True if it is found."""
@@ -193,7 +191,7 @@ def _searched_near(
     found = localize(tracker.scan_map, panorama, settings, tracker.workers, Stopwatch(), method)
     if found.status == NOT_LOCALIZED:
         return False
-    frame.put(states_of(tracker.scan_map, found), "near")
+    frame.put(list_states(tracker.scan_map, found), "near")
     return True
 
 
@@ -215,7 +213,7 @@ def _state_on(tracker: Tracker, path: Path, m: int) -> State:
     return states[chosen] if is_old and chosen is not None else states[-1]
 
 
-def _follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
+def _make_follower(tracker: Tracker, path: Path, m: int, step: int) -> Follower:
     """Make a follower from a sure frame and the one before it in the direction of the sweep."""
     state = _state_on(tracker, path, m)
     other = m - step

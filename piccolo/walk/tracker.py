@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, by_score, suppressed
+from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, sort_by_score, suppress_near
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
 from ..geometry.rotations import Gravity
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..localization.attempts import FIRST_BEAM, MIRROR_RATIO, brief_query, first_score, mirror_score
+from ..localization.attempts import FIRST_BEAM, MIRROR_RATIO, brief_query, score_mirror, score_starts
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
 from ..localization.localize import localize
@@ -21,7 +21,7 @@ from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
 from ..localization.refinement import FULL_LOSS, descend, descend_fine, descend_middle, perturb_middle, refine
 from ..localization.search import search_poses
-from ..localization.selection import CLEAR_SCORE, rank, standings_of
+from ..localization.selection import CLEAR_SCORE, assess_poses, rank
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import Panorama
 from ..scan_map.prior import Prior
@@ -33,9 +33,9 @@ from .frames import (
     Frame,
     Motion,
     State,
-    centers_of,
+    list_states,
     log_ratio,
-    states_of,
+    state_centers,
 )
 from .free_space import FreeSpace
 from .path import REACH_SLACK, Lattice
@@ -100,7 +100,7 @@ class Tracker:
         self.motion = replace(self.motion, max_speed=step, max_acceleration=NO_ACCELERATION, is_timed=False)
         self.lattice = Lattice(self.lattice.space, self.motion)
 
-    def prepared(self, panorama: Panorama) -> Query:
+    def prepare(self, panorama: Panorama) -> Query:
         """Prepare the query of a frame, with the images that its descents need."""
         query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
         for image in query.photo.images:
@@ -115,7 +115,9 @@ class Tracker:
             is_far = bool(self.frames) and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
             self._follow(query, frame, not is_far)
             is_lost = self.num_lost + 1 >= self.next_search
-            is_due = self.walked + self._moved(frame) >= (CHECKED_SURE if self.is_sure else CHECKED_UNSURE)
+            is_due = self.walked + self._distance_moved(frame) >= (
+                CHECKED_SURE if self.is_sure else CHECKED_UNSURE
+            )
             if is_far or (is_lost and not frame.is_credible):
                 self._search(query, panorama, frame)
             elif is_due and frame.is_credible:
@@ -125,33 +127,33 @@ class Tracker:
 
     def accept(self, frame: Frame) -> None:
         """Count a frame that was found now or earlier."""
-        self.walked += self._moved(frame)
+        self.walked += self._distance_moved(frame)
         self.lattice.add(frame)
         if frame.how == "alone":
             self.walked = 0.0
         if frame.is_credible:
             self.num_lost = 0
             self.next_search = FIRST_SEARCH
-            self.is_sure = bool(self.lattice.filtered().max() >= SURE)
+            self.is_sure = bool(self.lattice.filter_last().max() >= SURE)
             return
         self.num_lost += 1
         if frame.how == "alone":
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
 
-    def _moved(self, frame: Frame) -> float:
+    def _distance_moved(self, frame: Frame) -> float:
         """Metres from the frame before, from its nearest pose; 0 if one of the two has none."""
         before = next((f for f in reversed(self.frames) if f.states), None)
         if before is None or not frame.states:
             return 0.0
         best = max(frame.states, key=lambda state: state.log_odds).pose.center_world
-        return float(np.linalg.norm(centers_of(before.states) - best, axis=1).min())
+        return float(np.linalg.norm(state_centers(before.states) - best, axis=1).min())
 
     def _follow(self, query: Query, frame: Frame, looks_near: bool) -> None:
         """Descend from where the camera should be by each of its last poses, or look near these."""
         followers = self.followers()
         if not followers:
             return
-        ends = followed(query, followers, frame.time, self.motion)
+        ends = follow_all(query, followers, frame.time, self.motion)
         is_there = any(end.score >= least_score(f) for f, end in zip(followers, ends, strict=True))
         least = KEPT_BESIDE * max(end.score for end in ends) if is_there else CLEAR_SCORE
         found = [end for end in ends if end.score >= least] if is_there else []
@@ -159,9 +161,9 @@ class Tracker:
         for f in lost[:MOST_SOUGHT] if looks_near else []:
             radius = self.motion.max_speed * (frame.time - f.time) + REACH_SLACK
             if radius <= MAX_RADIUS:
-                found += found_near(query, f.state.pose, radius, least)
+                found += find_near(query, f.state.pose, radius, least)
         if found:
-            frame.put(states_at(query, found), "tracked" if is_there else "near")
+            frame.put(make_states(query, found), "tracked" if is_there else "near")
 
     def followers(self) -> list[Follower]:
         """Return the poses to track from: those of the last credible frame, then of a later one."""
@@ -189,23 +191,23 @@ class Tracker:
 
     def _check(self, query: Query, frame: Frame) -> None:
         """Look for a frame that is followed in the whole scan too."""
-        found = found_everywhere(query, CLEAR_SCORE)
+        found = find_everywhere(query, CLEAR_SCORE)
         if found:
-            frame.put(merged(query, frame.states, found), "alone")
+            frame.put(merge_states(query, frame.states, found), "alone")
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan, and keep what was tracked beside."""
         alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         tracked_to = [Hypothesis(state.pose, state.score) for state in frame.states]
-        states = states_of(self.scan_map, alone)
-        frame.put(merged(query, states, tracked_to) if states else frame.states, "alone")
+        states = list_states(self.scan_map, alone)
+        frame.put(merge_states(query, states, tracked_to) if states else frame.states, "alone")
         frame.alone = alone
 
 
-def merged(query: Query, states: list[State], others: Sequence[Hypothesis]) -> list[State]:
+def merge_states(query: Query, states: list[State], others: Sequence[Hypothesis]) -> list[State]:
     """Merge other poses into the states of a frame."""
     for other in others:
-        more = beside(query, states, other)
+        more = associate(query, states, other)
         states = states if more is None else [*states, more]
     return states
 
@@ -215,7 +217,7 @@ def least_score(f: Follower) -> float:
     return max(LEAST_SCORE, LEAST_KEPT * f.state.score)
 
 
-def followed(query: Query, followers: Sequence[Follower], time: float, motion: Motion) -> list[Hypothesis]:
+def follow_all(query: Query, followers: Sequence[Follower], time: float, motion: Motion) -> list[Hypothesis]:
     """Track a frame from several poses in parallel; the query's images must be made."""
     return list(query.workers.map(lambda f: follow(query, f, time, motion), followers, "descend"))
 
@@ -228,15 +230,15 @@ def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis
     span = f.time - f.earlier_time
     if f.earlier is not None and span != 0.0:
         reach = motion.max_speed * abs(seconds) + REACH_SLACK
-        starts.insert(0, predicted(f.state.pose, f.earlier, seconds / span, reach))
-    end = tracked(query, starts[0], least)
+        starts.insert(0, predict(f.state.pose, f.earlier, seconds / span, reach))
+    end = track(query, starts[0], least)
     if end.score < least:
-        end = max([end, *(tracked(query, start, least) for start in starts[1:])], key=lambda h: h.score)
+        end = max([end, *(track(query, start, least) for start in starts[1:])], key=lambda h: h.score)
     is_usual = end.score >= USUAL * f.state.score and motion.max_speed * abs(seconds) < SHORT
-    return end if is_usual or end.score < least else tracked_on(query, end)
+    return end if is_usual or end.score < least else track_on(query, end)
 
 
-def predicted(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
+def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
     """Predict a camera's pose at constant velocity from an earlier pose and the last.
 
     `ratio` is the time since, divided by the time between the two. At most max_distance [m] away.
@@ -248,7 +250,7 @@ def predicted(before: Pose, earlier: Pose, ratio: float, max_distance: float) ->
     return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
 
 
-def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
+def track(query: Query, start: Pose, least_score: float) -> Hypothesis:
     """Descend from a predicted pose; perturb it if the end has less than the least score."""
     near = descend_fine(query, descend_middle(query, start).pose)
     if near.score < least_score:
@@ -260,7 +262,7 @@ def tracked(query: Query, start: Pose, least_score: float) -> Hypothesis:
     return max(end, score_pose(query, near.pose), key=lambda h: h.score)
 
 
-def tracked_on(query: Query, end: Hypothesis) -> Hypothesis:
+def track_on(query: Query, end: Hypothesis) -> Hypothesis:
     """Perturb a tracked pose and descend again; return the better of the two."""
     around = descend_last(query, descend_fine(query, perturb_middle(query, end.pose).pose).pose)
     return max(end, around, key=lambda h: h.score)
@@ -272,19 +274,19 @@ def descend_last(query: Query, pose: Pose) -> Hypothesis:
     return score_pose(query, pose)
 
 
-def found_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
+def find_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
     """Search by whole views within a radius [m]; return poses of at least a score."""
     x, y, z = (float(value) for value in query.scan_map.to_world(near).center_world)
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.sparse) == 0:
         return []
-    close = found_everywhere(replace(query, scan_map=some, cache=Cache(query.cache.views)), least_score)
+    close = find_everywhere(replace(query, scan_map=some, cache=Cache(query.cache.views)), least_score)
     least = KEPT_BESIDE * max((h.score for h in close), default=0.0)
-    ends = query.workers.map(lambda h: tracked(query, h.pose, least), close, "descend")
+    ends = query.workers.map(lambda h: track(query, h.pose, least), close, "descend")
     return [end for end in ends if end.score >= least]
 
 
-def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
+def find_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     """Search the whole map by whole views; return poses, copies too, to centimetres, best first.
 
     None if the best has less than the least score.
@@ -292,8 +294,8 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     first = brief_query(replace(query, num_halves=0))
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts = search_poses(first, gravity)
-    score = first_score(first, starts)
-    if score < least_score or score < MIRROR_RATIO * mirror_score(first):
+    score = score_starts(first, starts)
+    if score < least_score or score < MIRROR_RATIO * score_mirror(first):
         return []
     found = rank(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)
     if found.best.score < least_score:
@@ -302,13 +304,13 @@ def found_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
     return [h for h in (found.best, *found.alternatives) if h.score >= least]
 
 
-def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
+def make_states(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
     """Make states of a frame's poses, best first, with odds by whole views."""
-    ranked = suppressed(by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
+    ranked = suppress_near(sort_by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
     asked = replace(query, num_halves=0)
     best, *others = ranked
     covariance = estimate_covariance(query, best.pose)
-    standings = standings_of(asked, best, others)
+    standings = assess_poses(asked, best, others)
     *probabilities, none = posterior(standings, covariance)
     return [
         State(h.pose, log_ratio(float(p), float(none)), h.score, covariance if h is best else None)
@@ -316,7 +318,7 @@ def states_at(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
     ]
 
 
-def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
+def associate(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
     """Make a state of another pose of a frame, with its odds relative to the best state.
 
     None if the frame has it already, or if it is too much worse to be a copy.
@@ -325,7 +327,7 @@ def beside(query: Query, states: Sequence[State], found: Hypothesis) -> State | 
     if any(is_same(state.pose, found.pose) for state in states):
         return None
     asked, at_best = replace(query, num_halves=0), Hypothesis(best.pose, best.score)
-    first, second = posterior(standings_of(asked, at_best, [found]), None)[:2]
+    first, second = posterior(assess_poses(asked, at_best, [found]), None)[:2]
     odds = best.log_odds + log_ratio(float(second), float(first))
     if odds < best.log_odds - OTHER_LOG_ODDS:
         return None

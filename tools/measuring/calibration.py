@@ -23,8 +23,8 @@ from piccolo.confidence.confidence import (
     ChoiceModel,
     Standing,
     classify,
-    features_of,
-    none_features_of,
+    none_features,
+    pose_features,
     posterior,
 )
 from piccolo.confidence.covariance import PoseCovariance
@@ -69,7 +69,7 @@ def pose_error(pose: Pose, true_pose: Pose) -> Array:
     return np.concatenate([turn, true_pose.center_world - pose.center_world])
 
 
-def outcome_of(line: str) -> Outcome | None:
+def read_outcome(line: str) -> Outcome | None:
     """Read a line of tools/benchmark.py confidence; None if it has no pose or no probabilities."""
     trial = json.loads(line)
     result = Result.from_json(json.dumps(trial["result"]))
@@ -93,8 +93,8 @@ def outcome_of(line: str) -> Outcome | None:
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
     """Return the weights of the greatest penalised likelihood."""
-    poses = [np.array([features_of(s) for s in o.standings]) for o in outcomes]
-    nones = np.array([none_features_of(o.covariance) for o in outcomes])
+    poses = [np.array([pose_features(s) for s in o.standings]) for o in outcomes]
+    nones = np.array([none_features(o.covariance) for o in outcomes])
     deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
 
     def loss(w: Array) -> tuple[float, Array]:
@@ -174,7 +174,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     def read(paths: Sequence[Path]) -> list[Outcome]:
         wanted = "wanted a file of tools/benchmark.py confidence"
-        found = [o for path in paths for o in parse_lines(path, read_bytes(path, wanted), outcome_of)]
+        found = [o for path in paths for o in parse_lines(path, read_bytes(path, wanted), read_outcome)]
         return [o for o in found if o is not None and o.case not in arguments.without]
 
     learnt = read(arguments.fit)

@@ -59,7 +59,7 @@ class Trial(NamedTuple):
     is_masked: NDArray[np.bool_] | None = None  # (H, W) what the photo does not show
 
 
-def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
+def occlude(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
     """Hide a fraction of the sphere of a photo (H, W, 3) behind round pieces of another."""
     height, width = rgb.shape[:2]
     rays = pixel_rays(width)
@@ -76,7 +76,7 @@ def occluded(rgb: Image, other: Image, fraction: float, rng: np.random.Generator
     return shown
 
 
-def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
+def light_unevenly(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
     """Put a photo (H, W, 3) under patches of light that differ by some stops."""
     noise = blur(rng.normal(size=rgb.shape[:2])[..., None], 0.08 * rgb.shape[1])
     gain = 2.0 ** (0.5 * stops * noise / noise.std())
@@ -84,7 +84,7 @@ def unevenly_lit(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
     return np.asarray(255.0 * linear.clip(0.0, 1.0) ** (1.0 / 2.2), np.uint8)
 
 
-def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
+def mask_outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
     """Return the mask (H, W) of a sphere outside a level pinhole photo that looks along azimuth `yaw`."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
     forward = math.cos(yaw) * x + math.sin(yaw) * y
@@ -93,7 +93,7 @@ def outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
     return np.asarray((forward <= 0.0) | (np.abs(left) > reach) | (np.abs(z) > ASPECT * reach))
 
 
-def without_texture(world: World) -> World:
+def remove_texture(world: World) -> World:
     """Return the rooms with every surface in one colour."""
     plain = [(room, room.materials.copy()) for room in world.rooms]
     for _, materials in plain:
@@ -101,15 +101,15 @@ def without_texture(world: World) -> World:
     return world._replace(rooms=tuple(room._replace(materials=m) for room, m in plain))
 
 
-def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
+def damage_trial(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
     """Yield a photo half hidden, in uneven light, narrow, and mirrored."""
     for fraction in (0.2, 0.4, 0.6):
-        hidden = occluded(trial.rgb, other, fraction, rng)
+        hidden = occlude(trial.rgb, other, fraction, rng)
         yield trial._replace(case=f"{trial.case}, hidden {fraction:.0%}", rgb=hidden)
-    lit = occluded(unevenly_lit(trial.rgb, 2.0, rng), other, 0.3, rng)
+    lit = occlude(light_unevenly(trial.rgb, 2.0, rng), other, 0.3, rng)
     yield trial._replace(case=f"{trial.case}, uneven light, hidden 30%", rgb=lit)
     for fov_deg in (120.0, 90.0, 65.0):
-        outside = outside_field(trial.rgb.shape[1], fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
+        outside = mask_outside_field(trial.rgb.shape[1], fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
         for gravity in ("known", "unknown"):
             case = f"{trial.case}, {fov_deg:.0f} deg, gravity {gravity}"
             yield Trial(case, trial.rgb, trial.true_pose, gravity, outside)
@@ -117,18 +117,18 @@ def damaged(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Tr
     yield Trial(f"{trial.case}, mirrored", mirrored, None, "unknown")
 
 
-def without_scene(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
+def make_sceneless(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
     """Yield images that show no place, and the photo blurred, which keeps its true pose."""
     rgb = trial.rgb
     yield Trial("black", np.zeros_like(rgb), None)
     yield Trial("white", np.full_like(rgb, 255), None)
     yield Trial("noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8), None)
-    yield Trial("cloudy", fractal_noise(rgb.shape, rng), None)
+    yield Trial("cloudy", draw_fractal_noise(rgb.shape, rng), None)
     blurred = np.asarray(blur(rgb.astype(float), 0.02 * rgb.shape[1]), np.uint8)
     yield Trial("blurred", blurred, trial.true_pose)
 
 
-def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
+def draw_fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
     """Draw smooth noise of several scales (H, W, 3), with the contrast of a photo."""
     total = np.zeros(shape)
     for scale in (0.004, 0.015, 0.06):
@@ -137,7 +137,7 @@ def fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
     return np.asarray((127.0 + 40.0 * total).clip(0, 255), np.uint8)
 
 
-def upside_down(trial: Trial) -> Trial:
+def turn_over(trial: Trial) -> Trial:
     """Turn the camera over, and search for it as if it were upright."""
     pose = trial.true_pose
     if pose is not None:
@@ -145,14 +145,14 @@ def upside_down(trial: Trial) -> Trial:
     return Trial("upside down", np.ascontiguousarray(trial.rgb[::-1, ::-1]), pose, "known")
 
 
-def thinned(points: Points, rng: np.random.Generator) -> Points:
+def thin_points(points: Points, rng: np.random.Generator) -> Points:
     """Draw one of twenty points, in order."""
     count = len(points[0])
     chosen = np.sort(rng.choice(count, int(0.05 * count), replace=False))
     return points[0][chosen], points[1][chosen]
 
 
-def random_size(rng: np.random.Generator) -> NDArray[np.float64]:
+def draw_size(rng: np.random.Generator) -> NDArray[np.float64]:
     """Draw the size (3,) of a room [m], from a box room to a hall."""
     return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
 
@@ -160,24 +160,24 @@ def random_size(rng: np.random.Generator) -> NDArray[np.float64]:
 def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
     """Yield clouds of one to three rooms, whole, thinned and cut down, each with its trials."""
     rng = np.random.default_rng([seed, 50])
-    size = random_size(rng)
+    size = draw_size(rng)
     world = make_world(seed, size, int(rng.integers(1, 4)))
     other = make_world(seed + 100_000, size, 1)  # of the same shape
     if seed % 3 == 2:  # a third of the rooms
-        world = without_texture(world)
-        other = without_texture(other)
+        world = remove_texture(world)
+        other = remove_texture(other)
     cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
-    right = [_trial(world, variant, variant, workers) for variant in VARIANTS]
-    elsewhere = [_trial(other, "elsewhere", variant, workers) for variant in ("clean", "photo")]
+    right = [_make_trial(world, variant, variant, workers) for variant in VARIANTS]
+    elsewhere = [_make_trial(other, "elsewhere", variant, workers) for variant in ("clean", "photo")]
     trials = [*right, *(trial._replace(true_pose=None) for trial in elsewhere)]
-    trials += without_scene(right[0], rng)
-    trials.append(upside_down(right[0]))
-    another = _trial(other, "another place", "clean", workers, 1)._replace(true_pose=None)
+    trials += make_sceneless(right[0], rng)
+    trials.append(turn_over(right[0]))
+    another = _make_trial(other, "another place", "clean", workers, 1)._replace(true_pose=None)
     for trial in (right[0], another):
-        trials += damaged(trial, _trial(other, "", "clean", workers, 2).rgb, rng)
+        trials += damage_trial(trial, _make_trial(other, "", "clean", workers, 2).rgb, rng)
     yield cloud, trials
     thin = [right[0]._replace(case="sparse"), trials[4]._replace(case="sparse, elsewhere")]
-    yield thinned(cloud, rng), thin
+    yield thin_points(cloud, rng), thin
     wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + 0.15)
     yield (cloud[0][wall], cloud[1][wall]), [r._replace(case="one wall") for r in right[:2]]
 
@@ -186,9 +186,9 @@ def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[
     """Yield a place of each kind that looks the same from several positions, with its trials."""
     rng = np.random.default_rng([seed, 51])
     for kind in REPEATED_KINDS:
-        world = World(seed, make_repeated(kind, seed, random_size(rng)))
+        world = World(seed, make_repeated(kind, seed, draw_size(rng)))
         cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
-        yield cloud, [_trial(world, kind, "clean", workers, index) for index in range(2)]
+        yield cloud, [_make_trial(world, kind, "clean", workers, index) for index in range(2)]
 
 
 def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
@@ -200,14 +200,16 @@ def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[
             world = World(seed, make_alike(kind, seed, changed))
             cloud = scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
             case = f"{kind}, {changed:.0%} changed"
-            trials = [_trial(world, case, "clean", workers, index) for index in range(4)]
-            another = _trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)._replace(true_pose=None)
-            hidden = occluded(trials[0].rgb, another.rgb, 0.3, rng)
+            trials = [_make_trial(world, case, "clean", workers, index) for index in range(4)]
+            another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)._replace(
+                true_pose=None
+            )
+            hidden = occlude(trials[0].rgb, another.rgb, 0.3, rng)
             trials += [trials[0]._replace(case=f"{case}, hidden 30%", rgb=hidden), another]
             yield cloud, trials
 
 
-def _trial(world: World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
+def _make_trial(world: World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
     query = make_query(world, index, variant, WIDTH, workers)
     return Trial(case, query.rgb, query.pose)
 
@@ -218,12 +220,12 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points
     rng = np.random.default_rng([len(scene.queries), 52])
     own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
     upright = [trial for trial in own if trial.case == "clean"]
-    spoilt = [spoilt for trial in upright[:2] for spoilt in without_scene(trial, rng)]
+    spoilt = [spoilt for trial in upright[:2] for spoilt in make_sceneless(trial, rng)]
     foreign = [query.image for other in others for query in other.queries]
     elsewhere = [Trial("elsewhere", read_panorama(image).rgb, None) for image in foreign]
     points = (cloud.points + cloud.origin_world, cloud.colors)
-    yield points, [*own, *elsewhere, *spoilt, *map(upside_down, upright)]
-    yield thinned(points, rng), [trial._replace(case="sparse") for trial in upright]
+    yield points, [*own, *elsewhere, *spoilt, *map(turn_over, upright)]
+    yield thin_points(points, rng), [trial._replace(case="sparse") for trial in upright]
 
 
 def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:

@@ -15,7 +15,7 @@ from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import pixels_of
 from piccolo.scenes.synthetic.world import blur
 
-from .confidence import Image, Points, occluded, outside_field, thinned, unevenly_lit
+from .confidence import Image, Points, light_unevenly, mask_outside_field, occlude, thin_points
 
 PHOTO_SIZE = (1024, 768)  # [px]
 PHOTO_FOV_DEG = 70.0
@@ -56,16 +56,16 @@ def damage_panorama(rgb: Image, other: Image, rng: np.random.Generator) -> Itera
     other = np.asarray(cv2.resize(other, (width, height)), np.uint8)
     yield Damaged("as taken", rgb)
     for fraction in (0.2, 0.4, 0.6):
-        yield Damaged(f"{fraction:.0%} hidden by objects", occluded(rgb, other, fraction, rng))
-    lit = unevenly_lit(rgb, 2.0, rng)
-    yield Damaged("uneven light (2 stops), 30% hidden", occluded(lit, other, 0.3, rng))
+        yield Damaged(f"{fraction:.0%} hidden by objects", occlude(rgb, other, fraction, rng))
+    lit = light_unevenly(rgb, 2.0, rng)
+    yield Damaged("uneven light (2 stops), 30% hidden", occlude(lit, other, 0.3, rng))
     yield Damaged("night", take_at_night(rgb, rng))
     yield Damaged(f"noise and JPEG quality {JPEG_QUALITY}", compress_noisy(rgb, rng))
     blurred = np.asarray(blur(rgb.astype(float), width / 360.0), np.uint8)
     yield Damaged("blurred by 1 deg (one sigma)", blurred)
     small = cv2.resize(rgb, (256, 128), interpolation=cv2.INTER_AREA)
     yield Damaged("256 x 128 pixels", np.asarray(small, np.uint8))
-    is_outside = outside_field(width, 90.0, float(rng.uniform(0.0, 2.0 * np.pi)))
+    is_outside = mask_outside_field(width, 90.0, float(rng.uniform(0.0, 2.0 * np.pi)))
     yield Damaged("masked outside of 90 x 74 deg", rgb, is_masked=is_outside)
     is_behind = np.broadcast_to(np.abs(np.arange(width) - width // 2) >= width // 4, (height, width))
     yield Damaged("half of the sphere masked", rgb, is_masked=is_behind)
@@ -79,7 +79,7 @@ def add_point_noise(points: Points, rng: np.random.Generator) -> Points:
 
 
 DAMAGED_SCANS: dict[str, Callable[[Points, np.random.Generator], Points]] = {
-    "scan thinned to 5%": thinned,
+    "scan thinned to 5%": thin_points,
     "scan with 5 cm noise": add_point_noise,
 }
 

@@ -5,7 +5,7 @@ from collections.abc import Iterable, Iterator, Sequence
 import numpy as np
 
 from piccolo.geometry.pose import Array
-from piccolo.scenes.synthetic.office import CORRIDOR_WIDTH, placed
+from piccolo.scenes.synthetic.office import CORRIDOR_WIDTH, place
 from piccolo.scenes.synthetic.room import (
     CHECKS,
     PICTURE,
@@ -38,7 +38,7 @@ def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
     """Make rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
     if kind == "twins":
         room = make_room(seed, size, np.zeros(3))
-        return room, placed(room, np.array([room.size[0] + GAP, 0.0, 0.0]), is_turned=False)
+        return room, place(room, np.array([room.size[0] + GAP, 0.0, 0.0]), is_turned=False)
     return (symmetric_hall(seed, size) if kind == "hall" else corridor(seed, float(size[2])),)
 
 
@@ -53,7 +53,7 @@ def symmetric_hall(seed: int, size: Array) -> Room:
     is_kept = boxes[:, 0] < 0.5 * x
     half = room._replace(boxes=boxes[is_kept])
     return room._replace(
-        boxes=np.vstack([half.boxes, placed(half, np.zeros(3), is_turned=True).boxes]),
+        boxes=np.vstack([half.boxes, place(half, np.zeros(3), is_turned=True).boxes]),
         materials=np.tile(room.materials[is_kept], (2, 1)),
         light=np.array([0.5 * x, 0.5 * y, room.light[2]]),
         labels=np.tile(room.labels[is_kept], 2),

@@ -21,11 +21,11 @@ from .e57_file import (
     child,
     children,
     number_of,
-    opened,
-    parsed_integer,
+    open_file,
+    parse_integer,
     pose_of,
+    read_scaled,
     refusing,
-    scaled,
     text_of,
 )
 from .reader import CHUNK, OPTION, CloudFormat, PointSource, RawCloud, intensity_reader
@@ -74,7 +74,7 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     range is the scan's colorLimits, or else what the field's declaration says; it is never guessed. Scans
     without colours beside others are left out, with a warning.
     """
-    with opened(path) as file:
+    with open_file(path) as file:
         scans, left_out = _scans(file, COLORS)
         measured, not_measured = ([], []) if scans else _scans(file, (INTENSITY,))
     if not scans and not (measured and options.intensity_as_gray):
@@ -113,7 +113,7 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
     prototype = child(points, "prototype")
     if points is None or prototype is None or points.get("type") != "CompressedVector":
         raise _UnusableError("has no points")
-    num_points = parsed_integer(file.path, points.get("recordCount", "0"))
+    num_points = parse_integer(file.path, points.get("recordCount", "0"))
     if num_points <= 0:
         raise _UnusableError(f"has {num_points} points")
     fields = {field.tag.removeprefix(NAMESPACE): field for field in prototype}
@@ -141,8 +141,8 @@ def _num_bits(path: Path, field: Element) -> int:
     if type_ == "Float":
         return 32 if field.get("precision") == "single" else 64
     if type_ in ("Integer", "ScaledInteger"):
-        low = parsed_integer(path, field.get("minimum", str(-(1 << 63))))
-        high = parsed_integer(path, field.get("maximum", str((1 << 63) - 1)))
+        low = parse_integer(path, field.get("minimum", str(-(1 << 63))))
+        high = parse_integer(path, field.get("maximum", str((1 << 63) - 1)))
         return max(high - low, 0).bit_length()
     return 0
 
@@ -157,7 +157,7 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     declared = [field.get(end) for end in ("minimum", "maximum")]
     if None in declared:
         raise _UnusableError(f"has colours without a range: neither colorLimits nor a declared {name}")
-    first, last = (scaled(path, field, text or "") for text in declared)
+    first, last = (read_scaled(path, field, text or "") for text in declared)
     if not first < last:
         raise _UnusableError(f"has colours without a range: {name} is declared {first:g} to {last:g}")
     return first, last
@@ -179,7 +179,7 @@ def _read_colored(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
 
 def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Array]]:
     """Yield the points that count (N, 3), in the world, of each scan, and its channels (N, C)."""
-    with opened(path) as file:
+    with open_file(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
                 is_valid = np.ones(len(columns[scan.channels[0]]), dtype=np.bool_)
@@ -238,13 +238,13 @@ class E57Image(NamedTuple):
 
 def list_images(path: Path) -> list[E57Image]:
     """Return the images of an E57 file, in its order."""
-    with opened(path) as file:
+    with open_file(path) as file:
         return list(_images(file))
 
 
 def read_image(path: Path, index: int) -> bytes:
     """Return the JPEG or PNG file that is the image of that index in list_images."""
-    with opened(path) as file:
+    with open_file(path) as file:
         image = list(_images(file))[index]
         number, representation, blob = image.node
         with refusing(path, file.libe57):
@@ -263,7 +263,7 @@ def _images(file: E57File) -> Iterator[E57Image]:
             blob = child(representation, f"{encoding}Image")
             if representation is None or blob is None or blob.get("type") != "Blob":
                 continue
-            size = parsed_integer(file.path, blob.get("length", ""))
+            size = parse_integer(file.path, blob.get("length", ""))
             if not 0 < size <= file.size:  # libE57 reserves it
                 found = f"promises {size} bytes, found a file of {file.size} bytes"
                 raise InputError(f"{file.path}: image {number} {found}; it is broken")

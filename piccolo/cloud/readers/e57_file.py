@@ -19,7 +19,7 @@ import numpy as np
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotation_from_quaternion_wxyz
 from ...optional import import_optional
-from .reader import quoted
+from .reader import quote_line
 
 MAGIC = b"ASTM-E57"
 HEADER = struct.Struct("<8sIIQQQQ")  # magic, major, minor, file size, XML offset, XML size, page size
@@ -47,7 +47,7 @@ class E57File(NamedTuple):
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[E57File]:
+def open_file(path: Path) -> Iterator[E57File]:
     """Yield an E57 file whose header and XML were checked, open to be read."""
     root = read_xml(path)
     libe57 = import_optional(path, "pye57.libe57")
@@ -65,7 +65,7 @@ def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
     try:
         yield
     except (libe57.E57Exception, RuntimeError, UnicodeDecodeError) as error:  # the last in its own message
-        raise InputError(f"{path}: broken E57 file ({quoted(str(error).encode())})") from error
+        raise InputError(f"{path}: broken E57 file ({quote_line(str(error).encode())})") from error
 
 
 def read_xml(path: Path) -> Element:
@@ -88,7 +88,7 @@ def read_xml(path: Path) -> Element:
         file.seek(offset - offset % PAGE_SIZE)
         pages = file.read(num_bytes)
     content = b"".join(pages[k : k + PAGE_CONTENT] for k in range(0, len(pages), PAGE_SIZE))
-    return _parsed(path, content[offset % PAGE_SIZE :][:length])
+    return _parse_xml(path, content[offset % PAGE_SIZE :][:length])
 
 
 class _Limited(TreeBuilder):
@@ -122,13 +122,13 @@ class _Limited(TreeBuilder):
         raise ValueError("a document type definition")
 
 
-def _parsed(path: Path, xml: bytes) -> Element:
+def _parse_xml(path: Path, xml: bytes) -> Element:
     parser = XMLParser(target=_Limited())
     try:
         parser.feed(xml.rstrip(b"\0"))
         root = parser.close()
     except (ParseError, ValueError, LookupError) as error:
-        raise InputError(f"{path}: the XML section is broken ({quoted(str(error).encode())})") from error
+        raise InputError(f"{path}: the XML section is broken ({quote_line(str(error).encode())})") from error
     if not isinstance(root, Element) or root.tag != f"{NAMESPACE}e57Root":
         raise InputError(f"{path}: the XML section has no element e57Root of E57 1.0")
     return root
@@ -156,33 +156,35 @@ def number_of(path: Path, element: Element | None) -> float | None:
 
     An empty one is 0, a scaled integer is scaled.
     """
-    return None if element is None else scaled(path, element, (element.text or "").strip() or "0")
+    return None if element is None else read_scaled(path, element, (element.text or "").strip() or "0")
 
 
-def scaled(path: Path, element: Element, text: str) -> float:
+def read_scaled(path: Path, element: Element, text: str) -> float:
     """Return the number that a text means in an element, which may be a scaled integer's."""
-    value = parsed_number(path, text)
+    value = parse_number(path, text)
     if element.get("type") != "ScaledInteger":
         return value
-    scale, offset = (parsed_number(path, element.get(*part)) for part in (("scale", "1"), ("offset", "0")))
+    scale, offset = (parse_number(path, element.get(*part)) for part in (("scale", "1"), ("offset", "0")))
     return value * scale + offset
 
 
-def parsed_number(path: Path, text: str) -> float:
+def parse_number(path: Path, text: str) -> float:
     """Return a finite number; InputError if the text is none."""
     try:
         value = float(text)
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(f"{path}: found {quoted(text.encode())} in the XML section, wanted a finite number")
+        raise InputError(
+            f"{path}: found {quote_line(text.encode())} in the XML section, wanted a finite number"
+        )
     return value
 
 
-def parsed_integer(path: Path, text: str) -> int:
+def parse_integer(path: Path, text: str) -> int:
     """Return an integer of 64 bits or little more; InputError if the text is none."""
     if not INTEGER.fullmatch(text):
-        raise InputError(f"{path}: found {quoted(text.encode())} in the XML section, wanted an integer")
+        raise InputError(f"{path}: found {quote_line(text.encode())} in the XML section, wanted an integer")
     return int(text)
 
 

@@ -28,7 +28,7 @@ from .reader import (
     RawCloud,
     intensity_reader,
     label_reader,
-    quoted,
+    quote_line,
 )
 
 MAGIC = b"LASF"
@@ -164,7 +164,7 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
         if not vlr.uses_variable_size_chunks():
             entries = [(vlr.chunk_size(), size) for _, size in entries]
     offset = header.points_offset + OFFSET_SIZE
-    return LasLayout(offset, _checked_chunks(header, entries, table_offset - offset), laszip, num_layers)
+    return LasLayout(offset, _check_chunks(header, entries, table_offset - offset), laszip, num_layers)
 
 
 def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
@@ -220,7 +220,7 @@ def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
     return offset, file.read(MAX_ENTRY_SIZE * (num_chunks + 32))
 
 
-def _checked_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
+def _check_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
     """Return the chunks that hold the promised points, the last no more than is left."""
     chunks: list[LazChunk] = []
     num_left = header.num_points
@@ -282,7 +282,7 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
     except BaseException as error:  # a panic in Rust: no Exception, and of a class that can't be imported
         if not isinstance(error, lazrs.LazrsError) and type(error).__name__ != "PanicException":
             raise
-        why = quoted(str(error).encode())
+        why = quote_line(str(error).encode())
         raise InputError(f"{path}: the compressed points are broken ({why})") from error
 
 
@@ -305,7 +305,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields"
     return PointSource(
         path,
-        lambda: (_colored(header, records, is_8_bit) for records in _chunks(header, layout)),
+        lambda: (_read_colors(header, records, is_8_bit) for records in _chunks(header, layout)),
         header.num_points,
         (f"{note} (largest value {brightest} in {num_samples} points looked at)",) if is_8_bit else (),
     )
@@ -385,7 +385,7 @@ def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], R
         return records["xyz"] * header.scales + header.offsets, records
 
 
-def _colored(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
+def _read_colors(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
     points_world, records = _points(header, records)
     rgb = records["rgb"]
     if not is_8_bit:

@@ -265,13 +265,13 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     if texture is not None:
         if uv is None:
             return Surface(vertices, triangles)  # the material's colour would only be multiplied
-        uv = _checked_uv(loaded.path, uv, vertices)
+        uv = _check_uv(loaded.path, uv, vertices)
         return Surface(vertices, triangles, uv, texture)
     colors, corners = _colors(loaded.path, mesh, triangles)
     return Surface(vertices, triangles, colors=colors, corners=corners)
 
 
-def _checked_uv(path: Path, raw: Any, vertices: Array) -> Array:
+def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
     """Texture coordinates (V, 2); vertices without finite ones become NaN."""
     uv: Array = np.array(raw, dtype=np.float64)
     if uv.shape != (len(vertices), 2):
@@ -293,7 +293,7 @@ def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray
     raw = visual.vertex_attributes.get("color")
     if raw is None and material is NO_MATERIAL:
         return Surface(vertices, triangles)
-    uv = None if texture is None else _checked_uv(path, visual.uv, vertices)
+    uv = None if texture is None else _check_uv(path, visual.uv, vertices)
     factor = np.array([material.factor])
     if raw is not None:
         colors = _fractions(path, raw, len(vertices)) * factor

@@ -24,10 +24,10 @@ from .reader import (
     CloudFormat,
     PointSource,
     brightest_of,
-    colored_chunks,
+    color_chunks,
     in_chunks,
     point_label,
-    quoted,
+    quote_line,
     read_records,
 )
 
@@ -53,7 +53,7 @@ class ArrayInFile(NamedTuple):
     offset: int  # [byte] of the first number
 
     def __str__(self) -> str:
-        return f"an array {self.shape} of type {quoted(str(self.dtype).encode())}"
+        return f"an array {self.shape} of type {quote_line(str(self.dtype).encode())}"
 
     def read_rows(self) -> Iterator[NDArray[Any]]:
         """Yield the rows (N, C) in chunks."""
@@ -95,7 +95,7 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
     """Return the points of chunks of positions and colours, as many as there are `rows`."""
     locate = partial(point_label, path)
-    return PointSource(path, lambda: colored_chunks(read_parts(), brightest, locate), rows.shape[0])
+    return PointSource(path, lambda: color_chunks(read_parts(), brightest, locate), rows.shape[0])
 
 
 def has_npz_magic(head: bytes) -> bool:
@@ -114,7 +114,7 @@ def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
     except Exception as error:
         if isinstance(error, OSError) and error.errno != errno.EINVAL:
             raise  # the disk's or the user's trouble; EINVAL is zipfile going to a place before the beginning
-        raise InputError(f"{path}: damaged ({quoted(str(error).encode())}), {wanted}") from error
+        raise InputError(f"{path}: damaged ({quote_line(str(error).encode())}), {wanted}") from error
 
 
 def _open(path: Path, member: str | None) -> IO[bytes]:
@@ -131,12 +131,12 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     names = [name for names in (POINTS_NAMES, COLORS_NAMES) for name in names if name in members]
     if [name in COLORS_NAMES for name in names] != [False, True]:
-        listed = quoted(" ".join(list(members)[:12]).encode())
+        listed = quote_line(" ".join(list(members)[:12]).encode())
         raise InputError(f"{path}: the arrays are {listed}, {WANTED}")
     infos = [members[name] for name in names]
     for info in infos:
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:
-            name = quoted(info.filename.encode())
+            name = quote_line(info.filename.encode())
             raise InputError(f"{path}: {name} is encrypted or compressed in another way than by NumPy")
     size = sum(info.file_size for info in infos)
     most = min(MAX_RATIO * path.stat().st_size, MAX_UNPACKED)

@@ -28,7 +28,7 @@ from .reader import (
     in_chunks,
     point_label,
     points_of,
-    quoted,
+    quote_line,
     read_records,
     take_records,
 )
@@ -108,7 +108,7 @@ def read_header(path: Path) -> PcdHeader:
         raise InputError(f"{path}: the header has no lines FIELDS and DATA, {WANTED}")
     encoding = " ".join(entries["DATA"])
     if encoding not in ENCODINGS:
-        raise InputError(f"{path}: DATA is {quoted(encoding.encode())}, wanted {', '.join(ENCODINGS)}")
+        raise InputError(f"{path}: DATA is {quote_line(encoding.encode())}, wanted {', '.join(ENCODINGS)}")
     fields = _fields(path, entries)
     return PcdHeader(path, fields, _num_points(path, entries), encoding, min(size, len(head)))
 
@@ -125,7 +125,7 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
     for name, size, type_, text in zip(names, sizes, types, counts, strict=True):
         count = _count(text)
         if size not in ("1", "2", "4", "8") or type_ not in ("I", "U", "F") or not count:
-            found = quoted(f"{name} {size} {type_} {text}".encode())
+            found = quote_line(f"{name} {size} {type_} {text}".encode())
             wanted = "wanted SIZE 1 2 4 or 8, TYPE I U or F, COUNT 1 or more"
             raise InputError(f"{path}: a field has the name, SIZE, TYPE and COUNT {found}, {wanted}")
         fields.append(PcdField(name, type_.lower() + size, count, offset, column))
@@ -142,7 +142,7 @@ def _num_points(path: Path, entries: dict[str, list[str]]) -> int:
     counts = {key: _count(" ".join(words)) for key, words in found.items()}
     if None in counts.values() or not counts.keys() & {"POINTS", "WIDTH"}:
         words = " ".join(f"{key} {' '.join(words)}" for key, words in found.items())
-        raise InputError(f"{path}: the header counts the points by {quoted(words.encode())}, {WANTED}")
+        raise InputError(f"{path}: the header counts the points by {quote_line(words.encode())}, {WANTED}")
     num_cells = (counts.get("WIDTH") or 0) * (counts.get("HEIGHT", 1) or 0)
     num_points = counts.get("POINTS", num_cells) or 0
     if "WIDTH" in counts and num_cells != num_points:
@@ -192,7 +192,7 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     binary file is compared with the header before memory is reserved.
     """
     header = read_header(path)
-    fields = _wanted_fields(header, options)
+    fields = _select_fields(header, options)
     found = path.stat().st_size - header.size
     promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
     if promised > found:  # of ASCII and compressed data this is known when they are read
@@ -207,7 +207,7 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     return column_source(path, read_columns, types, header.num_points, options.labels)
 
 
-def _wanted_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
+def _select_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
     """Return fields x y z and the colour's one or three, or the intensity or label if the options say so."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
@@ -220,7 +220,7 @@ def _wanted_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField,
         wanted = WANTED
     if not more or not all(names.count(axis) == 1 and axis in found for axis in "xyz"):
         listed = " ".join(names[:12]) or "none"
-        raise InputError(f"{header.path}: the fields are {quoted(listed.encode())}, {wanted}")
+        raise InputError(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
     if more == (INTENSITY,):
         check_option(header.path, options, WANTED)
     fields = tuple(found[name] for name in (*"xyz", *more))

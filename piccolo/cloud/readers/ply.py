@@ -27,7 +27,7 @@ from .reader import (
     check_option,
     color_names,
     column_source,
-    quoted,
+    quote_line,
     read_records,
 )
 from .text import LineLayout, NumberLines
@@ -120,12 +120,12 @@ def read_header(path: Path) -> PlyHeader:
     text = bytes(byte if byte < 128 else ord("?") for byte in text)  # comments in any language
     counts = [match.group(2) for match in ELEMENT_LINE.finditer(text)]
     if not all(count.isdigit() and len(count) <= MAX_COUNT_DIGITS for count in counts):
-        raise InputError(f"{path}: the header counts {quoted(b' '.join(counts))} elements, {WANTED}")
+        raise InputError(f"{path}: the header counts {quote_line(b' '.join(counts))} elements, {WANTED}")
     try:
         # counts of 0 let plyfile stop at the header's end
         ply = PlyData.read(BytesIO(ELEMENT_LINE.sub(rb"\g<1>0", text)), mmap=False)
     except (PlyParseError, ValueError) as error:
-        raise InputError(f"{path}: broken header ({quoted(str(error).encode())}), {WANTED}") from error
+        raise InputError(f"{path}: broken header ({quote_line(str(error).encode())}), {WANTED}") from error
     if len(ply.elements) != len(counts):
         raise InputError(f"{path}: broken header (an element's line), {WANTED}")
     index = _vertex_index(path, ply.elements)

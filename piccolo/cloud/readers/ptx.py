@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import transform_points
 from ..settings import IN_METRES, CloudSettings
-from .reader import CloudFormat, PointSource, RawCloud, check_option, intensity_reader, quoted
+from .reader import CloudFormat, PointSource, RawCloud, check_option, intensity_reader, quote_line
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
@@ -91,7 +91,7 @@ def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
         found = _numbers(line or b"", num_wanted)
         if found is None:
             wanted = "a count" if num_wanted == 1 else f"{num_wanted} numbers"
-            place = f"{lines.locate(lines.num_taken - 1)} is {quoted(line or b'')}"
+            place = f"{lines.locate(lines.num_taken - 1)} is {quote_line(line or b'')}"
             raise InputError(f"{place}, wanted {wanted} of a scan's header, {WANTED}")
         numbers.append(found)
     matrix = np.array(numbers[-4:])

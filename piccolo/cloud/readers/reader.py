@@ -80,7 +80,7 @@ class CloudFormat(NamedTuple):
     has_labels: bool = False  # the reader knows them
 
 
-def quoted(line: bytes) -> str:
+def quote_line(line: bytes) -> str:
     """Return the first line of `line`, short and printable, control characters as escapes."""
     text = line.splitlines()[0] if line else b""
     return ascii(text[:60].decode("latin-1")) + ("..." if len(text) > 60 else "")
@@ -103,7 +103,7 @@ def brightest_of(path: Path, types: Sequence[str]) -> float:
     return BRIGHTEST[types[0]]
 
 
-def colored_chunks(
+def color_chunks(
     chunks: Iterable[tuple[NDArray[np.generic], NDArray[np.generic]]],
     brightest: float,
     locate: Callable[[int], str],
@@ -166,7 +166,7 @@ def column_source(
 ) -> PointSource:
     """Points with three colours of these types, as "u1", or with one scalar: a label, else the intensity."""
     if len(types) == 3:
-        read_chunks: ChunkReader = partial(_colored, path, read_columns, brightest_of(path, types))
+        read_chunks: ChunkReader = partial(_read_colored, path, read_columns, brightest_of(path, types))
     elif labels:
         read_chunks = label_reader(path, partial(_with_scalar, read_columns), labels)
     else:
@@ -174,9 +174,9 @@ def column_source(
     return PointSource(path, read_chunks, num_points)
 
 
-def _colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
+def _read_colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
     parts = ((np.stack(c[:3], axis=1), np.stack(c[3:], axis=1)) for c in read_columns())
-    return colored_chunks(parts, brightest, partial(point_label, path))
+    return color_chunks(parts, brightest, partial(point_label, path))
 
 
 def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:

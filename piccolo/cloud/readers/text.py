@@ -24,10 +24,10 @@ from .reader import (
     PointSource,
     RawCloud,
     check_option,
+    color_chunks,
     color_names,
-    colored_chunks,
     intensity_reader,
-    quoted,
+    quote_line,
 )
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
@@ -81,7 +81,7 @@ class NumberLines:
         self.layout = layout
         self.wanted = wanted
         self.num_taken = 0
-        self._kept = partial(_kept, has_counts=layout.has_counts)
+        self._kept = partial(_strip_blanks, has_counts=layout.has_counts)
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
 
     def peek(self) -> bytes | None:
@@ -148,16 +148,16 @@ class NumberLines:
         if len(self.layout.columns) == NUM_WITH_INTENSITY:
             return ((some[:, :3], some[:, 3]) for some in rows)
         parts = ((some[:, :3], some[:, 3:]) for some in rows)
-        chunks = colored_chunks(parts, BRIGHTEST["u1"], lambda index: self.locate(first + index))
+        chunks = color_chunks(parts, BRIGHTEST["u1"], lambda index: self.locate(first + index))
         return ((chunk.points_world, chunk.colors) for chunk in chunks)
 
     def locate(self, index: int) -> str:
         """Return the file and the number in it of the line that comes after `index` others."""
-        for number, _ in islice(self._numbered(), index, None):
+        for number, _ in islice(self._number_lines(), index, None):
             return f"{self.path}: line {number}"
         raise InputError(f"{self.path}: {CUT}")
 
-    def _numbered(self) -> Iterator[tuple[int, bytes]]:
+    def _number_lines(self) -> Iterator[tuple[int, bytes]]:
         """Yield number in the file and text of all lines of numbers, from the first on.
 
         The file is read again.
@@ -172,9 +172,9 @@ class NumberLines:
 
     def _complaint(self, otherwise: str) -> str:
         """Describe the first broken line behind those taken, or return `otherwise` if all seem right."""
-        for number, line in islice(self._numbered(), self.num_taken, None):
+        for number, line in islice(self._number_lines(), self.num_taken, None):
             if fault := self._fault(line):
-                return f"{self.path}: line {number}: {fault} ({quoted(line)}), {self.wanted}"
+                return f"{self.path}: line {number}: {fault} ({quote_line(line)}), {self.wanted}"
         return f"{self.path}: {otherwise}, {self.wanted}"
 
     def _fault(self, line: bytes) -> str:
@@ -187,10 +187,10 @@ class NumberLines:
             return f"{len(fields)} instead of {num_wanted} columns"
         parsed = [fields[column] for column in columns] if exact is None else fields
         broken = next((field for field in parsed if not is_number(field)), None)
-        return "" if broken is None else f"{quoted(broken.encode('latin-1'))} is not a number"
+        return "" if broken is None else f"{quote_line(broken.encode('latin-1'))} is not a number"
 
 
-def _kept(lines: list[bytes], has_counts: bool) -> list[bytes]:
+def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
     """Return the lines of numbers among all, without blanks at their ends."""
     return [
         line
@@ -245,7 +245,7 @@ def _layout(path: Path, head: bytes) -> LineLayout:
         fields = text.split(_delimiter(text))
         if _begins_numbers(line.strip(), fields):
             break
-        named = _named_columns(text) or named
+        named = _find_columns(text) or named
         if {*"xyz"} <= {*_names(text)}:
             header = text
         start += len(line)
@@ -253,11 +253,11 @@ def _layout(path: Path, head: bytes) -> LineLayout:
     else:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
     if not named and len(_names(header)) == len(fields):
-        raise InputError(f"{path}: the columns are {quoted(header.encode())}, {WANTED}")
+        raise InputError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
     has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
     columns = named or tuple(range(NUM_WITH_INTENSITY if has_intensity else 6))
     if len(fields) <= max(columns):
-        found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quoted(line)}"
+        found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quote_line(line)}"
         raise InputError(f"{path}: {found}, {WANTED}")
     return LineLayout(columns, start=start, delimiter=_delimiter(text))
 
@@ -278,7 +278,7 @@ def _names(header: str) -> list[str]:
     return [name.strip(' "').lower() for name in names.split(_delimiter(names))]
 
 
-def _named_columns(header: str) -> tuple[int, ...]:
+def _find_columns(header: str) -> tuple[int, ...]:
     """Return the fields of x, y, z and r, g, b, or of x, y, z and intensity, if a header line names them."""
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
@@ -304,7 +304,7 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         raise InputError(f"{path}: no line of numbers, {PTS_WANTED}")
     num_columns = len(line.split())
     if min(num_columns, 7) not in COLUMNS:
-        found = f"{num_columns} columns, no colours: {quoted(line)}"
+        found = f"{num_columns} columns, no colours: {quote_line(line)}"
         raise InputError(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
     layout = LineLayout(COLUMNS[min(num_columns, 7)], num_columns, has_counts=True)
     return line_source(path, layout, options, PTS_WANTED)

@@ -68,10 +68,10 @@ def _table(path: Path) -> list[dict[str, str]]:
         {key.strip(): value.strip() for key, value in row.items() if key and isinstance(value, str)}
         for row in rows
     ]
-    return [_renamed(row) if row.keys() >= OWN_QUATERNION else row for row in texts]
+    return [_rename_columns(row) if row.keys() >= OWN_QUATERNION else row for row in texts]
 
 
-def _renamed(row: dict[str, str]) -> dict[str, str]:
+def _rename_columns(row: dict[str, str]) -> dict[str, str]:
     """Return row of tools/export_poses.py as one of a list, its rotation inverted to go with the position."""
     inverse = {f"q{letter}": row[f"quaternion_{letter}"] for letter in "wxyz"}
     w = inverse["qw"]

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ...errors import InputError
 from ...files.json_file import read_json
 from ...geometry.pose import Array, Pose
-from .files import checked_pose, labels_by_index
+from .files import check_pose, labels_by_index
 from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
 
 NAME = "stanford2d3ds"
@@ -78,7 +78,7 @@ def list_scenes(options: ConvertOptions) -> SceneList:
 def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
     """Return the panoramas by area and room; 5a and 5b are both of area 5."""
     pictures: dict[tuple[str, str], list[Picture]] = defaultdict(list)
-    for rgb in _globbed(folder, PANORAMAS):
+    for rgb in _glob(folder, PANORAMAS):
         is_original = rgb.name == "rgb"
         area_folder = rgb.parents[1] if is_original else rgb
         match = AREA.match(area_folder.name)
@@ -95,7 +95,7 @@ def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
     return pictures
 
 
-def _globbed(folder: Path, patterns: Iterable[str]) -> list[Path]:
+def _glob(folder: Path, patterns: Iterable[str]) -> list[Path]:
     return [path for pattern in patterns for path in sorted(folder.glob(pattern))]
 
 
@@ -104,7 +104,7 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
 
     With labels the same, an object a file named by class.
     """
-    found = _globbed(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
+    found = _glob(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
     if found and not usable:
         text = f"found a cloud of the {ALIGNED}, whose rooms are turned one by one"
@@ -136,7 +136,7 @@ def _read_pose(picture: Picture) -> Pose:
     angles = _three(picture.pose, document, "final_camera_rotation")
     center_world = _three(picture.pose, document, "camera_location")
     R_world_from_opengl = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, x first
-    pose = checked_pose(str(picture.pose), R_world_from_opengl.T, center_world, "opengl")
+    pose = check_pose(str(picture.pose), R_world_from_opengl.T, center_world, "opengl")
     return AREA_5B.of_pose(pose) if picture.part == "5b" else pose
 
 
@@ -152,7 +152,7 @@ def _three(path: Path, document: Any, name: str) -> Array:
 
 def _read_table(options: ConvertOptions) -> NDArray[np.uint16]:
     """Return the class of each index in the semantic pictures."""
-    found = _globbed(options.folder, LABEL_FILES)
+    found = _glob(options.folder, LABEL_FILES)
     if not found:
         raise InputError(
             f"{options.folder}: found no {LABEL_FILES[1]}, wanted the names of the semantic indices"

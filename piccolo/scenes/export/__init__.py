@@ -8,7 +8,7 @@ from ...files.atomic import check_output, check_output_folder
 from ...result import Result
 from .formats import COLMAP, CSV, GEOJSON, GPX, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .gpano import GPANO
-from .posed_images import Format, LeftOut, Options, Selection, posed_images, select, true_results
+from .posed_images import Format, LeftOut, Options, Selection, select, select_images, true_results
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]
 
@@ -26,6 +26,6 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     (check_output_folder if form.is_folder else check_output)(out)
     if not results:
         raise InputError(f"{out}: there is no pose to write; `all` also writes those that are not localized")
-    images, left_out = posed_images(results, form, options)
+    images, left_out = select_images(results, form, options)
     form.write(images, out, options)
     return left_out

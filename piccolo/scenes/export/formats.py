@@ -24,7 +24,7 @@ from ...geometry.rotations import (
     OPTICAL_FROM_CAM,
     heading_pitch_roll_deg,
     translation,
-    turned,
+    turn_axes,
 )
 from ...optional import import_optional
 from .posed_images import NO_UTF8, Format, Options, PosedImage
@@ -105,7 +105,7 @@ def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
     """Return a comment and the rows of poses, each with the text of its time; `axes` as in CAMERA_AXES."""
     lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {axes}"]
     for time, pose in poses:
-        T = T_world_from_cam(turned(pose, CAMERA_AXES[axes]))
+        T = T_world_from_cam(turn_axes(pose, CAMERA_AXES[axes]))
         w, x, y, z = quaternion_wxyz(T[:3, :3])
         lines.append(f"{time} {numbers([*T[:3, 3], x, y, z, w])}")
     return lines
@@ -113,7 +113,7 @@ def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
 
 def write_kitti(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write the twelve numbers of a 3 x 4 matrix, world from camera, a row; the format has no comments."""
-    matrices = [T_world_from_cam(turned(image.pose, CAMERA_AXES[options.axes])) for image in images]
+    matrices = [T_world_from_cam(turn_axes(image.pose, CAMERA_AXES[options.axes])) for image in images]
     write_offset_beside(out, options)
     write_lines(out, [numbers(T[:3].ravel()) for T in matrices])
 
@@ -146,7 +146,7 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
     cameras = [f"{i} {text}" for text, i in camera_ids.items()]
     lines = []
     for i, (image, text) in enumerate(zip(images, texts, strict=True), 1):
-        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
         values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
         lines += [f"{i} {values} {camera_ids[text]} {image.name}", ""]  # a line of points follows
     offset = offset_comment(options)
@@ -183,7 +183,7 @@ def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) 
     frames = []
     for image in images:
         own = {} if is_one_size else _intrinsics(image.size)
-        matrix = T_world_from_cam(turned(image.pose, OPENGL_FROM_CAM)).tolist()
+        matrix = T_world_from_cam(turn_axes(image.pose, OPENGL_FROM_CAM)).tolist()
         frames.append({"file_path": image.name, **own, "transform_matrix": matrix})
     write_json(out, document | {"frames": frames})
 
@@ -206,7 +206,7 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
         width, height = image.size
         camera = f"spherical {width} {height}"
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
-        pose = turned(image.pose, OPTICAL_FROM_CAM)
+        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
         rotation = log_so3(pose.R_cam_from_world).tolist()
         shot = {"rotation": rotation, "translation": translation(pose).tolist(), "camera": camera}
         shots[image.name] = shot

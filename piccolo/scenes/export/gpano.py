@@ -16,7 +16,7 @@ from ...files.atomic import replacing_folder, write_atomically
 from ...files.json_file import read_bytes
 from ...geometry.rotations import DECIMALS, heading_pitch_roll_deg
 from ...panorama.gpano import CROP_FIELDS, NAMESPACE, PREFIX
-from ...panorama.picture import WANTED, opened
+from ...panorama.picture import WANTED, open_picture
 from .posed_images import Format, Options, PosedImage, check_size
 
 JPEG_MAGIC = b"\xff\xd8"
@@ -75,7 +75,7 @@ def with_pose(path: Path, data: bytes, angles_deg: tuple[float, float, float]) -
     segments = list(jpeg_segments(data)) if data.startswith(JPEG_MAGIC) else []
     if not segments or segments[-1].marker != SCAN:
         raise InputError(f"{path}: no JPEG, or a damaged one; XMP can be written into a whole JPEG only")
-    with opened(path, data) as image:
+    with open_picture(path, data) as image:
         size = image.size
     bodies = [data[begin + 4 : end] if marker == APP1 else b"" for marker, begin, end in segments]
     packets = [i for i, body in enumerate(bodies) if body.startswith(XMP_MARK)]

@@ -120,7 +120,7 @@ def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool 
     return Selection(tuple(chosen), dict(left_out))
 
 
-def posed_images(
+def select_images(
     results: Sequence[Result], form: Format, options: Options
 ) -> tuple[list[PosedImage], LeftOut]:
     """Pictures and poses by the names, times and offset that the options ask for, and what is left out.

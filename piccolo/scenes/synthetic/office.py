@@ -24,7 +24,7 @@ from .room import (
     Door,
     Room,
     RoomBuilder,
-    joined,
+    join_rooms,
     make_room,
     put_furniture,
     put_hangings,
@@ -169,11 +169,11 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
     }
     slots = plan.slots()
     rooms = [
-        placed(made[int(k)], plan.corner(slot), is_turned=slot[3])
+        place(made[int(k)], plan.corner(slot), is_turned=slot[3])
         for k, slot in zip(copies, slots, strict=True)
     ]
     others = [*corridors(seed, plan, twins > 0.0), *halls(seed, plan)]
-    whole = joined([*rooms, *others])
+    whole = join_rooms([*rooms, *others])
     parts = [part for other in others for part in _parts(other)]
     cells = tuple(whole._replace(corner=cell.corner, size=cell.size) for cell in (*rooms, *parts))
     levels = plan.height * np.arange(num_storeys, dtype=np.float64)
@@ -181,7 +181,7 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
     return Office(World(seed, cells), num_rooms, copies, levels, flights)
 
 
-def placed(room: Room, corner: Array, is_turned: bool) -> Room:
+def place(room: Room, corner: Array, is_turned: bool) -> Room:
     """A room whose corner is the origin, moved to `corner` (3,), turned by half a turn if asked."""
     sign = np.ones(3)
     shift = np.array(corner)

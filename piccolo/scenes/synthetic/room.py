@@ -269,7 +269,7 @@ def make_room(seed: int, size: Array, corner: Array, changed: int = 0, doors: Se
     return b.room(size, b.corner + size * [*shell_rng.uniform(0.35, 0.65, 2), 0.93])
 
 
-def joined(rooms: Sequence[Room]) -> Room:
+def join_rooms(rooms: Sequence[Room]) -> Room:
     """The first of some rooms with the boxes of all, each lit as in its own."""
     return rooms[0]._replace(
         boxes=np.concatenate([room.boxes for room in rooms]),

@@ -11,7 +11,7 @@ from ...errors import InputError
 from ...geometry.pose import Pose
 from ...jobs.threads import Workers
 from .office import Office
-from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, joined
+from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .walking import Walk
 from .world import make_query, make_world, other_light, photograph
 
@@ -78,7 +78,7 @@ def frames_of(
         else:
             present = [part for person in people if (part := person.at(time)) is not None]
             meanwhile = _exposures(walk, time) if options.is_blurred else []
-            room = joined([office.world.rooms[0], *present])
+            room = join_rooms([office.world.rooms[0], *present])
             rgb = photograph(room, pose, options.width, workers, meanwhile)
         if options.variant == "photo" and kind != "black":
             rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk

@@ -200,20 +200,20 @@ class Walker:
 
     def walk(self, length: float, rng: np.random.Generator) -> Walk:
         """A walk of so many metres through rooms at random."""
-        return timed(smooth_legs(self.floors, self._legs(length, rng), length), rng)
+        return time_legs(smooth_legs(self.floors, self._legs(length, rng), length), rng)
 
     def _legs(self, length: float, rng: np.random.Generator) -> list[Array]:
         """Ways (M, 3) from room to room until they are long enough."""
         legs: list[Array] = []
         done = 0.0
         number = int(rng.integers(self.office.num_rooms))
-        cell = int(rng.choice(self._reached(self.everywhere, number)))
+        cell = int(rng.choice(self._reach_cells(self.everywhere, number)))
         seen = {number}
         while done < length:
             reach = self.floors.reach(cell)
             number = self._next(reach, seen, rng)
             seen.add(number)
-            cell = int(rng.choice(self._reached(reach, number)))
+            cell = int(rng.choice(self._reach_cells(reach, number)))
             legs.append(self.floors.way(reach, cell))
             done += float(np.linalg.norm(np.diff(legs[-1], axis=0), axis=1).sum())
         return legs
@@ -227,7 +227,7 @@ class Walker:
         order = [unseen[k] for k in np.argsort(costs, kind="stable")]
         return int(rng.choice(order[:NUM_NEAR] if rng.random() < NEAR_FRACTION else order))
 
-    def _reached(self, reach: Reach, number: int) -> Cells:
+    def _reach_cells(self, reach: Reach, number: int) -> Cells:
         """The cells of a room that can be reached: at least those before its door."""
         cells = self.floors.cells_of_room(number)
         return cells[np.isfinite(reach.costs[cells])]
@@ -288,7 +288,7 @@ def speeds(leg: Array, pace: float) -> Array:
     return np.asarray(np.maximum(found, SLOWEST))
 
 
-def timed(legs: Sequence[Array], rng: np.random.Generator) -> Walk:
+def time_legs(legs: Sequence[Array], rng: np.random.Generator) -> Walk:
     """The legs at a person's speed, with a pause after each but the last."""
     pace = float(rng.uniform(*PACE))
     times = []
