@@ -51,7 +51,7 @@ def is_of_kind(value: object, kind: Any) -> bool:
     return isinstance(value, origin)
 
 
-def is_collection(value: object, origin: Any, parts: tuple[Any, ...]) -> bool:
+def is_collection(value: Any, origin: Any, parts: tuple[Any, ...]) -> bool:
     """Return whether a value is a collection as an annotation says; the items of an iterator are not read."""
     if isinstance(value, str | bytes):
         return False
