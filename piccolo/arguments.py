@@ -51,13 +51,17 @@ def is_of_kind(value: object, kind: Any) -> bool:
     return isinstance(value, origin)
 
 
-def is_collection(value: object, origin: Any, parts: tuple[Any, ...]) -> bool:
+def is_collection(value: Any, origin: Any, parts: tuple[Any, ...]) -> bool:
     """Return whether a value is a collection as an annotation says; the items of an iterator are not read."""
     if isinstance(value, str | bytes):
         return False
     if origin is tuple:
         is_row = isinstance(value, tuple | list) or (isinstance(value, np.ndarray) and value.ndim == 1)
-        return is_row and len(value) == len(parts) and all(map(is_of_kind, value, parts))
+        return (
+            is_row
+            and len(value) == len(parts)
+            and all(is_of_kind(v, p) for v, p in zip(value, parts, strict=True))
+        )
     if not isinstance(value, origin):
         return False
     if isinstance(value, Mapping):

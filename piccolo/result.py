@@ -19,7 +19,7 @@ from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, T_world_from_cam, check_rotation, quaternion_wxyz
+from .geometry.pose import Pose, check_rotation
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .scan_map.prior import GpsPrior
@@ -234,8 +234,10 @@ def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """Return a pose in all its forms, POSE_FIELDS."""
     if pose is None:
         return None
-    quaternion = quaternion_wxyz(pose.R_cam_from_world).tolist()
-    others = {"quaternion_wxyz": quaternion, "T_world_from_cam": T_world_from_cam(pose).tolist()}
+    others = {
+        "quaternion_wxyz": pose.quaternion_wxyz.tolist(),
+        "T_world_from_cam": pose.T_world_from_cam.tolist(),
+    }
     return _rotation_and_center(pose) | others
 
 

@@ -8,7 +8,7 @@ from evo.core import metrics
 from evo.core.trajectory import PosePath3D
 from poses import result
 
-from piccolo.geometry.pose import Pose, T_world_from_cam, exp_so3
+from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.scenes.evaluation.query_result import (
     PAPER_THRESHOLDS,
     QueryResult,
@@ -58,7 +58,7 @@ def test_path_errors_equal_evo(tmp_path):
     frames = [frame._replace(query=dataclasses.replace(frame.query, is_answerable=True)) for frame in frames]
     summary = summarize_walk(frames)
     paths = [
-        PosePath3D(poses_se3=[T_world_from_cam(pose) for pose in poses])
+        PosePath3D(poses_se3=[pose.T_world_from_cam for pose in poses])
         for poses in ([f.query.pose for f in frames[1:]], [f.pose for f in frames[1:]])
     ]
     ate = metrics.APE(metrics.PoseRelation.translation_part)

@@ -33,7 +33,7 @@ def test_conventions_of_turns_steps_quaternions_and_matrices():
     pose = poses.Pose(poses.exp_so3(np.array([0.4, -1.1, 0.7])), np.array([0.3, -0.2, 1.5]))
     x_world = np.array([2.0, 1.0, 0.5])
     x_cam = pose.R_cam_from_world @ (x_world - pose.center_world)
-    np.testing.assert_allclose((poses.T_world_from_cam(pose) @ [*x_cam, 1.0])[:3], x_world, atol=1e-12)
+    np.testing.assert_allclose((pose.T_world_from_cam @ [*x_cam, 1.0])[:3], x_world, atol=1e-12)
     yaw = 0.7
     forward = poses.yaw_rotation(yaw).T @ [1.0, 0.0, 0.0]
     np.testing.assert_allclose(forward, [np.cos(yaw), np.sin(yaw), 0.0], atol=1e-12)
@@ -109,3 +109,27 @@ def test_kept_poses_are_the_first_of_their_neighbourhood():
     assert non_maximum_suppression(rotations, centers, 9, 0.5, np.radians(20)).tolist() == [0, 2, 3]
     assert non_maximum_suppression(rotations, centers, 2, 0.5, np.radians(20)).tolist() == [0, 2]
     assert non_maximum_suppression(rotations, centers, 9, 0.5, np.radians(5)).tolist() == [0, 1, 2, 3]
+
+
+def test_poses_are_a_group_and_act_on_points():
+    """Names cancel: (c_from_b @ b_from_w) maps a point as b_from_w does, then as c_from_b."""
+    rng = np.random.default_rng(0)
+    a, b, c = (poses.Pose(poses.exp_so3(rng.normal(size=3)), rng.normal(size=3)) for _ in range(3))
+    identity = poses.Pose(np.eye(3), np.zeros(3))
+
+    def matrix(pose):
+        return pose.T_world_from_cam
+
+    np.testing.assert_allclose(matrix((a @ b) @ c), matrix(a @ (b @ c)), atol=1e-12)
+    np.testing.assert_allclose(matrix(a @ a.inverse()), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(matrix(a.inverse() @ a), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(matrix((a @ b).inverse()), matrix(b.inverse() @ a.inverse()), atol=1e-12)
+    np.testing.assert_array_equal(matrix(a @ identity), matrix(a))
+    np.testing.assert_allclose(matrix(a @ b), matrix(b) @ matrix(a), atol=1e-12)
+    x = rng.normal(size=3)
+    in_b = b.R_cam_from_world @ (x - b.center_world)
+    in_c = a.R_cam_from_world @ (in_b - a.center_world)
+    both = a @ b
+    np.testing.assert_allclose(both.R_cam_from_world @ (x - both.center_world), in_c, atol=1e-12)
+    turned = poses.rotation_from_quaternion_wxyz(a.quaternion_wxyz)
+    np.testing.assert_allclose(turned, a.R_cam_from_world, atol=1e-12)

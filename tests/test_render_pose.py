@@ -11,7 +11,6 @@ import pytest
 import rooms
 
 from piccolo.cli import prepare_map, render_pose
-from piccolo.geometry.pose import T_world_from_cam
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.optimize import descent_animation as animation
 from piccolo.optimize.refine import DescentSettings
@@ -52,7 +51,7 @@ def test_all_results_become_a_folder_of_pictures(run, scene, tmp_path):
 
 def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_path):
     pose = read_scene(scene).by_name["tilt_0.jpg"].pose
-    np.savetxt(tmp_path / "T.txt", T_world_from_cam(pose), fmt="%.17g")
+    np.savetxt(tmp_path / "T.txt", pose.T_world_from_cam, fmt="%.17g")
     heading, pitch, roll = heading_pitch_roll_deg(pose)
     sources = {
         "result": ["--result", scene / "poses.jsonl", "--pano", "tilt_0.jpg"],

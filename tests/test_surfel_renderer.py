@@ -13,7 +13,7 @@ from refusals import mutated, read_or_refused
 from piccolo.cli.render_pose import read_pose_matrix
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, T_world_from_cam, angle_between, exp_so3, step
+from piccolo.geometry.pose import Pose, angle_between, exp_so3, step
 from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.sphere import pixel_rays, pixels_of
 from piccolo.jobs.threads import Workers
@@ -235,7 +235,7 @@ def test_a_pose_file_is_read_or_refused(tmp_path_factory, data):
     path = tmp_path_factory.mktemp("pose") / "T.txt"
     pose = poses.tilted_poses(1)[0]
     text = "# T_world_from_cam\n" + "\n".join(
-        " ".join(f"{x:.9f}" for x in row) for row in T_world_from_cam(pose)
+        " ".join(f"{x:.9f}" for x in row) for row in pose.T_world_from_cam
     )
     path.write_text(text)
     read = read_pose_matrix(path)

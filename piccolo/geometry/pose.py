@@ -20,7 +20,7 @@ TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to unde
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and rotation of a camera."""
+    """Position and rotation of a camera: the map from world to camera coordinates."""
 
     R_cam_from_world: Array  # (3, 3) rotation, camera axes: +x image centre, +y left, +z up
     center_world: Array  # (3,) camera position [m]
@@ -29,6 +29,28 @@ class Pose:
     def key(self) -> bytes:
         """The bits of the pose."""
         return self.R_cam_from_world.tobytes() + self.center_world.tobytes()
+
+    @property
+    def T_world_from_cam(self) -> Array:
+        """Homogeneous matrix (4, 4): `x_world = T_world_from_cam @ x_cam`."""
+        T = np.eye(4)
+        T[:3, :3] = self.R_cam_from_world.T
+        T[:3, 3] = self.center_world
+        return T
+
+    @property
+    def quaternion_wxyz(self) -> Array:
+        """Unit quaternion (4,) of `R_cam_from_world`, scalar first and not negative."""
+        return quaternion_wxyz(self.R_cam_from_world)
+
+    def inverse(self) -> "Pose":
+        """Return the map from camera to world coordinates."""
+        return Pose(self.R_cam_from_world.T, -self.R_cam_from_world @ self.center_world)
+
+    def __matmul__(self, other: "Pose") -> "Pose":
+        """Return the pose that maps by `other` first: `c_from_w = c_from_b @ b_from_w`."""
+        center_world = other.center_world + other.R_cam_from_world.T @ self.center_world
+        return Pose(self.R_cam_from_world @ other.R_cam_from_world, center_world)
 
 
 def skew(w: Array) -> Array:
@@ -140,14 +162,6 @@ def rotation_from_quaternion_wxyz(q: Array) -> Array:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     )
-
-
-def T_world_from_cam(pose: Pose) -> Array:
-    """Homogeneous matrix (4, 4): `x_world = T_world_from_cam @ x_cam`."""
-    T = np.eye(4)
-    T[:3, :3] = pose.R_cam_from_world.T
-    T[:3, 3] = pose.center_world
-    return T
 
 
 def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:

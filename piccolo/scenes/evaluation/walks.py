@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...confidence.confidence import LOCALIZED
-from ...geometry.pose import Array, Pose, T_world_from_cam, angle_between, pose_errors
+from ...geometry.pose import Array, Pose, angle_between, pose_errors
 from ..scene import Query, Scene
 from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
 from .tables import ALL, Table
@@ -77,7 +77,7 @@ def _time(frame: Frame) -> float:
 
 def step_errors(true: tuple[Pose, Pose], found: tuple[Pose, Pose]) -> tuple[float, float]:
     """Return the error [m], [rad] of a motion, evo's: inv(inv(Q_0) Q_1) inv(P_0) P_1 of T_world_from_cam."""
-    true_motion, motion = (np.linalg.solve(*map(T_world_from_cam, poses)) for poses in (true, found))
+    true_motion, motion = (np.linalg.solve(a.T_world_from_cam, b.T_world_from_cam) for a, b in (true, found))
     error = np.linalg.solve(true_motion, motion)
     return float(np.linalg.norm(error[:3, 3])), angle_between(error[:3, :3], np.eye(3))
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...errors import InputError, printable
 from ...files.atomic import is_stream, replacing_folder, write_atomically
-from ...geometry.pose import Pose, T_world_from_cam, log_so3, quaternion_wxyz
+from ...geometry.pose import Pose, log_so3, quaternion_wxyz
 from ...geometry.rotations import (
     CAMERA_AXES,
     OPENGL_FROM_CAM,
@@ -105,7 +105,7 @@ def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
     """Return a comment and the rows of poses, each with the text of its time; `axes` as in CAMERA_AXES."""
     lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {axes}"]
     for time, pose in poses:
-        T = T_world_from_cam(turn_axes(pose, CAMERA_AXES[axes]))
+        T = turn_axes(pose, CAMERA_AXES[axes]).T_world_from_cam
         w, x, y, z = quaternion_wxyz(T[:3, :3])
         lines.append(f"{time} {numbers([*T[:3, 3], x, y, z, w])}")
     return lines
@@ -113,7 +113,7 @@ def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
 
 def write_kitti(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write the twelve numbers of a 3 x 4 matrix, world from camera, a row; the format has no comments."""
-    matrices = [T_world_from_cam(turn_axes(image.pose, CAMERA_AXES[options.axes])) for image in images]
+    matrices = [turn_axes(image.pose, CAMERA_AXES[options.axes]).T_world_from_cam for image in images]
     write_offset_beside(out, options)
     write_lines(out, [numbers(T[:3].ravel()) for T in matrices])
 
@@ -183,7 +183,7 @@ def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) 
     frames = []
     for image in images:
         own = {} if is_one_size else _intrinsics(image.size)
-        matrix = T_world_from_cam(turn_axes(image.pose, OPENGL_FROM_CAM)).tolist()
+        matrix = turn_axes(image.pose, OPENGL_FROM_CAM).T_world_from_cam.tolist()
         frames.append({"file_path": image.name, **own, "transform_matrix": matrix})
     write_json(out, document | {"frames": frames})
 
