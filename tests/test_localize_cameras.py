@@ -113,7 +113,7 @@ def test_arrays_of_photos_need_a_camera():
     rgb = np.zeros((300, 400, 3), np.uint8)
     with pytest.raises(piccolo.InputError, match=r"found uint8 of shape .300, 400, 3., wanted RGB"):
         scan().localize(rgb)
-    with pytest.raises(piccolo.InputError, match="camera, rig: wanted only one of them"):
+    with pytest.raises(piccolo.InputError, match="`camera`, `rig`: found both, wanted one of them"):
         scan().localize(rgb, camera="a.json", rig="b.json")
 
 

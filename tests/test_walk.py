@@ -108,7 +108,7 @@ def test_a_walk_keeps_within_a_prior(scan, building):
 
 def test_times_are_of_all_frames(scan, building):
     frames = [q.image for q in building[1][:2]]
-    with pytest.raises(InputError, match=r"^times: found 1 of 2 frames, wanted one of each$"):
+    with pytest.raises(InputError, match=r"^`times`: found 1 of 2 frames, wanted one of each$"):
         scan.localize_walk(frames, [0.0])
 
 
