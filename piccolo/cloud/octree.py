@@ -16,8 +16,6 @@ MAX_NODES = 1 << 22  # that a view collects; reserved, but used only as far as a
 RANGES_BELOW = 1 / 20  # voxels by their distance: larger ones are drawn at one level in few places
 DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so near to its mean
 
-Float3 = tuple[np.float32, np.float32, np.float32]
-
 
 class Octree(NamedTuple):
     """Nodes of all levels, coarsest first, in Morton order within a level; kernels read it as it is."""
@@ -71,7 +69,7 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
 
 
 @inline_kernel
-def uniform_level(least_distance: NDArray[np.float32], level: int, low: float, high: float) -> int:
+def uniform_level(least_distance, level, low, high):
     """The level at which all below a node, its children of `level`, is drawn if it is from low to high away.
 
     0 if there is none.
@@ -83,15 +81,7 @@ def uniform_level(least_distance: NDArray[np.float32], level: int, low: float, h
 
 
 @inline_kernel
-def take_all(
-    nodes: NDArray[np.float32],
-    first: int,
-    last: int,
-    center: Float3,
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
-    count: int,
-) -> None:
+def take_all(nodes, first, last, center, found, directions, count):
     """Write nodes that follow one another, and their positions relative to the centre, from `count` on."""
     x, y, z = directions[0], directions[1], directions[2]
     for i in range(last - first):
@@ -104,18 +94,7 @@ def take_all(
 
 
 @inline_kernel
-def take_far(
-    nodes: NDArray[np.float32],
-    first: int,
-    last: int,
-    center: Float3,
-    least: np.float32,
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
-    count: int,
-    stack: NDArray[np.int32],
-    top: int,
-) -> tuple[int, int]:
+def take_far(nodes, first, last, center, least, found, directions, count, stack, top):
     """The same with those at least so far, squared [m^2]; the others go on the stack. Returns both counts."""
     x, y, z = directions[0], directions[1], directions[2]
     for node in range(first, last):
@@ -135,13 +114,7 @@ def take_far(
 
 
 @kernel
-def collect(
-    tree: Octree,
-    center: NDArray[np.float64],
-    voxel_per_range: float,
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
-) -> int:
+def collect(tree, center, voxel_per_range, found, directions):
     """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
 
     `directions` (3, N) get the positions relative to the centre [m]. Where all below a node is drawn at one
@@ -195,7 +168,7 @@ def collect(
 
 
 @inline_kernel
-def level_of(tree: Octree, node: int) -> int:
+def level_of(tree, node):
     """The level of a node, 0 for the coarsest voxels."""
     level = 0
     while node >= tree.level_start[level + 1]:

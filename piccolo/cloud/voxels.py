@@ -49,7 +49,7 @@ SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
 
 
 @inline_kernel
-def spread_bits(cell: int) -> int:
+def spread_bits(cell):
     """The lowest 21 bits of an int64, each followed by two zeros."""
     bits = cell & 0x1FFFFF
     bits = (bits | (bits << 32)) & 0x1F00000000FFFF
@@ -60,7 +60,7 @@ def spread_bits(cell: int) -> int:
 
 
 @kernel
-def interleave(cells: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
+def interleave(cells, codes):
     """Write the 63-bit Morton code (N,) of each cell (N, 3), int64 in [0, 2^21); x has the lowest bit."""
     for i in range(len(cells)):
         x, y, z = spread_bits(cells[i, 0]), spread_bits(cells[i, 1]), spread_bits(cells[i, 2])
@@ -131,7 +131,7 @@ def join_voxels(
 
 
 @inline_kernel
-def first_slot(x: int, y: int, z: int, num_slots: int) -> int:
+def first_slot(x, y, z, num_slots):
     """The slot of an index (2^k,) from which a cell is looked for."""
     # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
@@ -139,7 +139,7 @@ def first_slot(x: int, y: int, z: int, num_slots: int) -> int:
 
 
 @inline_kernel
-def find_slot(index: NDArray[np.int32], rows: NDArray[np.int32], x: int, y: int, z: int) -> int:
+def find_slot(index, rows, x, y, z):
     """The slot that names a cell's row, or the free one where it belongs."""
     slot = first_slot(x, y, z, len(index))
     while index[slot] != 0:
@@ -151,14 +151,7 @@ def find_slot(index: NDArray[np.int32], rows: NDArray[np.int32], x: int, y: int,
 
 
 @kernel
-def add_points(
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    base: NDArray[np.int64],
-    index: NDArray[np.int32],
-    rows: NDArray[np.int32],
-    num_voxels: int,
-) -> tuple[int, int]:
+def add_points(points, colors, base, index, rows, num_voxels):
     """Add points (N, 3) [m] with colours (N, 3) to the rows (n, 10) of `num_voxels` voxels.
 
     `index` (2^k,) has, by a hash of their cells, their rows' numbers and 1, and 0 in free slots. Stops at a
@@ -198,7 +191,7 @@ def add_points(
 
 
 @kernel
-def fill_index(rows: NDArray[np.int32], num_voxels: int, index: NDArray[np.int32]) -> None:
+def fill_index(rows, num_voxels, index):
     """Name the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
     for k in range(num_voxels):
         x, y, z = np.int64(rows[k, CELL]), np.int64(rows[k, CELL + 1]), np.int64(rows[k, CELL + 2])

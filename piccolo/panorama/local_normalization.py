@@ -36,21 +36,19 @@ LEAST_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any do
 
 
 @inline_kernel
-def opponent(r: np.float32, g: np.float32, b: np.float32) -> tuple[np.float32, np.float32, np.float32]:
+def opponent(r, g, b):
     """Luminance, (R - B) / 2 and (2 G - R - B) / 4: OPPONENT times the colour."""
     return (r + g + b) / np.float32(3.0), HALF * (r - b), HALF * g - np.float32(0.25) * (r + b)
 
 
 @inline_kernel
-def zscore(value: np.float32, mean: np.float32, inverse_std: np.float32) -> np.float32:
+def zscore(value, mean, inverse_std):
     """(value - mean) / standard deviation, clipped."""
     return min(max((value - mean) * inverse_std, -_CLIP), _CLIP)
 
 
 @inline_kernel
-def mean_and_inverse_std(
-    total: np.float32, squares: np.float32, per: np.float32
-) -> tuple[np.float32, np.float32]:
+def mean_and_inverse_std(total, squares, per):
     """Mean and 1 / standard deviation of weighted sums, `per` weight; bounded where nothing varies."""
     mean = total * per
     return mean, F1 / math.sqrt(max(squares * per - mean * mean, F0) + _MIN_VARIANCE)
@@ -80,9 +78,7 @@ def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.floa
 
 
 @kernel
-def block_moments(
-    channels: NDArray[np.float32], weight: NDArray[np.float32], moments: NDArray[np.float32]
-) -> None:
+def block_moments(channels, weight, moments):
     """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
     step = channels.shape[0] // moments.shape[0]
     for i in range(moments.shape[0]):
@@ -105,9 +101,7 @@ def block_moments(
 
 
 @inline_kernel
-def interpolation_along(
-    num: int, num_wider: int
-) -> tuple[NDArray[np.uintp], NDArray[np.uintp], NDArray[np.float32]]:
+def interpolation_along(num, num_wider):
     """Places of `num` pixels among fewer, wider ones around a row: indices (num,) and fractions."""
     left = np.empty(num, np.uintp)
     right = np.empty(num, np.uintp)
@@ -123,19 +117,14 @@ def interpolation_along(
 
 
 @inline_kernel
-def as_texel_channel(value: np.float32, mean: np.float32, gain: np.float32, shift: int) -> np.int32:
+def as_texel_channel(value, mean, gain, shift):
     """A channel's bits of a texel: its normalised value in levels."""
     level = np.int32(zscore(value, mean, gain) * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
     return np.int32(min(level, np.int32(255)) << np.int32(shift))
 
 
 @kernel
-def pack_normalized(
-    channels: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    stats: NDArray[np.float32],
-    texels: NDArray[np.int32],
-) -> None:
+def pack_normalized(channels, weight, stats, texels):
     """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
 
     `stats` (h, w, 6) are means and 1 / standard deviations, read bilinearly; a column of texels is wrapped
@@ -172,7 +161,7 @@ def pack_normalized(
 
 
 @kernel
-def finish_statistics(sums: NDArray[np.float32]) -> None:
+def finish_statistics(sums):
     """Turn weighted sums (h, w, 7) of 1, channels, squares into means and 1 / deviations (h, w, 1:7)."""
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
@@ -230,14 +219,7 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
 
 
 @kernel
-def sample_channels(
-    texels: NDArray[np.int32],
-    width: int,
-    directions: NDArray[np.float64],
-    rotations: NDArray[np.float64],
-    samples: NDArray[np.float32],
-    validity: NDArray[np.float32],
-) -> None:
+def sample_channels(texels, width, directions, rotations, samples, validity):
     """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
     p = make_projected()
     center = np.zeros(3)

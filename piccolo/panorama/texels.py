@@ -18,8 +18,6 @@ from ..kernels.jit import F1, HALF, inline_kernel
 BYTE = np.int32(255)
 CHUNK = 512  # points
 
-Float4 = tuple[np.float32, np.float32, np.float32, np.float32]
-
 
 class Texels(NamedTuple):
     """An equirectangular image for gathering: a column is wrapped and a row clamped on each side."""
@@ -41,15 +39,13 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
 
 
 @inline_kernel
-def channel(texel: np.int32, shift: int) -> np.float32:
+def channel(texel, shift):
     """The 8-bit channel of a texel as float32; shift 0, 8 or 16."""
     return np.float32((texel >> shift) & BYTE)
 
 
 @inline_kernel
-def texel_at(
-    x: np.float32, y: np.float32, z: np.float32, rho: float, width: int
-) -> tuple[np.int32, np.float32, np.float32]:
+def texel_at(x, y, z, rho, width):
     """Index of the upper left of four texels around a camera direction, and the fraction (fu, fv) beyond it.
 
     rho = hypot(x, y). Texel centres are at half-integers of the pixel coordinates, and a column and a row of
@@ -63,13 +59,13 @@ def texel_at(
 
 
 @inline_kernel
-def is_valid(t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32) -> np.float32:
+def is_valid(t00, t10, t01, t11):
     """1 if all four texels count, 0 if one is masked; float32."""
     return np.float32(((t00 & t10 & t01 & t11) >> 24) & 1)
 
 
 @inline_kernel
-def bilinear_weights(fu: np.float32, fv: np.float32) -> Float4:
+def bilinear_weights(fu, fv):
     """Weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fraction (fu, fv)."""
     w11 = fu * fv
     w10 = fu - w11
@@ -78,18 +74,14 @@ def bilinear_weights(fu: np.float32, fv: np.float32) -> Float4:
 
 
 @inline_kernel
-def blend(
-    t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32, weights: Float4, shift: int
-) -> np.float32:
+def blend(t00, t10, t01, t11, weights, shift):
     """Bilinear value of one channel of four texels."""
     value = weights[0] * channel(t00, shift) + weights[1] * channel(t10, shift)
     return value + weights[2] * channel(t01, shift) + weights[3] * channel(t11, shift)
 
 
 @inline_kernel
-def blend_with_gradient(
-    t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32, fu: np.float32, fv: np.float32, shift: int
-) -> tuple[np.float32, np.float32, np.float32]:
+def blend_with_gradient(t00, t10, t01, t11, fu, fv, shift):
     """Bilinear value of one channel of four texels and its derivatives by u and v."""
     c00 = channel(t00, shift)
     c10 = channel(t10, shift) - c00
@@ -116,7 +108,7 @@ class Projected(NamedTuple):
 
 
 @inline_kernel
-def make_projected() -> Projected:
+def make_projected():
     """Room for a chunk."""
     f = np.empty((5, CHUNK), np.float32)
     i = np.empty((5, CHUNK), np.int32)
@@ -124,9 +116,7 @@ def make_projected() -> Projected:
 
 
 @inline_kernel
-def pose_float32(
-    R_cam_from_world: NDArray[np.floating[Any]], center_world: NDArray[np.floating[Any]]
-) -> tuple[np.float32, ...]:
+def pose_float32(R_cam_from_world, center_world):
     """A pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 that registers hold."""
     f = np.float32
     R = R_cam_from_world
@@ -138,9 +128,7 @@ def pose_float32(
 
 
 @inline_kernel
-def in_camera(
-    x: np.float32, y: np.float32, z: np.float32, pose: tuple[np.float32, ...]
-) -> tuple[np.float32, np.float32, np.float32]:
+def in_camera(x, y, z, pose):
     """Camera coordinates of a point, by a pose of `pose_float32`."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22, tx, ty, tz = pose
     dx, dy, dz = x - tx, y - ty, z - tz
@@ -152,15 +140,7 @@ def in_camera(
 
 
 @inline_kernel
-def project(
-    X: NDArray[np.floating[Any]],
-    Y: NDArray[np.floating[Any]],
-    Z: NDArray[np.floating[Any]],
-    R_cam_from_world: NDArray[np.floating[Any]],
-    center_world: NDArray[np.floating[Any]],
-    width: int,
-    projected: Projected,
-) -> None:
+def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
     """Write the camera coordinates, and the texels in an image of `width`, of at most CHUNK points (n,)."""
     p = projected
     pose = pose_float32(R_cam_from_world, center_world)
@@ -173,13 +153,13 @@ def project(
 
 
 @inline_kernel
-def texels_around(projected: Projected, n: int) -> tuple[np.int32, np.int32, np.int32, np.int32]:
+def texels_around(projected, n):
     """The four texels around a projected point that `gather` has written."""
     return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
 
 
 @inline_kernel
-def gather(texels: NDArray[np.int32], width: int, projected: Projected, count: int) -> None:
+def gather(texels, width, projected, count):
     """Write the four texels around each of `count` projected points."""
     p = projected
     stride = np.int32(width + 2)
