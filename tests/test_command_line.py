@@ -106,12 +106,12 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
     def opened(localizer, workers):
         workers.warn("early")
         prepared = SimpleNamespace(scan_sha256="")
-        return SimpleNamespace(warnings=("early", "set up=-y"), prepared=prepared)
+        return SimpleNamespace(warnings=("early", "set `up` to -y"), prepared=prepared)
 
     monkeypatch.setattr(localize.Localizer, "open_scan", opened)
     run = localize.prepare_run(_parse(*["--quiet"] * quiet))
     localize.open_scan(run, run.localizer, 1)
-    assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: set --up -y\n")
+    assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: set --up to -y\n")
 
 
 @pytest.mark.parametrize(

@@ -94,7 +94,7 @@ def test_the_line_moves():
 @pytest.mark.parametrize("settings", [CoarseToFineSettings, PaperSettings])
 @pytest.mark.parametrize("value", [0.0, 1.0, -1.0, float("nan")])
 def test_lines_that_mean_nothing_are_refused(settings, value):
-    with pytest.raises(InputError, match=f"--min-confidence: found {value}, wanted above 0 and below 1"):
+    with pytest.raises(InputError, match=f"`min_confidence`: found {value}, wanted above 0 and below 1"):
         settings(min_confidence=value)
     assert settings(min_confidence=0.01).min_confidence == 0.01
 

@@ -166,5 +166,5 @@ def test_sizes_are_read_without_decoding_those_of_cube_faces_are_the_spheres_and
     results = [result(tmp_path / "b.jpg", tilted_poses(1)[0])]
     for content in (b"", b"\xff\xd8" + b"\xff" * 9999, b"II*\0" + bytes(99), b"\xff\xd8\xff\xe1\xff\xff" * 9):
         write(tmp_path / "b.jpg", content)
-        with pytest.raises(InputError, match=r"b\.jpg: .*with --size W H no picture is needed"):
+        with pytest.raises(InputError, match=r"b\.jpg: .*with `size` W H no picture is needed"):
             export(results, "nerfstudio", tmp_path / "t.json", Options())

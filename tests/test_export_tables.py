@@ -160,7 +160,7 @@ def test_tum_has_the_times_of_a_walk(tmp_path):
     walked = [replace(r, walk=frame) for r, frame in zip(_results(), frames, strict=True)]
     export(walked, "tum", tmp_path / "p.tum", Options(timestamps="walk"))
     assert np.loadtxt(tmp_path / "p.tum")[:, 0].tolist() == [0.0, 0.25, 0.5, 0.75]
-    with pytest.raises(InputError, match=r"^a\.jpg: found no frame of a walk, as --timestamps walk needs$"):
+    with pytest.raises(InputError, match=r"^a\.jpg: found no frame of a walk, as `timestamps` walk needs$"):
         export(_results(), "tum", tmp_path / "q.tum", Options(timestamps="walk"))
 
 

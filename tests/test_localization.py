@@ -129,7 +129,8 @@ def test_a_prior_that_allows_nothing_says_what_was_left_out():
     settings = dataclasses.replace(KNOWN, prior=prior)
     (text,) = _localize(1, query(1).rgb, settings).warnings
     num_low = ((heights >= 0.2) & (heights <= 1.3)).sum()
-    assert f"no position is left of the scan's {num}: --near allows 0, --height allows {num_low}; " in text
+    counts = f"`near_world` allows 0, `height` allows {num_low}; "
+    assert f"no position is left of the scan's {num}: {counts}" in text
     x, y, z, distance = map(float, re.search(r"is (\S+) (\S+) (\S+), (\S+) m away", text).groups())
     to_near = np.linalg.norm(whole.centers + origin - prior.near_world, axis=1)
     np.testing.assert_allclose((x, y, z), whole.centers[to_near.argmin()] + origin, atol=0.005)
@@ -143,7 +144,9 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
     num = len(find_supported_cells(top_surfaces(whole.octree)))
     for most in (num - 1, 10):  # known when all have been counted, or from the surfaces alone
         monkeypatch.setattr(camera_positions, "MAX_POSITIONS", most)
-        with pytest.raises(InputError, match=rf"more than {most} camera positions, .*--units, else .*--near"):
+        with pytest.raises(
+            InputError, match=rf"more than {most} camera positions, .*`units`, .*`near_world`"
+        ):
             prepare_map(cloud, Workers(1))
     monkeypatch.setattr(camera_positions, "MAX_POSITIONS", num - 1)
     prior = Prior(tuple(center + cloud.origin_world), 1.0)
@@ -151,7 +154,7 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
     part = prepare_map(cloud, Workers(1, warn=said.append), prior=prior)
     assert part.is_partial
     assert said == list(part.warnings)
-    assert "prepared within 1 m of --near" in said[0]
+    assert "prepared within 1 m of `near_world`" in said[0]
     assert 0 < len(part.centers) < len(whole.centers)
     left = {tuple(c) for c in apply_prior(part, prior).centers}
     assert {tuple(c) for c in whole.centers[is_near]} <= left

@@ -66,7 +66,7 @@ def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
     assert localize.main(_arguments(scene, "--quiet", "--near", "900", "0", "0", "1")) == 1
     nothing = json.loads(capsys.readouterr().out)
     assert nothing["center_world"] is None
-    assert "--near allows 0; the nearest to --near is" in nothing["warnings"][-1]
+    assert "`near_world` allows 0; the nearest to `near_world` is" in nothing["warnings"][-1]
 
 
 def test_files_are_written_and_look_right(scene, tmp_path, capsys):

@@ -50,7 +50,7 @@ def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(syst
     memory.limit_memory(500.0)
     assert memory.memory_left() == pytest.approx(8e9)
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="--max-memory: found"):
+        with pytest.raises(InputError, match="`max_memory`: found"):
             memory.limit_memory(wrong)
 
 

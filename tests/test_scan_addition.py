@@ -186,18 +186,18 @@ def test_joined_voxels_are_those_of_each_and_means_where_both_are():
 def test_what_can_not_be_added_is_refused():
     cloud = rooms.room(2)[1]
     for name in ("", " A", "A\n", "x" * 101, "\x1b[31m"):
-        with pytest.raises(InputError, match=r"^--name: found .*, wanted 1 to 100 printable characters$"):
+        with pytest.raises(InputError, match=r"^`name`: found .*, wanted 1 to 100 printable characters$"):
             name_scan(rooms.scan_map(1), name)
-    with pytest.raises(InputError, match=r"^--name: found 'A', which the map has already: 'A'$"):
+    with pytest.raises(InputError, match=r"^`name`: found 'A', which the map has already: 'A'$"):
         _added(first(), cloud, "A")
-    with pytest.raises(InputError, match=r"^--add: found a scan 30 km from the map's, wanted one coordinate"):
+    with pytest.raises(InputError, match=r"^`add`: found a scan 30 km from the map's, wanted one coordinate"):
         _added(first(), _shifted(cloud, np.array([30_000.0, 0.0, 0.0])), "B")
     octree = first().octree._replace(leaf_size=0.04)
-    with pytest.raises(InputError, match=r"^--add: found a map of voxels of 0.04 m, wanted 0.02 m"):
+    with pytest.raises(InputError, match=r"^`add`: found a map of voxels of 0.04 m, wanted 0.02 m"):
         _added(replace(first(), octree=octree), cloud, "B")
     scan_map = _added(first(), _shifted(cloud, np.array([2000.0, 0.0, 0.0])), "B")
     assert "both need one coordinate system" in scan_map.warnings[-1]
-    with pytest.raises(InputError, match=r"^--name: found a map of several scans: 'A', 'B'$"):
+    with pytest.raises(InputError, match=r"^`name`: found a map of several scans: 'A', 'B'$"):
         name_scan(scan_map, "C")
 
 

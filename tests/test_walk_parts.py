@@ -116,7 +116,7 @@ def test_times_by_names_tables_and_exif(tmp_path):
         times_of(frames, str(tmp_path / "t.csv"))
     with pytest.raises(InputError, match="wanted them to rise"):
         times_of(frames[::-1], "names")
-    with pytest.raises(InputError, match=r"^--times names: found no number in walk\.jpg"):
+    with pytest.raises(InputError, match=r"^`times` names: found no number in walk\.jpg"):
         times_of([tmp_path / "walk.jpg"], "names")
-    with pytest.raises(InputError, match=r"^--times exif: found a frame without a time in EXIF"):
+    with pytest.raises(InputError, match=r"^`times` exif: found a frame without a time in EXIF"):
         times_of(frames, "exif")

@@ -46,7 +46,7 @@ def open_map(
     prior: Prior = NOTHING_KNOWN,
     has_features: bool = False,
 ) -> ScanMap:
-    """The map of a cloud's files: prepared already, from the cache, or built now.
+    """Return the map of a cloud's files: prepared already, from the cache, or built now.
 
     A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
     Local features come late, and into the cache then, unless `has_features`.
@@ -99,7 +99,7 @@ def extend_map(
     workers: Workers,
     watch: Stopwatch,
 ) -> ScanMap:
-    """A prepared map with the scan of some files put in under a name; a map without names gets its file's."""
+    """Return a prepared map with another scan under a name; a map without names gets its file's."""
     if not find_prepared_map([map_path]):
         found = "no prepared map" if map_path.exists() else "no such file"
         raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
@@ -130,12 +130,12 @@ def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSetting
 
 
 def find_prepared_map(paths: Sequence[Path]) -> Path | None:
-    """The first of some files that is a prepared map."""
+    """Return the first of some files that is a prepared map."""
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
 def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
-    """The digest of a scan's files, or the one of what the prepared map in place of them was made from."""
+    """Return the digest of a scan's files, or of those that a prepared map was made from."""
     map_path = find_prepared_map(paths)
     if map_path:
         return load_map(map_path, cache.is_used).scan_sha256
@@ -151,7 +151,7 @@ def content_key(scan_sha256: str, settings: CloudSettings) -> str:
 def open_cached_map(
     folder: Path | None, key: str, scan_sha256: str, build: Callable[[], ScanMap], watch: Stopwatch
 ) -> tuple[ScanMap, str]:
-    """The map named `key` of a cache within a folder, or built and put there; the user's cache if None.
+    """Return the map `key` of a cache within a folder, or build it there; the user's cache if None.
 
     Second what went wrong with the cache, in one line: the map is then as good, only not kept. Two processes
     may build one map at once: each writes its own file whole, the last stays, both are equal.
@@ -183,7 +183,7 @@ def open_cached_map(
 
 
 def keep_when_made(scan_map: ScanMap, path: Path) -> ScanMap:
-    """The map; when its local features are made, it is written once more, if no other process has done so."""
+    """Return the map; once its local features are made, it is written again, by one process."""
     late = scan_map.late
     if late is None:
         return scan_map

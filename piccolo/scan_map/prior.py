@@ -46,12 +46,12 @@ class GpsPrior:
     is_used: bool = True  # the result lies there; else it was found, or not found, without it
 
     def apply_to(self, prior: Prior) -> Prior:
-        """The prior with this position in place of none."""
+        """Return the prior with this position in place of none."""
         return replace(prior, near_world=(*self.center_world, None), radius=self.radius)
 
 
 def gps_prior(gps: GpsPosition, crs: str, metres_per_unit: float) -> GpsPrior | None:
-    """The prior of a position in a scan of this system; None where the system does not hold."""
+    """Return the prior of a position in a scan of this system; None where the system does not hold."""
     place = from_wgs84(crs, gps.latitude_deg, gps.longitude_deg)
     if place is None:
         return None
