@@ -359,9 +359,9 @@ def test_a_full_disk_keeps_the_lines_before(out):
     code = """
 import resource, sys
 from pathlib import Path
-from piccolo.files.line_file import locked
+from piccolo.files.line_file import open_locked
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-with locked(Path(sys.argv[1])) as file:
+with open_locked(Path(sys.argv[1])) as file:
     for k in range(9):
         file.append(str(k) * 300)
 """

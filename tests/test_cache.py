@@ -223,7 +223,7 @@ def test_a_kernel_is_compiled_with_another_that_was_loaded(tmp_path, monkeypatch
     assert found == {names.llvm_func_name, *wrappers}
 
 
-@pytest.mark.parametrize("fails", ["rebuilt", "serialize"])
+@pytest.mark.parametrize("fails", ["rebuild", "serialize"])
 def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch, caplog, fails):
     def total(values):
         return values.sum()
@@ -231,7 +231,7 @@ def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch
     jit.warn_not_kept.cache_clear()
     monkeypatch.setattr(jit, "kernel_folder", lambda: tmp_path)
     values = np.arange(5.0)
-    if fails == "rebuilt":
+    if fails == "rebuild":
         kernel(total)(values)
     monkeypatch.setattr(jit, fails, None)
     assert kernel(total)(values) == 10.0

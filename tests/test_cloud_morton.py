@@ -31,7 +31,8 @@ def clean(path, raw, scale):
 
 def whole(open_file, path, options=IN_METRES):
     """All points that a reader finds in a file."""
-    chunks = list(open_file(path, options).read_chunks())
+    none = RawCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
+    chunks = list(open_file(path, options).read_chunks()) or [none]
     return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))
 
 

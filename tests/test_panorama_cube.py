@@ -97,7 +97,7 @@ def test_crosses_are_known_by_their_empty_cells(tmp_path, rows):
 @pytest.mark.parametrize("rows", [["rludfb"], list("rludfb"), ["fbl", "rud"], ["du", "fb", "lr"]])
 def test_grids_are_read_by_the_order_given(tmp_path, rows):
     path = write(tmp_path / "a.png", encoded(picture_of(rows), ".png"))
-    assert_refused("or the order of cube faces", read_panorama, path)
+    assert_refused(r"`cube_order`", read_panorama, path)
     assert_is_the_sphere(read_panorama(path, ReadOptions(cube_order="".join(rows))))
 
 

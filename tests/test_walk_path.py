@@ -37,7 +37,7 @@ class Open:
         straight = np.linalg.norm(ends - start, axis=1)
         return np.where(straight > limit, np.inf, straight)
 
-    def share_within(self, center, radius):
+    def fraction_within(self, center, radius):
         return self.share
 
 
