@@ -1,4 +1,4 @@
-"""What the default method can be asked for, and what it is made of."""
+"""Settings of the default method, and the parts that it is made of."""
 
 from dataclasses import asdict, dataclass
 from typing import NamedTuple, get_args
