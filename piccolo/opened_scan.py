@@ -24,7 +24,7 @@ from .panorama.photo import PhotoFacts, sha256_of
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
-from .result import Result, Source, failure_of, result_of, unreadable_result
+from .result import Result, Source, describe_failure, result_of, unreadable_result
 from .scan_map.named_scans import add_places, check_within
 from .scan_map.prior import GpsPrior, gps_prior
 from .scan_map.scan_map import ScanMap
@@ -107,7 +107,7 @@ class OpenedScan:
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
-            if read_options.use_gps and (gps := self.gps_prior_of(photo, settings)):
+            if read_options.use_gps and (gps := self.make_gps_prior(photo, settings)):
                 near = replace(settings, prior=gps.apply_to(settings.prior))
                 attempts = [(near, gps), (settings, replace(gps, is_used=False))]
             run = localize_guessed if has_guessed_focal(picture) else localize
@@ -140,7 +140,7 @@ class OpenedScan:
         elif read_options.refine_focal:
             raise InputError("`refine_focal`: not an option of the preset paper")
 
-    def gps_prior_of(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
+    def make_gps_prior(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
         """Return the photo's GPS position in the scan; None if it has none, or a position is given anyway."""
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
         if photo.gps is None or not crs or settings.prior.near_world is not None:
@@ -156,7 +156,7 @@ def settings_json(
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": reading}
 
 
-def failed_result(
+def make_failed_result(
     scan: OpenedScan,
     panorama: File | NDArray[np.uint8],
     error: Exception,
@@ -168,7 +168,7 @@ def failed_result(
 
     `name` replaces the photo's path.
     """
-    text, is_passing = failure_of(error)
+    text, is_passing = describe_failure(error)
     digest = None
     path = "array"
     if not isinstance(panorama, np.ndarray):

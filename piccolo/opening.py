@@ -17,7 +17,7 @@ from .errors import InputError
 from .files.cache import sha256_of_files
 from .geometry.colors import Labels
 from .jobs.stopwatch import Stopwatch
-from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
+from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
 from .localization.settings import CoarseToFineSettings
 from .opened_scan import File, OpenedScan, Settings
 from .paper.localize import PaperMap
@@ -91,7 +91,7 @@ def open_scan(  # noqa: PLR0913  options by name
     room/images/clean_1.jpg localized
     """
     check_arguments(open_scan, locals())
-    show = progress_to(progress) if progress else no_progress
+    show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     cloud_settings = CloudSettings(
         METRES[units], up, intensity_as_gray, _make_labels(labels, ignore_labels), crs

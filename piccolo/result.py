@@ -13,7 +13,7 @@ import numpy as np
 from . import __version__
 from .camera import Mount
 from .camera.files import document_of as camera_document
-from .camera.files import mounts_of
+from .camera.files import read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
@@ -174,7 +174,7 @@ class Result:
                 "cloud": cloud if isinstance(cloud, str) else _paths(cloud),
                 "best_pose": None if best is None else _pose_from_json(best),
                 "source": Source(image_size=size and tuple(size), **source),
-                "cameras": mounts_of(document["camera"]) if document.get("camera") else (),
+                "cameras": read_mounts(document["camera"]) if document.get("camera") else (),
                 "focal_length": document["focal_length"] and FocalLength(**document["focal_length"]),
                 "gps_prior": gps and GpsPrior(**gps | {"center_world": tuple(gps["center_world"])}),
                 "evidence": document["evidence"] and Evidence(**document["evidence"]),
@@ -205,7 +205,7 @@ class Failure(NamedTuple):
     is_passing: bool  # it may have one when it is tried again
 
 
-def failure_of(error: Exception) -> Failure:
+def describe_failure(error: Exception) -> Failure:
     """Return the failure of a photo; an error of none, but of the program, is raised."""
     if isinstance(error, OSError | InputError):
         return Failure(text_of(error), is_passing(error))

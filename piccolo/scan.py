@@ -15,7 +15,7 @@ from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
 from .localization.settings import CoarseToFineSettings
-from .opened_scan import File, OpenedScan, Settings, failed_result
+from .opened_scan import File, OpenedScan, Settings, make_failed_result
 from .optimize.refine import Solver
 from .panorama import ReadOptions
 from .panorama.model import Projection
@@ -208,7 +208,7 @@ class Scan:
             try:
                 return self._opened.localize_query(panorama, read_options, settings, is_masked)
             except Exception as error:
-                return failed_result(self._opened, panorama, error, read_options, settings)
+                return make_failed_result(self._opened, panorama, error, read_options, settings)
 
         return map(localize, panoramas)
 

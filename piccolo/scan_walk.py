@@ -16,8 +16,8 @@ from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Progress, no_progress
 from .localization.query import Query
 from .panorama import Panorama, ReadOptions, read_photo
-from .panorama.photo import PhotoFacts, photo_of, photo_of_array, sha256_of
-from .result import Failure, Result, Source, failure_of, result_of, unreadable_result
+from .panorama.photo import PhotoFacts, photo_of_array, read_photo_facts, sha256_of
+from .result import Failure, Result, Source, describe_failure, result_of, unreadable_result
 from .scan_map.named_scans import add_places
 from .walk.frames import Frame, check_times
 from .walk.localize import WalkFrame, make_localization, make_localizations, result_alone
@@ -59,7 +59,9 @@ class Prepared(NamedTuple):
 
 def photo_facts(picture: Picture, rig: Calibration | None) -> PhotoFacts:
     """Return what is known of a photo beside its pixels."""
-    return photo_of_array(picture) if isinstance(picture, np.ndarray) else photo_of(Path(picture), rig)
+    return (
+        photo_of_array(picture) if isinstance(picture, np.ndarray) else read_photo_facts(Path(picture), rig)
+    )
 
 
 class Walk:
@@ -89,7 +91,7 @@ class Walk:
                     panorama = replace(read_photo(frame, self.read_options), focal_prior=None)  # as exact
                     photo = photo_facts(frame, self.read_options.rig)
             except Exception as error:
-                text, is_passing = failure_of(error)
+                text, is_passing = describe_failure(error)
                 if isinstance(frame, np.ndarray):
                     raise
                 failure = Failure(text.replace(str(frame), name), is_passing)

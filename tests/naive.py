@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from piccolo.geometry.sphere import cell_of, make_grid
+from piccolo.geometry.sphere import find_cell, make_grid
 
 
 def project(points, R_cam_from_world, center_world, width):
@@ -121,7 +121,7 @@ def normalized_cells(rgb, is_seen, num_rings, stats_rings, sigma_deg):
     channels = np.stack([(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], axis=1)
     moments = np.zeros((len(coarse), 7))
     rows = np.column_stack([np.ones(len(r)), channels, channels**2]) * (fine.solid_angle * is_seen)[:, None]
-    np.add.at(moments, cell_of(fine.directions, stats_rings), rows)
+    np.add.at(moments, find_cell(fine.directions, stats_rings), rows)
     cosine = coarse.directions.astype(float) @ coarse.directions.T
     weight = np.exp((cosine - 1) / math.radians(sigma_deg) ** 2) * coarse.solid_angle
     weight[cosine <= math.cos(2.3 * math.radians(sigma_deg))] = 0
@@ -197,7 +197,7 @@ def view_positions(centers, ranges, num_rings):
             middle = np.radians([(column + 0.5) * 3.75 - 180.0, 90.0 - (row + 0.5) * 3.75])
             level = math.cos(middle[1])
             ray = np.array([[level * math.cos(middle[0]), level * math.sin(middle[0]), math.sin(middle[1])]])
-            limit = ranges[j, cell_of(ray.astype(np.float32), num_rings)[0]]
+            limit = ranges[j, find_cell(ray.astype(np.float32), num_rings)[0]]
             is_near = math.hypot(*gap[:2]) < 2.5 and abs(gap[2]) < 2.4
             if is_near and (limit == 0 or np.linalg.norm(gap) < limit + 1.0):
                 break

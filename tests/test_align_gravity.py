@@ -11,7 +11,7 @@ import pytest
 from pictures import encoded
 from plyfile import PlyData, PlyElement
 from poses import tilted_poses
-from rooms import query as photo_of
+from rooms import query as read_photo_facts
 from scans import bare_room, points_of, scan, write_scan
 from test_cloud_ptx import scan as ptx_lines
 from test_cloud_ptx import write as write_lines
@@ -208,14 +208,14 @@ def test_scanners_tell_up_in_a_bare_room(run, tmp_path):
 
 @pytest.mark.parametrize("assumed", [[], [FREE]])
 def test_a_photo_tells_up(run, tilted, tmp_path, assumed):
-    (tmp_path / "photo.png").write_bytes(encoded(photo_of(1).rgb, ".png"))
+    (tmp_path / "photo.png").write_bytes(encoded(read_photo_facts(1).rgb, ".png"))
     code, report, _ = run("--cloud", tilted, "--pano", tmp_path / "photo.png", *assumed)
     assert (code, report["explanation"]) == (0, f"{tmp_path / 'photo.png'} is localized")
     np.testing.assert_allclose(report["up_scan"], exp_so3(TURN)[:, 2], atol=np.radians(0.2))
 
 
 def test_a_photo_from_elsewhere_tells_nothing(run, tilted, tmp_path):
-    (tmp_path / "photo.png").write_bytes(encoded(photo_of(2).rgb, ".png"))
+    (tmp_path / "photo.png").write_bytes(encoded(read_photo_facts(2).rgb, ".png"))
     code, report, err = run("--cloud", tilted, "--pano", tmp_path / "photo.png", FREE)
     assert (code, report["up_scan"]) == (1, None)
     assert "photo.png is not_localized" in err

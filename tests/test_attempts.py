@@ -144,8 +144,8 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
     few = whole.narrow(np.arange(len(whole.sparse)) < 7)
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    assert attempts.tilted_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
-    assert 0.3 < len(attempts.tilted_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    assert attempts.tilt_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    assert 0.3 < len(attempts.tilt_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
 
 
 LOOK = (0, "look_first")

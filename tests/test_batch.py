@@ -16,7 +16,7 @@ import pytest
 from batches import PAPER, ROOT, run, start_localize
 
 from piccolo.batch import localizer as module
-from piccolo.batch.inputs import panoramas_of
+from piccolo.batch.inputs import list_panoramas
 from piccolo.cli import localize, options
 from piccolo.errors import InputError
 from piccolo.files.line_file import open_locked, whole_lines, whole_size
@@ -65,7 +65,7 @@ def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
     with (tmp_path / "stdin").open("w+") as stdin:
         stdin.write("e.jpg\r\n\nf.jpg")
         stdin.seek(0)
-        found = list(panoramas_of([str(scene), "a.jpg", f"@{listed}", "-"], stdin, Counter()))
+        found = list(list_panoramas([str(scene), "a.jpg", f"@{listed}", "-"], stdin, Counter()))
     assert found[:3] == [scene / "images" / name for name in names]
     assert [str(path) for path in found[3:]] == ["a.jpg", "b c.jpg", "caf\udce9.png", "e.jpg", "f.jpg"]
     cube = tmp_path / "photos" / "cube"
@@ -74,11 +74,11 @@ def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
         (cube / f"{face}.png").touch()
     (tmp_path / "photos" / "a.webp").touch()
     (tmp_path / "photos" / ".hidden.jpg").touch()
-    found = panoramas_of([str(tmp_path / "photos"), str(cube)], None, Counter())
+    found = list_panoramas([str(tmp_path / "photos"), str(cube)], None, Counter())
     assert list(found) == [tmp_path / "photos/a.webp", cube, cube]
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="empty: a folder without a JPEG"):
-        list(panoramas_of([str(tmp_path / "empty")], None, Counter()))
+        list(list_panoramas([str(tmp_path / "empty")], None, Counter()))
 
 
 def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, capsys):
@@ -299,7 +299,7 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
     (photos / "self").symlink_to("self")
     (elsewhere / "inner" / "a.jpg").write_bytes(images[0])
     left_out = Counter()
-    found = list(panoramas_of([str(photos)], None, left_out))
+    found = list(list_panoramas([str(photos)], None, left_out))
     assert found == [photos / "link" / "inner" / "a.jpg"]
     assert left_out == Counter({"": 1})  # the link that leads to itself
     for name in ("a.GIF", "b.gif", "c.bmp", "d"):
@@ -310,7 +310,7 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
     for name in "abcdefg":
         (tmp_path / "few" / f"x.{name}").touch()
     with pytest.raises(InputError, match=r"; 7 files left out: 1 \.\w, .* 2 of other kinds$"):
-        list(panoramas_of([str(tmp_path / "few")], None, Counter()))
+        list(list_panoramas([str(tmp_path / "few")], None, Counter()))
 
 
 def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):

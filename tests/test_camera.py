@@ -13,14 +13,20 @@ from rooms import room
 
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import MODELS, camera_of_fov, pinhole
-from piccolo.camera.resampling import View, sphere_of, sphere_width
+from piccolo.camera.resampling import View, make_sphere, sphere_width
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, pose_of_query
+from piccolo.scenes.synthetic.world import (
+    make_query,
+    photograph,
+    picture_of_all,
+    pose_of_query,
+    render_picture,
+)
 
 SIZE = (1000, 800)
 TOLERANCE = 1e-6  # px
@@ -225,7 +231,7 @@ def test_nothing_aliases_where_the_picture_is_finer_than_the_sphere():
     stripes = np.zeros((2400, 3000, 4), np.uint8)
     stripes[:, ::2] = 255
     stripes[..., 3] = 255
-    rgb, is_valid = sphere_of([View(Mount(camera), stripes)], 512)
+    rgb, is_valid = make_sphere([View(Mount(camera), stripes)], 512)
     assert is_valid.mean() > 0.15
     assert np.abs(rgb[is_valid].astype(int) - 127).max() <= 6
 
@@ -235,7 +241,7 @@ def test_where_cameras_overlap_the_nearer_axis_counts():
     black = white * np.uint8([0, 0, 0, 1])
     views = [View(Mount(FISHEYE), white), View(Mount(FISHEYE, BACK), black)]
     for order in (views, views[::-1]):
-        rgb, is_valid = sphere_of(order, 512)
+        rgb, is_valid = make_sphere(order, 512)
         assert is_valid.all()
         is_front = pixel_rays(512)[..., 0] > 0.002
         np.testing.assert_array_equal(rgb[..., 0][is_front], 255)
@@ -252,7 +258,7 @@ def test_the_sphere_is_as_fine_as_the_camera_and_bounded():
 def write_instant(folder, mounts, this, pose):
     folder.mkdir(parents=True)
     for mount in mounts:
-        write(folder / mount.image, encoded(picture_by(mount, this, pose, Workers(2)), ".png"))
+        write(folder / mount.image, encoded(render_picture(mount, this, pose, Workers(2)), ".png"))
     return folder
 
 

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import assert_refused, mutated, read_or_refused
 
-from piccolo.camera.files import document_of, mounts_of, read_calibration, read_rig
+from piccolo.camera.files import document_of, read_calibration, read_mounts, read_rig
 from piccolo.camera.model import MODELS, Camera
-from piccolo.camera.resampling import View, sphere_of, sphere_width
+from piccolo.camera.resampling import View, make_sphere, sphere_width
 from piccolo.camera.rig import Mount
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
@@ -97,7 +97,7 @@ def test_our_own_json_comes_back(tmp_path):
     mounts = (Mount(lens), Mount(lens, rows(TURN), (0.0, 0.01, -0.02), (800, 0)))
     for some in (mounts, mounts[:1], mounts[1:]):
         document = document_of(some)
-        assert mounts_of(json.loads(json.dumps(document))) == some
+        assert read_mounts(json.loads(json.dumps(document))) == some
         found = read_calibration(write(tmp_path / "a.json", document))
         assert found.mounts == some
         assert not found.is_choice
@@ -233,7 +233,9 @@ def test_any_camera_that_is_taken_can_be_resampled(data):
     except InputError:
         return
     views = [View(Mount(camera), np.full((48, 64, 4), 255, np.uint8))]
-    rgb, is_valid = sphere_of(views, sphere_width([view.mount for view in views]) if params[0] < 99 else 512)
+    rgb, is_valid = make_sphere(
+        views, sphere_width([view.mount for view in views]) if params[0] < 99 else 512
+    )
     assert rgb[is_valid].min(initial=255) == 255
     pixels = np.random.default_rng(0).uniform(0.0, 1.0, (200, 2)) * (64, 48)
     rays, is_seen = camera.rays(pixels)

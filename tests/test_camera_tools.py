@@ -17,7 +17,7 @@ from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
 from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.world import make_world, photograph, picture_by, pose_of_query
+from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query, render_picture
 from piccolo.views.pictures import cut, sphere_width_for
 
 WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))
@@ -43,7 +43,7 @@ def test_the_same_pose_is_photographed_as_a_sphere_and_by_a_camera():
     full = photograph(room, pose, 2048, Workers(2))
     mount = Mount(WIDE, TURN)
     difference = np.abs(
-        cut(full, WIDE, mount.rotation).astype(int) - picture_by(mount, room, pose, Workers(2))
+        cut(full, WIDE, mount.rotation).astype(int) - render_picture(mount, room, pose, Workers(2))
     )
     assert np.median(difference) <= 2
     assert difference.mean() < 4

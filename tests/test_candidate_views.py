@@ -130,7 +130,7 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
     monkeypatch.setattr(points_around, "average_view", average_view)
     views = points_around.RecentViews(octree)
     here, near, far = _pose(0.296, 0.2, 0.3), _pose(0.304, 0.197, 0.304), _pose(0.306, 0.2, 0.3)
-    places = [points_around.place_of(pose) for pose in (here, near, far)]
+    places = [points_around.round_position(pose) for pose in (here, near, far)]
     assert places[0] == places[1] != places[2]
     sums = [views.averages(place, FINE) for place in places]
     assert sums[0] is sums[1]
@@ -143,7 +143,7 @@ def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):
 
 def test_views_and_points_count_from_their_place():
     query, pose = _query(), _pose(0.307, 0.191, 0.304)
-    place = points_around.place_of(pose)
+    place = points_around.round_position(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, FINE_CELLS)
     points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), 30_000)
     for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):

@@ -10,7 +10,7 @@ from test_cloud_morton import whole
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.readers import mesh as mesh_module
 from piccolo.cloud.readers import mesh_files
-from piccolo.cloud.readers.mesh import linear_to_srgb, look_up, open_mesh, srgb_to_linear, weights_of
+from piccolo.cloud.readers.mesh import compute_weights, linear_to_srgb, look_up, open_mesh, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 
@@ -167,7 +167,7 @@ def test_points_leave_no_gaps_and_no_clumps(tmp_path):
     points = whole(open_mesh, made.write_obj(tmp_path)).points_world
     counts = np.histogram2d(points[:, 0], points[:, 1], bins=20)[0]
     assert abs(counts - 25).max() <= 7  # chance would give +-18
-    weights = weights_of(np.arange(30_000_000 - 9000, 30_000_000))
+    weights = compute_weights(np.arange(30_000_000 - 9000, 30_000_000))
     assert weights.min() >= 0
     np.testing.assert_allclose(weights.sum(axis=1), 1, atol=1e-15)
     np.testing.assert_allclose(weights.mean(axis=0), 1 / 3, atol=1e-3)

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, open_source, stream_of
+from piccolo.cloud import Cloud, open_source, stream_points
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
 from piccolo.cloud.voxels import morton_codes, morton_order
@@ -26,7 +26,7 @@ def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
 
 def clean(path, raw, scale):
     """The cloud of points in memory as if they had been read from a file."""
-    return replace(stream_of(path, raw), scale=scale).read()
+    return replace(stream_points(path, raw), scale=scale).read()
 
 
 def whole(open_file, path, options=IN_METRES):

@@ -11,7 +11,7 @@ from measuring.confidence import mask_outside_field, occlude
 
 from piccolo.confidence.localization import Evidence
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.sphere import cell_of, pixel_rays, solid_angles
+from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.localization.comparison import (
@@ -55,7 +55,7 @@ def _hidden(fraction):
 
 def _blocks_of(is_chosen):
     """Fraction (blocks,) of each block that is chosen (H, W)."""
-    block = cell_of(pixel_rays(WIDTH).reshape(-1, 3).astype(np.float32), BLOCK_RINGS)
+    block = find_cell(pixel_rays(WIDTH).reshape(-1, 3).astype(np.float32), BLOCK_RINGS)
     total = np.bincount(block, AREAS.ravel(), NUM_BLOCKS)
     return np.bincount(block, (AREAS * is_chosen).ravel(), NUM_BLOCKS) / total
 
@@ -100,18 +100,18 @@ def test_score_and_ratio_by_hand():
     a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
     b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
-    assert a.ratio_to(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
-    assert b.ratio_to(a) == pytest.approx(1 / a.ratio_to(b))
-    assert a.ratio_to(a) == 1.0
+    assert a.compute_ratio(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
+    assert b.compute_ratio(a) == pytest.approx(1 / a.compute_ratio(b))
+    assert a.compute_ratio(a) == 1.0
     elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
     other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
-    assert elsewhere.ratio_to(other) == 0.0
+    assert elsewhere.compute_ratio(other) == 0.0
 
 
 def test_the_true_pose_explains_more_than_others():
     seen, true_pose = _clean()
     assert 0.6 < seen.score < 1.0
-    assert seen.ratio_to(seen) == 1.0
+    assert seen.compute_ratio(seen) == 1.0
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
     query = _query(rooms.query(1).rgb)
     turned = compare(query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world))
@@ -120,7 +120,7 @@ def test_the_true_pose_explains_more_than_others():
     )
     for wrong in (turned, moved):
         assert wrong.score < 0.5 * seen.score
-        assert wrong.ratio_to(seen) < 0.5
+        assert wrong.compute_ratio(seen) < 0.5
 
 
 @pytest.mark.parametrize("fraction", [0.2, 0.5])

@@ -10,7 +10,7 @@ from piccolo.confidence import alternatives
 from piccolo.confidence import confidence as rule
 from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
-from piccolo.confidence.occlusion import Agreement, agreement_at
+from piccolo.confidence.occlusion import Agreement, measure_agreement
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, step
 from piccolo.localization.settings import CoarseToFineSettings
@@ -163,11 +163,11 @@ def scene():
 
 def test_true_pose_scores_high_and_explains_most_of_the_panorama(scene):
     points, panorama, true_pose = scene
-    assert agreement_at(points, panorama, true_pose).score > 0.5
+    assert measure_agreement(points, panorama, true_pose).score > 0.5
     for delta in ([0, 0, 1.0, 0, 0, 0], [0, 0, 0, 1.0, 0.5, 0]):
-        assert agreement_at(points, panorama, step(true_pose, np.array(delta))).score < 0.25
-    right = agreement_at(points, panorama, true_pose)
-    wrong = agreement_at(points, panorama, step(true_pose, np.array([0, 0, 1.0, 0, 0, 0])))
+        assert measure_agreement(points, panorama, step(true_pose, np.array(delta))).score < 0.25
+    right = measure_agreement(points, panorama, true_pose)
+    wrong = measure_agreement(points, panorama, step(true_pose, np.array([0, 0, 1.0, 0, 0, 0])))
     assert right.correlation > 0.5 > wrong.correlation
     assert 0.9 < right.seen_fraction <= 1.0
 
@@ -176,7 +176,7 @@ def test_true_pose_scores_high_and_explains_most_of_the_panorama(scene):
 def test_a_blank_wall_can_not_win(scene, level):
     points, panorama, true_pose = scene
     blank = as_panorama(np.full_like(panorama.rgb, level))
-    assert abs(agreement_at(points, blank, true_pose).score) < 0.05
+    assert abs(measure_agreement(points, blank, true_pose).score) < 0.05
 
 
 def test_score_and_value_charge_a_view_of_which_little_is_seen():

@@ -17,8 +17,8 @@ from piccolo.scenes.evaluation.query_result import (
     PAPER_THRESHOLDS,
     QueryResult,
     Thresholds,
+    make_query_result,
     match_results,
-    query_result_of,
     read_run,
 )
 from piccolo.scenes.scene import Query, Scene
@@ -57,7 +57,7 @@ ROWS = [
 
 def test_errors_of_a_query_and_the_thresholds_of_the_paper(tmp_path):
     scene = _scene(tmp_path)
-    row = query_result_of(scene, scene.queries[0], result("a.jpg", _pose(0.05, 3.0)), True)
+    row = make_query_result(scene, scene.queries[0], result("a.jpg", _pose(0.05, 3.0)), True)
     assert row.position_error == pytest.approx(0.05)
     assert np.degrees(row.rotation_error) == pytest.approx(3.0)
     assert (row.scene, row.image, row.variant) == ("room", "images/a.jpg", "clean")

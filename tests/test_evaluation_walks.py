@@ -12,10 +12,10 @@ from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.scenes.evaluation.query_result import (
     PAPER_THRESHOLDS,
     QueryResult,
+    make_query_result,
     match_results,
-    query_result_of,
 )
-from piccolo.scenes.evaluation.walks import summarize_all, summarize_walk, walk_table, walks_of
+from piccolo.scenes.evaluation.walks import group_walks, summarize_all, summarize_walk, walk_table
 from piccolo.scenes.scene import Query, Scene
 
 RATE = 2.0
@@ -45,10 +45,10 @@ def frames_of(tmp_path, changes, **more):
     queries = walk_of(tmp_path, **more)
     scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", tuple(queries))
     rows = [
-        query_result_of(scene, query, found(query, **changes.get(int(RATE * query.time), {})), None)
+        make_query_result(scene, query, found(query, **changes.get(int(RATE * query.time), {})), None)
         for query in queries
     ]
-    return walks_of([scene], rows)
+    return group_walks([scene], rows)
 
 
 def test_path_errors_equal_evo(tmp_path):
@@ -138,7 +138,7 @@ def test_walks_are_summed_up_without_a_step_from_one_to_the_next(tmp_path):
 def test_a_photo_without_an_answer_has_no_errors_and_is_read_back_without(tmp_path):
     query = dataclasses.replace(walk_of(tmp_path)[0], is_answerable=False)
     scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", (query,))
-    row = query_result_of(scene, query, found(query), None)
+    row = make_query_result(scene, query, found(query), None)
     again = QueryResult.from_json(row.to_json())
     assert not row.is_correct()
     assert (again.position_error, again.rotation_error) == (np.inf, np.inf)

@@ -164,18 +164,18 @@ def test_colmap_has_a_camera_a_size_and_refuses_blanks_in_names(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "pixels_of", "options"),
+    ("name", "compute_pixels", "options"),
     [
         ("nerfstudio", nerfstudio_pixels, SIZED),
         ("opensfm", opensfm_pixels, SIZED),
         ("potree", potree_pixels, Options()),
     ],
 )
-def test_readers_project_to_our_pixels(tmp_path, name, pixels_of, options):
+def test_readers_project_to_our_pixels(tmp_path, name, compute_pixels, options):
     export(_results(), name, tmp_path / "out", options)
     for number, pose in enumerate(POSES):
         pixels, points = pixels_and_points(pose)
-        _check_pixels(pixels_of(tmp_path / "out", number, points), pixels)
+        _check_pixels(compute_pixels(tmp_path / "out", number, points), pixels)
 
 
 def test_nerfstudio_with_two_sizes_and_an_offset(tmp_path):

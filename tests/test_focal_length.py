@@ -11,7 +11,7 @@ from test_localize_cameras import place, scan
 import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
-from piccolo.camera.resampling import View, sphere_of
+from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Evidence, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
@@ -20,14 +20,14 @@ from piccolo.localization.localize import select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
-from piccolo.scenes.synthetic.world import picture_by
+from piccolo.scenes.synthetic.world import render_picture
 
 TRUE = 320.0  # [px] of the photos here, 640 x 480
 
 
 def _photo(camera):
     this, pose = place(1)
-    return picture_by(Mount(camera), this, pose, Workers(2)), pose
+    return render_picture(Mount(camera), this, pose, Workers(2)), pose
 
 
 def _panorama(rgb, **options):
@@ -147,7 +147,7 @@ def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask():
     panorama = _panorama(rgb, focal_px=TRUE, mask_nadir_deg=80.0)
     found = panorama.resample(pinhole(640, 480, 1.1 * TRUE), 1024)
     pixels = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    wanted, is_wanted = sphere_of([View(Mount(pinhole(640, 480, 1.1 * TRUE)), pixels)], 1024)
+    wanted, is_wanted = make_sphere([View(Mount(pinhole(640, 480, 1.1 * TRUE)), pixels)], 1024)
     assert not found.is_valid[300:].any()
     assert is_wanted[300:].any()
     assert (found.is_valid == is_wanted)[:270].mean() > 0.998

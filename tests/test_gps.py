@@ -13,8 +13,8 @@ from pyproj import Transformer
 from test_cloud_las import RAW
 
 import piccolo
-from piccolo.cloud.crs import crs_of, from_wgs84
-from piccolo.panorama.photo import GpsPosition, photo_of
+from piccolo.cloud.crs import from_wgs84, read_crs
+from piccolo.panorama.photo import GpsPosition, read_photo_facts
 from piccolo.scan_map.prior import Prior, gps_prior
 
 UTM = "EPSG:25832"
@@ -44,14 +44,14 @@ def test_a_photo_says_what_it_is_and_when_and_where_it_was_taken(tmp_path):
     rgb = rooms.query(1).rgb
     time = "2026:11:22 10:02:03", "25", "+01:00"
     path = write_photo(tmp_path / "a.jpg", rgb, (-48.5, 9.75), 4.0, time)
-    photo = photo_of(path)
+    photo = read_photo_facts(path)
     assert photo.sha256 == hashlib.sha256(path.read_bytes()).hexdigest()
     assert photo.image_size == (rooms.WIDTH, rooms.WIDTH // 2)
     assert photo.capture_time == "2026-11-22T10:02:03.25+01:00"
     assert photo.gps == GpsPosition(pytest.approx(-48.5), pytest.approx(9.75), 4.0)
-    bare = photo_of(write_photo(tmp_path / "b.jpg", rgb, time=("soon", "", "")))
+    bare = read_photo_facts(write_photo(tmp_path / "b.jpg", rgb, time=("soon", "", "")))
     assert (bare.capture_time, bare.gps) == (None, None)
-    assert photo_of(write_photo(tmp_path / "c.jpg", rgb, (0.0, 0.0))).gps is None
+    assert read_photo_facts(write_photo(tmp_path / "c.jpg", rgb, (0.0, 0.0))).gps is None
 
 
 def las_with_record(record_id, content):
@@ -75,10 +75,10 @@ def test_las_names_its_system(tmp_path):
         (7, b"else", ""),
     ):
         path.write_bytes(las_with_record(record_id, content))
-        assert crs_of([path]) == expected
+        assert read_crs([path]) == expected
     other = tmp_path / "a.xyz"
     other.write_text("0 0 0 1 2 3\n")
-    assert crs_of([other]) == ""
+    assert read_crs([other]) == ""
 
 
 def test_a_position_becomes_a_prior_of_any_height():

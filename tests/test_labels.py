@@ -18,7 +18,7 @@ from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
-from piccolo.geometry.colors import NUM_COLORS, Labels, colors_of, palette
+from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
 from piccolo.panorama import ReadOptions as PanoramaOptions
 from piccolo.panorama import read_panorama
 
@@ -31,16 +31,16 @@ READ_IMAGE = PanoramaOptions(labels=Labels())
 
 @pytest.mark.parametrize(("count", "least"), [(16, 123.0), (64, 68.0), (256, 38.0), (NUM_COLORS, 16.0)])
 def test_colors_of_the_first_labels_are_far_apart(count, least):
-    assert pdist(colors_of(np.arange(count)).astype(float)).min() >= least
+    assert pdist(label_colors(np.arange(count)).astype(float)).min() >= least
 
 
 def test_no_color_is_black_and_a_label_alone_decides():
     assert palette().max(axis=1).min() > 0
     shuffled = np.array([[5, 70_000], [-1, 5]])
-    np.testing.assert_array_equal(colors_of(shuffled)[0, 0], colors_of(shuffled)[1, 1])
-    np.testing.assert_array_equal(colors_of(shuffled)[1, 0], palette()[NUM_COLORS - 1])
+    np.testing.assert_array_equal(label_colors(shuffled)[0, 0], label_colors(shuffled)[1, 1])
+    np.testing.assert_array_equal(label_colors(shuffled)[1, 0], palette()[NUM_COLORS - 1])
     for step in (256, 65_536):
-        assert len(np.unique(colors_of(step * np.arange(256)), axis=0)) == 256
+        assert len(np.unique(label_colors(step * np.arange(256)), axis=0)) == 256
 
 
 def _ply(path, name="label", kind="i4", text=False, values=LABELS, points=POINTS):
@@ -53,7 +53,7 @@ def _ply(path, name="label", kind="i4", text=False, values=LABELS, points=POINTS
 @pytest.mark.parametrize(("kind", "text"), [("u1", False), ("i4", True), ("f4", False), ("f8", True)])
 def test_ply(tmp_path, name, kind, text):
     read = whole(open_source, _ply(tmp_path / "a.ply", name, kind, text), READ)
-    np.testing.assert_array_equal(read.colors, colors_of(LABELS))
+    np.testing.assert_array_equal(read.colors, label_colors(LABELS))
     np.testing.assert_allclose(read.points_world, POINTS, rtol=1e-14)
 
 
@@ -61,7 +61,7 @@ def test_ignored_labels_are_left_out(tmp_path):
     read = whole(open_source, _ply(tmp_path / "a.ply"), CloudSettings(labels=Labels((0, 7, 99))))
     is_kept = (LABELS != 0) & (LABELS != 7)
     np.testing.assert_array_equal(read.points_world, POINTS[is_kept])
-    np.testing.assert_array_equal(read.colors, colors_of(LABELS[is_kept]))
+    np.testing.assert_array_equal(read.colors, label_colors(LABELS[is_kept]))
     everything = CloudSettings(labels=Labels(tuple(range(21))))
     with pytest.raises(InputError, match="found 0 finite points"):
         open_cloud([tmp_path / "a.ply"], everything).read()
@@ -92,14 +92,14 @@ def test_las(tmp_path, point_format, most, is_compressed):
     content = las_bytes(raw, point_format, classes=classes, withheld=withheld)
     path = write(tmp_path / "a.las", laz_bytes(content, chunk=700) if is_compressed else content)
     read = whole(open_source, path, READ)
-    np.testing.assert_array_equal(read.colors, colors_of(classes[:2900]))
+    np.testing.assert_array_equal(read.colors, label_colors(classes[:2900]))
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])
 def test_pcd(tmp_path, encoding):
     fields = [*((axis, "f4", 1, POINTS[:, k]) for k, axis in enumerate("xyz")), ("label", "u4", 1, LABELS)]
     path = write(tmp_path / "a.pcd", content_of(fields, encoding, 3000))
-    np.testing.assert_array_equal(whole(open_source, path, READ).colors, colors_of(LABELS))
+    np.testing.assert_array_equal(whole(open_source, path, READ).colors, label_colors(LABELS))
     write(path, path.read_bytes().replace(b"label", b"ring_"))
     assert_refused("the fields are 'x y z ring_', wanted x y z and label", open_source, path, READ)
 
@@ -129,7 +129,7 @@ def test_pictures_of_labels_in_8_16_and_24_bits(tmp_path):
     bgr = np.stack([of_24_bits & 255, of_24_bits >> 8 & 255, of_24_bits >> 16], axis=-1)
     for labels, pixels in ((IMAGE, np.uint8(IMAGE)), (deep, np.uint16(deep)), (of_24_bits, np.uint8(bgr))):
         panorama = read_panorama(_png(tmp_path / "a.png", pixels), READ_IMAGE)
-        np.testing.assert_array_equal(panorama.rgb, colors_of(labels))
+        np.testing.assert_array_equal(panorama.rgb, label_colors(labels))
         assert panorama.is_valid.all()
 
 

@@ -12,7 +12,7 @@ from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.feature_map import make_feature_map
-from piccolo.local_features.hypotheses import count_matches, exact_pose, poses_of, rough_poses
+from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import Matches
 from piccolo.localization.attempts import match_poses
 from piccolo.localization.localize import localize
@@ -76,7 +76,7 @@ def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin(pose, is_
 @pytest.mark.parametrize("R_cam_from_level", [None, LEVEL])
 def test_the_pose_is_found_among_wrong_matches(R_cam_from_level):
     matches = _exact_matches(TILTED, 60, num_wrong=40)
-    found = poses_of(matches, R_cam_from_level, 6, Workers())
+    found = propose_poses(matches, R_cam_from_level, 6, Workers())
     assert found[0].num_matches >= 20
     assert rooms.errors(found[0].pose, TILTED)[0] < 1e-4
     assert all(one.num_matches <= 6 for one in found[1:])
@@ -101,13 +101,13 @@ def test_a_pose_off_the_known_vertical_is_none():
 def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant, is_known):
     query = _query(1, variant)
     level = query.photo.R_cam_from_level if is_known else None
-    found = poses_of(query.matches, level, 6, Workers(2))
+    found = propose_poses(query.matches, level, 6, Workers(2))
     distance, angle_deg = rooms.errors(found[0].pose, _true_pose(1, variant))
     assert distance < 0.05
     assert angle_deg < 1.0
     assert found[0].num_matches >= 12
     assert [one.num_matches for one in found] == sorted((one.num_matches for one in found), reverse=True)
-    alone = poses_of(query.matches, level, 6, Workers(1))
+    alone = propose_poses(query.matches, level, 6, Workers(1))
     for one, other in zip(found, alone, strict=True):
         np.testing.assert_array_equal(one.pose.R_cam_from_world, other.pose.R_cam_from_world)
         np.testing.assert_array_equal(one.pose.center_world, other.pose.center_world)
@@ -119,12 +119,12 @@ def test_noise_has_no_pose_that_many_matches_agree_with():
     panorama, scan_map = rooms.as_panorama(rgb), rooms.scan_map(1)
     query = prepare_query(panorama, scan_map, CoarseToFineSettings(), Workers(2))
     for level in (None, np.eye(3)):
-        found = poses_of(query.matches, level, 6, Workers(2))
+        found = propose_poses(query.matches, level, 6, Workers(2))
         assert max([0, *(one.num_matches for one in found)]) < 8
     flat = prepare_query(
         rooms.as_panorama(np.full_like(rgb, 90)), scan_map, CoarseToFineSettings(), Workers(2)
     )
-    assert poses_of(flat.matches, None, 6, Workers(2)) == []
+    assert propose_poses(flat.matches, None, 6, Workers(2)) == []
 
 
 def test_poses_that_contradict_a_prior_are_told():

@@ -7,7 +7,7 @@ import rooms
 from measuring.places import REPEATED_KINDS, make_repeated
 from rooms import as_panorama, errors, query
 
-from piccolo.cloud import stream_of
+from piccolo.cloud import stream_points
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.geometry.pose import exp_so3, log_so3, step
 from piccolo.jobs.stopwatch import Stopwatch
@@ -53,11 +53,11 @@ def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
 def test_hessian_predicts_the_gradient_a_step_away(found):
     prepared, pose, _ = found
     points = _points(prepared, pose)
-    hessian = covariance.hessian_at(prepared.photo.images.full(), points, pose, covariance.STEPS[0])
+    hessian = covariance.compute_hessian(prepared.photo.images.full(), points, pose, covariance.STEPS[0])
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
-        before = covariance.gradient_at(prepared.photo.images.full(), points, pose)
-        after = covariance.gradient_at(prepared.photo.images.full(), points, moved)
+        before = covariance.compute_gradient(prepared.photo.images.full(), points, pose)
+        after = covariance.compute_gradient(prepared.photo.images.full(), points, moved)
         expected = hessian @ delta
         assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
 
@@ -113,7 +113,7 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
         return np.diag([1.0] * 5 + [-1.0 if any(image is i for i, _ in ways[:num_rough]) else 1.0])
 
     gradients = np.random.default_rng(0).normal(size=(100, 6))
-    monkeypatch.setattr(covariance, "hessian_at", hessian)
+    monkeypatch.setattr(covariance, "compute_hessian", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose)
     assert asked == ways[: 2 if num_rough == 1 else 3]
@@ -127,7 +127,7 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
 def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     world = World(1, make_repeated(kind, 1, np.array(rooms.SIZE)))
     points, colors, _ = scan_world(world, 80_000 * len(world.rooms), Workers(2))
-    cloud = stream_of(Path("repeated"), RawCloud(points.astype(float), colors))
+    cloud = stream_points(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
     result = localize(built, panorama, CoarseToFineSettings(), Workers(2), Stopwatch())

@@ -27,7 +27,13 @@ from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import ReadOptions, read_panorama
 from piccolo.result import Result, read_results
 from piccolo.scan import Scan
-from piccolo.scenes.synthetic.world import make_query, photograph, picture_by, picture_of_all, pose_of_query
+from piccolo.scenes.synthetic.world import (
+    make_query,
+    photograph,
+    picture_of_all,
+    pose_of_query,
+    render_picture,
+)
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 512, 512, (150.0, 150.0, 256.0, 256.0, 0.01, -0.003, 0.0, 0.0), 95.0)
@@ -98,7 +104,7 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     R_tilt = exp_so3(np.radians([15.0, 0.0, 0.0])) @ exp_so3(np.radians([0.0, 20.0, 0.0]))
     pose = Pose(R_tilt @ upright.R_cam_from_world, upright.center_world)
     camera = Camera("SIMPLE_FISHEYE", 800, 600, (230.0, 400.0, 300.0))
-    rgb = picture_by(Mount(camera), this, pose, Workers(2))
+    rgb = render_picture(Mount(camera), this, pose, Workers(2))
     down = tuple((pose.R_cam_from_world @ [0.0, 0.0, -9.81]).tolist())
     fov_deg = float(np.degrees(800 / 230.0))
     result = scan().localize(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down, gravity="known")
@@ -148,7 +154,7 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
         instant = tmp_path / "walk" / name
         instant.mkdir(parents=True)
         for mount in mounts:
-            write(instant / mount.image, encoded(picture_by(mount, this, pose, Workers(2)), ".png"))
+            write(instant / mount.image, encoded(render_picture(mount, this, pose, Workers(2)), ".png"))
     cloud = ["--cloud", str(folder / "cloud.ply"), "--cache", "none", "--gravity", "known"]
     main([*cloud, "--pano", str(tmp_path / "walk"), "--rig", str(rig), "--out", str(tmp_path / "out.jsonl")])
     results = read_results([tmp_path / "out.jsonl"])
@@ -157,7 +163,7 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     assert all(pose_errors(result.best_pose, pose)[0] < 0.02 for result in results)
     assert results[0].source.pano_sha256 == results[1].source.pano_sha256
     capsys.readouterr()
-    wide = picture_by(Mount(pinhole(480, 360, 150.0)), this, pose, Workers(2))
+    wide = render_picture(Mount(pinhole(480, 360, 150.0)), this, pose, Workers(2))
     exif = Image.Exif()
     exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 600 px diagonal: 152.5 px
     Image.fromarray(wide).save(tmp_path / "phone.jpg", exif=exif, quality=95)

@@ -22,7 +22,7 @@ from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
-from piccolo.panorama.photo import photo_of
+from piccolo.panorama.photo import read_photo_facts
 from piccolo.panorama.video import frames_of
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
@@ -188,4 +188,4 @@ def test_the_file_of_a_photo_tells_of_it_without_being_decoded(tmp_path, monkeyp
     if is_behind:
         path.write_bytes(content[:begin] + content[end:-12] + content[begin:end] + content[-12:])
     monkeypatch.setattr(PngImageFile, "load", lambda *_: pytest.fail("decoded"))
-    assert photo_of(path).capture_time == "2024-05-06T07:08:09"
+    assert read_photo_facts(path).capture_time == "2024-05-06T07:08:09"

@@ -12,7 +12,7 @@ from piccolo.confidence.occlusion import (
     LEAST_COVERED,
     MOST_DIFFERENCE,
     NOT_SCANNED,
-    occlusion_at,
+    compare_occlusion,
     occlusion_mask,
     write_squares,
 )
@@ -66,7 +66,7 @@ def test_occluders_are_where_the_mask_is_white(contrast):
             mask = occlusion_mask(points, photo, pose)
             was_scanned = mask != NOT_SCANNED
             overlaps.append(_intersection_over_union(mask == CONTRADICTED, (number > 0) & was_scanned))
-            explained, contradicted = occlusion_at(points, photo, pose).fractions()
+            explained, contradicted = compare_occlusion(points, photo, pose).fractions()
             assert contradicted / (explained + contradicted) == pytest.approx(fraction, abs=0.15)
             assert explained + contradicted <= 1.0
     assert np.median(overlaps) >= 0.75
@@ -78,7 +78,7 @@ def test_an_unchanged_room_contradicts_nothing_whatever_the_exposure(gains):
     for seed in SEEDS:
         points, panorama, pose = rooms.scene(seed)
         photo = rooms.as_panorama((panorama.rgb * np.array(gains)).clip(0, 255).astype(np.uint8))
-        explained, contradicted = occlusion_at(points, photo, pose).fractions()
+        explained, contradicted = compare_occlusion(points, photo, pose).fractions()
         assert contradicted < 0.02
         assert explained > 0.75
 
@@ -112,14 +112,14 @@ def test_what_was_not_scanned_or_not_photographed_is_grey():
     forward = pixel_rays(rooms.WIDTH)[..., 0]
     assert np.mean(mask[forward < -0.1] == NOT_SCANNED) > 0.99
     assert np.mean(mask[(forward > 0.1) & is_valid] == EXPLAINED) > 0.9
-    explained, contradicted = occlusion_at(half, photo, pose).fractions()
+    explained, contradicted = compare_occlusion(half, photo, pose).fractions()
     assert 0.4 < explained < 0.52
     assert contradicted < 0.02
 
 
 def test_nothing_in_common_is_neither_explained_nor_contradicted():
     points, panorama, pose = rooms.scene(1)
-    nothing = occlusion_at(points, Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool)), pose)
+    nothing = compare_occlusion(points, Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool)), pose)
     assert nothing.fractions() == (0.0, 0.0)
     assert not (nothing.coverage > LEAST_COVERED).any()
 

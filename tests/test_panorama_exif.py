@@ -14,7 +14,7 @@ from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
 from piccolo.panorama import GPano, ReadOptions, panorama_of_array, read_panorama
 from piccolo.panorama.gpano import attitude_of_gravity, rotation_to_level
-from piccolo.panorama.photo import focal_of
+from piccolo.panorama.photo import read_focal_length
 
 PHOTO = smooth_rgb(360, 480)
 
@@ -53,12 +53,12 @@ def test_a_phone_photo_is_read_with_no_option(tmp_path):
 
 def test_the_resolution_of_the_sensor_goes_before_the_rounded_equivalent():
     size = (480, 360)
-    assert focal_of(PLANE, size).focal == pytest.approx(360.0)  # 4.5 mm of a sensor 6 mm wide
-    assert focal_of({**PLANE, **FILM}, size).focal == pytest.approx(360.0)
-    assert focal_of(PLANE, (240, 180)).focal == pytest.approx(180.0)  # made smaller since
-    assert focal_of({**PLANE, Base.FocalPlaneResolutionUnit: 3}, size).focal == pytest.approx(914.4)
+    assert read_focal_length(PLANE, size).focal == pytest.approx(360.0)  # 4.5 mm of a sensor 6 mm wide
+    assert read_focal_length({**PLANE, **FILM}, size).focal == pytest.approx(360.0)
+    assert read_focal_length(PLANE, (240, 180)).focal == pytest.approx(180.0)  # made smaller since
+    assert read_focal_length({**PLANE, Base.FocalPlaneResolutionUnit: 3}, size).focal == pytest.approx(914.4)
     cropped = {**PLANE, Base.FocalLengthIn35mmFilm: 52}
-    assert focal_of(cropped, size).focal == pytest.approx(52.0 / 43.2666 * 600.0, rel=1e-5)
+    assert read_focal_length(cropped, size).focal == pytest.approx(52.0 / 43.2666 * 600.0, rel=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -74,7 +74,7 @@ def test_the_resolution_of_the_sensor_goes_before_the_rounded_equivalent():
     ],
 )
 def test_metadata_that_make_no_sense_count_as_missing(tags):
-    assert focal_of(tags, (480, 360)) is None
+    assert read_focal_length(tags, (480, 360)) is None
 
 
 @pytest.mark.parametrize("end", [20, 60, 90, 120])

@@ -12,7 +12,7 @@ from pillow_heif import register_heif_opener
 from refusals import assert_refused
 
 from piccolo.panorama import ReadOptions, read_panorama
-from piccolo.panorama.photo import photo_of
+from piccolo.panorama.photo import read_photo_facts
 from piccolo.panorama.picture import read_picture
 
 RGB = smooth_rgb()
@@ -169,7 +169,7 @@ def test_heic_is_read(tmp_path):
     panorama = read_panorama(path)
     assert np.abs(panorama.rgb.astype(int) - RGB).mean() < 3.0
     assert panorama.is_valid.all()
-    assert photo_of(path).capture_time == "2026-03-01T10:00:00"
+    assert read_photo_facts(path).capture_time == "2026-03-01T10:00:00"
 
 
 def test_a_phone_s_heic_is_turned_once_and_has_a_focal_length(tmp_path):

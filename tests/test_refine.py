@@ -9,8 +9,8 @@ import rooms
 from rooms import errors
 
 from piccolo.geometry.pose import Pose, pose_errors, step, yaw_rotation
-from piccolo.optimize.descent_animation import gif_of, perturb_pose, refine_with_history
-from piccolo.optimize.refine import Adam, DescentSettings, descend_lbfgs, refine, sampling_loss_of
+from piccolo.optimize.descent_animation import encode_gif, perturb_pose, refine_with_history
+from piccolo.optimize.refine import Adam, DescentSettings, descend_lbfgs, make_sampling_loss, refine
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 
@@ -28,7 +28,7 @@ def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
     points, panorama, true_pose = scene
     texels = pack_texels(panorama.rgb)
     settings = dataclasses.replace(PaperSettings(), solver=solver, use_visibility=use_visibility)
-    refined = refine(points, sampling_loss_of(texels), step(true_pose, PERTURBATION), settings)
+    refined = refine(points, make_sampling_loss(texels), step(true_pose, PERTURBATION), settings)
     distance, angle_deg = errors(refined.pose, true_pose)
     assert distance < 0.010
     assert angle_deg < 0.3
@@ -82,7 +82,7 @@ def test_a_descent_with_history_is_the_descent(points, solver):
     assert pose_errors(start, goal) == pytest.approx((0.15, np.radians(4.0)))
     how = DescentSettings(solver=solver, num_iterations=40, step_size=0.02)
     refined, history = refine_with_history(points, texels, start, how)
-    plain = refine(points, sampling_loss_of(texels), start, how)
+    plain = refine(points, make_sampling_loss(texels), start, how)
     np.testing.assert_array_equal(refined.pose.center_world, plain.pose.center_world)
     np.testing.assert_array_equal(history[0].pose.center_world, start.center_world)
     np.testing.assert_array_equal(history[-1].pose.center_world, plain.pose.center_world)
@@ -94,7 +94,7 @@ def test_a_descent_with_history_is_the_descent(points, solver):
 
 def test_a_gif_reads_back(tmp_path):
     frames = [np.full((26, 30, 3), (40 * k, 255 - 40 * k, 90), np.uint8) for k in range(4)]
-    (tmp_path / "a.gif").write_bytes(gif_of(frames))
+    (tmp_path / "a.gif").write_bytes(encode_gif(frames))
     video = cv2.VideoCapture(str(tmp_path / "a.gif"))
     read = [frame for is_read, frame in iter(video.read, (False, None)) if is_read]
     assert len(read) >= len(frames)

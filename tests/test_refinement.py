@@ -33,7 +33,7 @@ def _fit(x, score, yaw_deg=0.0):
 def _asked():
     """A query whose images are their names, of a photo that shows all cells."""
     images = Images(*(Once(lambda name=name: name) for name in Images._fields))
-    photo = SimpleNamespace(images=images, shown_cells=lambda *_: np.ones(3))
+    photo = SimpleNamespace(images=images, find_shown_cells=lambda *_: np.ones(3))
     return replace(QUERY, photo=photo, cache=Cache(VIEWS))
 
 
@@ -197,8 +197,8 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     narrow = whole.mask_pixels(is_hidden)
     grid = make_grid(METHOD.full_view.num_rings)
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
-    shown = narrow.photo.shown_cells(METHOD.full_view.num_rings, pose)
-    assert whole.photo.shown_cells(METHOD.full_view.num_rings, pose).all()
+    shown = narrow.photo.find_shown_cells(METHOD.full_view.num_rings, pose)
+    assert whole.photo.find_shown_cells(METHOD.full_view.num_rings, pose).all()
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
     monkeypatch.setattr(query_module, "normalize_view", lambda sums, center, config, shown: shown)

@@ -15,7 +15,7 @@ from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
-from piccolo.report.entries import entries_of, names_of, short_names_of
+from piccolo.report.entries import collect_entries, shorten_names, unique_names
 from piccolo.scenes.export.video import writing_video
 
 STOREYS = ["--storeys", "Ground floor", "First floor"]
@@ -223,12 +223,12 @@ def test_names_are_short_and_different(tmp_path):
     house = House(tmp_path, 128)
     for name in ("a.jpg", "b.jpg", "a.jpg"):
         house.add(0, name)
-    assert names_of(entries_of([house.write_results()])) == ["a.jpg", "b.jpg", "a.jpg (2)"]
+    assert unique_names(collect_entries([house.write_results()])) == ["a.jpg", "b.jpg", "a.jpg (2)"]
 
 
 def test_short_names_have_folders_where_they_would_repeat():
     names = ["f1/a.jpg", "f2/a.jpg", "f1/b.jpg", "c.jpg", "c.png", "d.jpg", "d.jpg (2)"]
-    assert short_names_of(names) == ["f1/a.jpg", "f2/a.jpg", "b", "c.jpg", "c.png", "d", "d (2)"]
+    assert shorten_names(names) == ["f1/a.jpg", "f2/a.jpg", "b", "c.jpg", "c.png", "d", "d (2)"]
 
 
 def test_a_name_spoils_neither_page_nor_plan(strangers, tmp_path):

@@ -22,7 +22,7 @@ from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
-from piccolo.scan_map.named_scans import add_places, name_scan, scan_at
+from piccolo.scan_map.named_scans import add_places, find_scan_at, name_scan
 from piccolo.scan_map.prior import Prior
 from piccolo.scan_map.scan_addition import add_scan
 from piccolo.scan_map.scan_map import prepare_map
@@ -146,7 +146,7 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
     like = (scan_map.wide_features == everywhere.features).mean(axis=1)
     assert like.min() > 0.5
     assert np.median(like) > 0.99
-    assert scan_at(scan_map, old.centers[far][0]) == "A"
+    assert find_scan_at(scan_map, old.centers[far][0]) == "A"
     assert len(_features_of(scan_map, place[None] + [0.0, 0.0, 1e-9])) == 0
 
 

@@ -111,7 +111,7 @@ def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monk
     class Seen(NamedTuple):
         place: float
 
-        def ratio_to(self, other):
+        def compute_ratio(self, other):
             return ratios[self.place, other.place]
 
     monkeypatch.setattr(selection, "compare", lambda query, pose: Seen(pose.center_world[0]))
@@ -166,8 +166,8 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     for name, value in {
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
-        "agreement_at": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
-        "occlusion_at": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
+        "measure_agreement": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
+        "compare_occlusion": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "count_matches": lambda matches, pose: counts.get(place(pose), 0),
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from piccolo.geometry import sphere
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import (
-    cell_of,
+    find_cell,
     interpolation,
     make_grid,
     make_neighbors,
@@ -95,13 +95,13 @@ def test_pixel_jacobian_against_central_differences(where):
 
 def test_pixel_centres_come_back_from_their_rays():
     for width in (32, 250):
-        u, v = sphere.pixels_of(sphere.pixel_rays(width), width)
+        u, v = sphere.compute_pixels(sphere.pixel_rays(width), width)
         np.testing.assert_allclose(u, np.broadcast_to(np.arange(width) + 0.5, u.shape), atol=1e-9)
         np.testing.assert_allclose(v[:, 0], np.arange(width // 2) + 0.5, atol=1e-9)
-        rows, columns = sphere.indices_of(sphere.pixel_rays(width), width)
+        rows, columns = sphere.compute_indices(sphere.pixel_rays(width), width)
         assert np.array_equal(columns[0], np.arange(width))
         assert np.array_equal(rows[:, 0], np.arange(width // 2))
-    rows, columns = sphere.indices_of(np.array([[0.0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0]]), 8)
+    rows, columns = sphere.compute_indices(np.array([[0.0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0]]), 8)
     assert rows.tolist() == [0, 3, 2, 2]
     assert set(columns[2:]) <= {0, 7}
 
@@ -117,7 +117,7 @@ def test_cells_share_the_sphere_nearly_evenly(num_rings):
 @pytest.mark.parametrize("num_rings", [12, 24])
 def test_a_cells_centre_lies_in_it(num_rings):
     grid = make_grid(num_rings)
-    np.testing.assert_array_equal(cell_of(grid.directions, num_rings), np.arange(len(grid)))
+    np.testing.assert_array_equal(find_cell(grid.directions, num_rings), np.arange(len(grid)))
 
 
 def test_neighbours_are_near_and_weighted_by_a_gaussian():

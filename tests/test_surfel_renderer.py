@@ -15,7 +15,7 @@ from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, angle_between, exp_so3, step
 from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
-from piccolo.geometry.sphere import pixel_rays, pixels_of
+from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.views.pictures import encode_image, fill_holes
@@ -25,9 +25,9 @@ from piccolo.views.surfels import (
     MAX_SLOPE,
     MIN_RADIUS_PX,
     axes_of_pixels,
+    make_surfels,
     render_points,
     splat,
-    surfels_of,
 )
 from piccolo.views.zbuffer import View
 
@@ -67,7 +67,7 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     surfels = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
     rgb = rng.integers(0, 256, (300, 3), dtype=np.uint8)
     angles = np.maximum(np.arcsin(radius / distance), MIN_RADIUS_PX * 2 * np.pi / 64)
-    extents = np.column_stack([*pixels_of(center, 64), angles])
+    extents = np.column_stack([*compute_pixels(center, 64), angles])
     axes = axes_of_pixels(64)
     depth, sums = np.full((32, 64), np.inf, np.float32), np.zeros((32, 64, 5), np.float32)
     packed = pack_points(center.astype(np.float32), rgb).rgbx
@@ -198,7 +198,7 @@ def test_points_in_the_air_and_lines_are_no_surface():
     stray = np.column_stack([rng.uniform(0, 2, (5, 2)), rng.uniform(0.5, 1.0, 5)])
     line = np.column_stack([np.linspace(5, 6, 100), np.zeros(100), np.zeros(100)])
     points = np.concatenate([wall, stray, line]).astype(np.float32)
-    surfels = surfels_of(pack_points(points, np.zeros(points.shape, np.uint8)), WORKERS)
+    surfels = make_surfels(pack_points(points, np.zeros(points.shape, np.uint8)), WORKERS)
     assert not (surfels.points.z > 0.4).any()
     of_line = surfels.points.x > 4
     assert of_line.sum() > 90

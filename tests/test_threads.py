@@ -89,10 +89,10 @@ def test_a_burst_of_callers_leaves_no_more_threads_than_the_cores_have_use_for(m
     monkeypatch.setattr(threads, "num_cores", lambda: 2)
     monkeypatch.setattr(threads, "_idle", {})
     with ExitStack() as stack:
-        pools = [stack.enter_context(threads.pool_of(2)) for _ in range(5)]
+        pools = [stack.enter_context(threads.get_pool(2)) for _ in range(5)]
         assert [pool.submit(abs, -1).result() for pool in pools] == [1] * 5
     assert len(threads._idle[2]) == 2
-    with threads.pool_of(2) as pool:
+    with threads.get_pool(2) as pool:
         assert pool.submit(abs, -1).result() == 1
 
 

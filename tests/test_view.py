@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.geometry.colors import unpack_rgb
-from piccolo.geometry.sphere import cell_of, make_grid
+from piccolo.geometry.sphere import find_cell, make_grid
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map import camera_positions
 from piccolo.views import view
@@ -30,7 +30,7 @@ def octree():
 
 
 def _cells(positions):
-    return cell_of(positions / np.linalg.norm(positions, axis=1, keepdims=True), 24)
+    return find_cell(positions / np.linalg.norm(positions, axis=1, keepdims=True), 24)
 
 
 def test_view_of_the_leaves_equals_its_twin(octree):

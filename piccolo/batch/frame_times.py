@@ -9,7 +9,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files.json_file import read_text
-from ..panorama.photo import photo_of
+from ..panorama.photo import read_photo_facts
 from ..walk.frames import check_times
 
 EXIF = "exif"
@@ -48,7 +48,7 @@ def exif_times(frames: Sequence[Path]) -> list[float] | None:
     times: list[float] = []
     for frame in frames:
         try:
-            text = photo_of(frame).capture_time
+            text = read_photo_facts(frame).capture_time
         except (OSError, InputError):
             return None
         if text is None:

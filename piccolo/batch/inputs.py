@@ -21,7 +21,7 @@ def is_from_stdin(words: Sequence[str]) -> bool:
     return STDIN in words
 
 
-def panoramas_of(
+def list_panoramas(
     words: Iterable[str], stdin: TextIO, left_out: Counter[str], is_panorama: Callable[[Path], bool] = is_cube
 ) -> Iterator[Path]:
     """Yield the panoramas that words name, in order: pictures, folders, `@list.txt`, `-` for stdin.

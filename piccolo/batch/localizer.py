@@ -18,7 +18,7 @@ from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.settings import CoarseToFineSettings
-from ..opened_scan import OpenedScan, Settings, failed_result, settings_json
+from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
 from ..result import Result, Source, unreadable_result
@@ -134,7 +134,7 @@ class Localizer:
                 overlay, mask = self._pictures(scan, path, found)
             except Exception as error:
                 name = str(task.pano)
-                return Answer(failed_result(scan, path, error, self.read_options, task.settings, name))
+                return Answer(make_failed_result(scan, path, error, self.read_options, task.settings, name))
         name = str(task.pano)
         warnings = tuple(warning.replace(str(path), name) for warning in found.warnings)
         result = replace(found, pano=name, warnings=warnings)

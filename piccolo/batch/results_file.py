@@ -104,7 +104,9 @@ class Records:
             text = f"none of its results is of a panorama that this command names; {WAYS}"
             raise InputError(f"{self.path}: {text}")
 
-    def remaining(self, panoramas: Iterable[Name], digest_of: Callable[[Name], str | None]) -> Iterator[Name]:
+    def remaining(
+        self, panoramas: Iterable[Name], compute_digest: Callable[[Name], str | None]
+    ) -> Iterator[Name]:
         """Yield the panoramas without a result, as they come.
 
         One has a result if its file is as it was, by its digest, or can't be read now, and did not fail.
@@ -114,7 +116,7 @@ class Records:
             taken = None
             if lines:
                 self._named.add(str(pano))
-                digest = digest_of(pano)
+                digest = compute_digest(pano)
                 same = (line for line in lines if digest in (None, line.pano_sha256))
                 taken = next((line for line in same if line.status != FAILED), None)
             self.order.append(taken)

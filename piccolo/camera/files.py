@@ -87,7 +87,7 @@ def document_of(mounts: Sequence[Mount]) -> dict[str, object]:
     return {"format": FORMAT, **(entries[0] if len(entries) == 1 else {"cameras": entries})}
 
 
-def mounts_of(document: Mapping[str, Any]) -> tuple[Mount, ...]:
+def read_mounts(document: Mapping[str, Any]) -> tuple[Mount, ...]:
     """Return the cameras of our own JSON; one of DAMAGE if it is none."""
     if document["format"] != FORMAT:
         raise ValueError(f"format {document['format']!r}, not {FORMAT!r}")
@@ -139,7 +139,7 @@ def _whole(value: Any) -> int:
 
 def _of_document(path: Path, document: Any) -> Calibration:
     if "format" in document:
-        return Calibration(str(path), mounts_of(document))
+        return Calibration(str(path), read_mounts(document))
     cameras = {name: _of_opensfm(entry) for name, entry in document.items()}
     return Calibration(str(path), tuple(map(Mount, cameras.values())), is_choice=True)
 

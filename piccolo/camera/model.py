@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..geometry.pose import Array
-from ..geometry.sphere import pixels_of, rays_of
+from ..geometry.sphere import compute_pixels, compute_rays
 
 MAX_STEPS = 25  # of Newton; five are usual
 LEAST = 1e-12  # of the denominator
@@ -253,7 +253,7 @@ class Camera:
         Pixels of rays that are not in the picture mean nothing.
         """
         if self.lens == SPHERE:
-            u, v = pixels_of(rays, self.width)
+            u, v = compute_pixels(rays, self.width)
             return np.stack([u, v * (2.0 * self.height / self.width)], axis=-1), np.ones(u.shape, np.bool_)
         forward = rays[..., 0]
         right = -rays[..., 1]
@@ -280,7 +280,7 @@ class Camera:
         """Return unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:
-            ray = rays_of(u, v * (0.5 * self.width / self.height), self.width)
+            ray = compute_rays(u, v * (0.5 * self.width / self.height), self.width)
             return ray, np.ones(u.shape, np.bool_)
         x = (u - self._named["cx"]) / self.focal[0]
         y = (v - self._named["cy"]) / self.focal[1]

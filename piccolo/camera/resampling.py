@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from ..geometry.sphere import rays_of
+from ..geometry.sphere import compute_rays
 from .model import SPHERE
 from .rig import Mount
 
@@ -43,7 +43,7 @@ def sphere_width(mounts: Sequence[Mount]) -> int:
     return min(max(width, MIN_SPHERE_WIDTH), MAX_SPHERE_WIDTH)
 
 
-def sphere_of(views: Sequence[View], width: int) -> Pixels:
+def make_sphere(views: Sequence[View], width: int) -> Pixels:
     """Return the picture of the sphere, `width` x width / 2, a multiple of MIN_SPHERE_WIDTH.
 
     Where several cameras show the same, the one is taken whose axis is nearest; how far they are from each
@@ -57,7 +57,7 @@ def sphere_of(views: Sequence[View], width: int) -> Pixels:
             block = slice(top, top + ROWS), slice(left, left + COLUMNS)
             pixels, is_valid = _resample_block(view, width, top, left)
             centers = np.arange(left, left + COLUMNS) + 0.5, np.arange(top, top + ROWS) + 0.5
-            closeness = (rays_of(centers[0], centers[1][:, None], width) @ axis).astype(np.float32)
+            closeness = (compute_rays(centers[0], centers[1][:, None], width) @ axis).astype(np.float32)
             is_better = is_valid & (closeness > nearest[block])
             np.copyto(rgb[block], pixels, where=is_better[..., None])
             np.copyto(nearest[block], closeness, where=is_better)
@@ -79,7 +79,7 @@ def _blocks(view: View, width: int) -> list[tuple[int, int]]:
     """Upper left corners of the sphere's blocks in which the camera may show something."""
     u = np.arange(LOOK // 2, width, LOOK) + 0.5
     v = np.arange(LOOK // 2, width // 2, LOOK) + 0.5
-    _, is_in = view.mount.camera.pixels(rays_of(u, v[:, None], width) @ view.mount.rotation.T)
+    _, is_in = view.mount.camera.pixels(compute_rays(u, v[:, None], width) @ view.mount.rotation.T)
     around = np.pad(is_in, ((0, 0), (1, 1)), mode="wrap").astype(np.uint8)
     is_near = cv2.dilate(around, np.ones((3, 3), np.uint8))[:, 1:-1]
     rows = ROWS // LOOK
@@ -121,7 +121,7 @@ def _places(
 ) -> tuple[Array, NDArray[np.bool_]]:
     """Pixels (h, w, 2) of the picture at columns u (w,), rows v (h,) of the sphere, and which are in it."""
     camera = view.mount.camera
-    places, is_in = camera.pixels(rays_of(u, v[:, None], width) @ view.mount.rotation.T)
+    places, is_in = camera.pixels(compute_rays(u, v[:, None], width) @ view.mount.rotation.T)
     height_here, width_here = view.pixels.shape[:2]
     return places * (width_here / camera.width, height_here / camera.height), is_in
 

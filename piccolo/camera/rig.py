@@ -63,7 +63,7 @@ class Mount:
         return replace(self, R_lens_from_cam=rows(R), center_cam=tuple(center.tolist()))
 
 
-def extent_of(mounts: Sequence[Mount]) -> tuple[int, int]:
+def compute_extent(mounts: Sequence[Mount]) -> tuple[int, int]:
     """Width and height [px] of a picture in which cameras have their parts."""
     right = max(mount.offset[0] + mount.camera.width for mount in mounts)
     return right, max(mount.offset[1] + mount.camera.height for mount in mounts)
@@ -112,7 +112,7 @@ class Calibration:
 
     def _scale(self, width: int, height: int) -> tuple[Mount, ...]:
         """All cameras with the whole picture at another size of the same shape."""
-        full_width, full_height = extent_of(self.mounts)
+        full_width, full_height = compute_extent(self.mounts)
         if len(self.mounts) == 1 and self.mounts[0].offset == (0, 0):
             try:
                 return (self.mounts[0].with_camera(self.mounts[0].camera.scale_to_size(width, height)),)

@@ -20,7 +20,7 @@ from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan, settings_json
-from ..result import UNREADABLE, Result, check_scan, failure_of, read_results
+from ..result import UNREADABLE, Result, check_scan, describe_failure, read_results
 from ..scan_map.open_map import scan_sha256_of
 from ..scenes.evaluation import tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
@@ -31,11 +31,11 @@ from ..scenes.evaluation.query_result import (
     check_variants,
     input_files,
     is_in_box,
+    make_query_result,
     match_results,
-    query_result_of,
     read_run,
 )
-from ..scenes.evaluation.walks import walk_table, walks_of
+from ..scenes.evaluation.walks import group_walks, walk_table
 from ..scenes.scene import Query, Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, Terminated, UsageError, checking_options, print_error, print_note
@@ -119,7 +119,7 @@ def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: 
         found.append(tables.summary_table(inside, thresholds, title))
     found.append(tables.threshold_table(rows, thresholds))
     found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
-    if walks := walks_of(scenes, rows):
+    if walks := group_walks(scenes, rows):
         found.append(walk_table(walks, thresholds))
     return "\n".join(table.markdown() for table in found)
 
@@ -246,7 +246,7 @@ class Evaluation:
             try:
                 executor, localizer = stack.enter_context(place)
             except Exception as error:
-                self.report(f"{scene.name}: {failure_of(error).text}", len(queries))
+                self.report(f"{scene.name}: {describe_failure(error).text}", len(queries))
                 return
             pictures = (query.labels if has_labels and query.labels else query.image for query in queries)
             tasks = (localizer.task(p, q.calibration) for p, q in zip(pictures, queries, strict=True))
@@ -271,7 +271,7 @@ class Evaluation:
         if result.error is not None and (result.status != UNREADABLE or query.is_answerable):
             self.report(result.error)
             return
-        row = query_result_of(scene, query, result, None if result.error else is_inside)
+        row = make_query_result(scene, query, result, None if result.error else is_inside)
         line = row.to_json()
         self.file.append(line)
         self.rows.append(QueryResult.from_json(line))  # as whoever reads the file has it

@@ -35,7 +35,7 @@ Item = TypeVar("Item")
 Executor = Here | Processes | Cluster
 
 
-def exit_code_of(statuses: Collection[str]) -> int:
+def choose_exit_code(statuses: Collection[str]) -> int:
     """Return 0 if all photos are localized, 3 if one can't be read or has failed, else 1."""
     if UNREADABLE in statuses or FAILED in statuses:
         return EXIT_BAD_INPUT

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ..batch.inputs import describe_left_out, is_from_stdin, panoramas_of
+from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas
 from ..batch.localizer import Answer, Localizer
 from ..batch.priors import read_priors
 from ..batch.results_file import Records
@@ -38,10 +38,10 @@ from .executing import (
     Executor,
     Interruption,
     check_execution,
+    choose_exit_code,
     connecting,
     count_jobs,
     executing,
-    exit_code_of,
     interruptible,
 )
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
@@ -108,7 +108,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     rig = localizer.read_options.rig
     is_one = rig.is_instant if rig else is_cube
     left_out = Counter[str]()
-    named = panoramas_of(arguments.pano, sys.stdin, left_out, is_one)
+    named = list_panoramas(arguments.pano, sys.stdin, left_out, is_one)
     if is_from_stdin(arguments.pano):
         check_files(arguments, [], None)
         return Run(arguments, localizer, named, None, left_out, Counter())
@@ -220,7 +220,7 @@ def finish(
         return interruption.stop(arguments, f"{counts.total()} results", how)
     if run.total is None:
         note_unused_priors(arguments, run.localizer)
-    return exit_code_of(counts)
+    return choose_exit_code(counts)
 
 
 def run_frames(run: Run) -> int:

@@ -22,8 +22,8 @@ from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
     FRAMES_PER_S,
+    encode_gif,
     frames_of,
-    gif_of,
     perturb_pose,
     refine_with_history,
 )
@@ -146,13 +146,13 @@ def suffix_of(option: str, path: Path) -> str:
 def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     given = (arguments.result, arguments.queries, arguments.pose, arguments.camera)
-    photos = [photo_of(arguments, shot.pano) for shot in poses]
+    photos = [find_photo(arguments, shot.pano) for shot in poses]
     check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
     for path in filter(None, outputs_of(arguments).values()):
         (check_output_folder if is_folder(path) else check_output)(path)
 
 
-def photo_of(arguments: argparse.Namespace, name: str) -> Path:
+def find_photo(arguments: argparse.Namespace, name: str) -> Path:
     """Return the panorama that a pose's file names."""
     return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
@@ -253,14 +253,14 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
     ((name, pose, camera),) = poses
     if camera is not None:
         raise InputError(f"{name}: found a photo by the model {camera.model}, --animate wanted a sphere")
-    panorama = shrink(read_panorama(photo_of(arguments, name)), DESCENT_WIDTH)
+    panorama = shrink(read_panorama(find_photo(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
     start = perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     refined, history = refine_with_history(cloud.points, texels, start, DESCENT)
     frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
     if suffix_of("--animate", arguments.animate) == ".gif":
-        write_atomically(arguments.animate, gif_of(frames))
+        write_atomically(arguments.animate, encode_gif(frames))
     else:
         height, width = frames[0].shape[:2]
         with writing_video(arguments.animate, FRAMES_PER_S, (width, height)) as add:

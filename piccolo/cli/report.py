@@ -10,7 +10,7 @@ from ..files.atomic import check_output
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers, num_cores
 from ..report.build import WIDTH, ReportSettings, build_report
-from ..report.entries import entries_of
+from ..report.entries import collect_entries
 from ..report.plan_file import SUFFIXES, write_plan_file
 from ..report.plan_image import OwnPlan
 from ..report.site import check_folder
@@ -99,7 +99,7 @@ def main(arguments: argparse.Namespace) -> int:
         settings = settings_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
     check_files(arguments)
-    entries = entries_of(arguments.results)
+    entries = collect_entries(arguments.results)
     workers = Workers(arguments.jobs, progress_bar(arguments.quiet), warn_once(arguments.quiet))
     cache = cache_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, cache, workers, Stopwatch())

@@ -34,7 +34,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
-from .executing import Interruption, exit_code_of, interruptible
+from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY
 from .outputs import check_suffix
 from .progress import progress_bar, shown
@@ -132,11 +132,11 @@ def run_walk(
     watch = Stopwatch()
     scan = open_scan()
     walk = scan.walk(read_options, settings, inputs.motion)
-    key = key_of(walk)
+    key = make_key(walk)
     if (counts := count_finished(arguments, key, inputs, read_options.rig)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
         write_plan(arguments.plan, scan, read_results([arguments.out]) if arguments.plan else [])
-        return exit_code_of(counts)
+        return choose_exit_code(counts)
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
         if interruption.number:
@@ -153,7 +153,7 @@ def run_walk(
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
     gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
     print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
-    return exit_code_of(counts)
+    return choose_exit_code(counts)
 
 
 def check_plan(path: Path) -> None:
@@ -176,7 +176,7 @@ def write_plan(path: Path | None, scan: OpenedScan, results: Sequence[Result]) -
     write_plan_file(entries_of_walk(results), scan.prepared, path, ReportSettings())
 
 
-def key_of(walk: Walk) -> dict[str, Any]:
+def make_key(walk: Walk) -> dict[str, Any]:
     """Return what must be the same where a walk goes on."""
     digest = walk.tracker.scan_map.scan_sha256 or None
     settings = json.loads(json.dumps(walk.about.settings))

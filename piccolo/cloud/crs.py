@@ -9,7 +9,7 @@ from ..optional import import_optional
 from .readers import e57_file, las
 from .settings import check_crs
 
-__all__ = ["check_crs", "crs_of", "from_wgs84"]
+__all__ = ["check_crs", "from_wgs84", "read_crs"]
 
 PROJECTION_USER = b"LASF_Projection"  # of LAS's records
 WKT_ID = 2112
@@ -20,7 +20,7 @@ USER_DEFINED = 32767
 MAX_LENGTH = 20_000  # characters of a system's description; what is longer is left aside
 
 
-def crs_of(paths: Sequence[Path]) -> str:
+def read_crs(paths: Sequence[Path]) -> str:
     """Return the system that the first of a scan's files names, as WKT or EPSG:code; empty if it names none.
 
     LAS and LAZ: the OGC WKT record, or the GeoTIFF keys. E57: coordinateMetadata.

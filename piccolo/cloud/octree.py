@@ -168,7 +168,7 @@ def collect(tree, center, voxel_per_range, found, directions):
 
 
 @inline_kernel
-def level_of(tree, node):
+def find_level(tree, node):
     """The level of a node, 0 for the coarsest voxels."""
     level = 0
     while node >= tree.level_start[level + 1]:

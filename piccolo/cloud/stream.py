@@ -14,7 +14,7 @@ from ..files.cache import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .readers.reader import CHUNK, PointSource, RawCloud, brightest_of, color_chunks
+from .readers.reader import CHUNK, PointSource, RawCloud, color_chunks, find_full_brightness
 from .settings import UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
@@ -111,7 +111,7 @@ class Cloud:
         return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)
 
 
-def stream_of(path: Path, raw: RawCloud) -> "CloudStream":
+def stream_points(path: Path, raw: RawCloud) -> "CloudStream":
     """Points in memory as if they stood in a file named `path`."""
     return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
 
@@ -205,6 +205,6 @@ def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | N
     if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
-    brightest = brightest_of(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
+    brightest = find_full_brightness(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
     chunks = color_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
-    return replace(stream_of(ARRAYS, next(iter(chunks))), sha256=sha256_of_arrays(points, colors))
+    return replace(stream_points(ARRAYS, next(iter(chunks))), sha256=sha256_of_arrays(points, colors))

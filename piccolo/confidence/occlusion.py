@@ -63,7 +63,7 @@ class Occlusion:
         return (float(is_compared.sum()) - contradicted) / total, contradicted / total
 
 
-def occlusion_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Occlusion:
+def compare_occlusion(points: PackedPoints, panorama: Panorama, pose: Pose) -> Occlusion:
     """Compare photo and scan at a pose."""
     view = _fill_view(points, pose)
     small = resize(panorama, view.depth.shape[1])
@@ -96,7 +96,7 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDAr
 
     Masked pixels count as not scanned.
     """
-    small = occlusion_at(points, panorama, pose)
+    small = compare_occlusion(points, panorama, pose)
     shape = panorama.is_valid.shape
 
     def exceeds(values: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
@@ -215,7 +215,7 @@ class Agreement:
         return self.correlation * math.sqrt(self.seen_fraction)
 
 
-def agreement_at(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreement:
+def measure_agreement(points: PackedPoints, panorama: Panorama, pose: Pose) -> Agreement:
     """Measure the agreement of the panorama with the cloud seen from `pose`."""
     small = shrink(panorama, VIEW_WIDTH)
     view = render_view(points, pose, VIEW_WIDTH)

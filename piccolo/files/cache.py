@@ -145,7 +145,7 @@ FACT_NAME = own_names("fact")
 TICK_NS = 50_000_000  # the clock of files moves on every 1 to 10 ms
 
 
-def key_of(what: str, status: os.stat_result) -> str:
+def make_key(what: str, status: os.stat_result) -> str:
     """Return a name for `what` of a file of this status: another as soon as it changes."""
     identity = status.st_dev, status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
     return hashlib.sha256(repr((what, identity)).encode()).hexdigest()[:32]
@@ -154,7 +154,7 @@ def key_of(what: str, status: os.stat_result) -> str:
 def _path_of(what: str, status: os.stat_result) -> Path | None:
     """Return the file in which `what` is kept of a file of this status."""
     folder = private_folder("facts", FACT_NAME)
-    return folder and folder / f"{key_of(what, status)}.fact"
+    return folder and folder / f"{make_key(what, status)}.fact"
 
 
 def recall(what: str, status: os.stat_result) -> str | None:

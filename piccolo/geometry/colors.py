@@ -40,7 +40,7 @@ def palette() -> NDArray[np.uint8]:
     return colors
 
 
-def colors_of(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
+def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
     """Colour (..., 3) of each label (...); labels that differ by a multiple of NUM_COLORS share theirs."""
     return np.asarray(palette()[labels % NUM_COLORS])
 

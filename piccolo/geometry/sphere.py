@@ -79,10 +79,10 @@ def pixel_jacobian(x, y, z, rho2, width):
 
 def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
     """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
-    return rays_of(np.arange(width) + 0.5, np.arange(width // 2)[rows, None] + 0.5, width)
+    return compute_rays(np.arange(width) + 0.5, np.arange(width // 2)[rows, None] + 0.5, width)
 
 
-def rays_of(u: Any, v: Any, width: int) -> NDArray[np.float64]:
+def compute_rays(u: Any, v: Any, width: int) -> NDArray[np.float64]:
     """Unit camera directions (..., 3) of columns u and rows v (...), continuous, of a `width` image."""
     azimuth = (0.5 - u / width) * 2.0 * np.pi
     elevation = (0.5 - v / (width / 2.0)) * np.pi
@@ -93,7 +93,9 @@ def rays_of(u: Any, v: Any, width: int) -> NDArray[np.float64]:
     return rays
 
 
-def pixels_of(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def compute_pixels(
+    rays: NDArray[np.floating], width: int
+) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
     """Columns u and rows v (...), continuous, of camera directions (..., 3) in a `width` image."""
     x, y, z = np.moveaxis(rays, -1, 0)
     u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width
@@ -101,9 +103,9 @@ def pixels_of(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.floati
     return u, v
 
 
-def indices_of(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def compute_indices(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Rows and columns (...) of the pixels in which directions (..., 3) lie, in a `width` image."""
-    u, v = pixels_of(rays, width)
+    u, v = compute_pixels(rays, width)
     return np.minimum(v.astype(np.int64), width // 2 - 1), u.astype(np.int64) % width
 
 
@@ -209,7 +211,7 @@ def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32],
 @lru_cache(maxsize=4)
 def wider_cells(num_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
     """The cell of `num_rings` in which each search cell lies, and the sum (cells,) of `whole_areas` in it."""
-    cells = cell_of(make_grid(SEARCH_RINGS).directions, num_rings)
+    cells = find_cell(make_grid(SEARCH_RINGS).directions, num_rings)
     areas = np.bincount(cells, whole_areas(SEARCH_RINGS), len(make_grid(num_rings)))
     return cells, areas.astype(np.float32)
 
@@ -220,7 +222,7 @@ def whole_areas(num_rings: int) -> NDArray[np.float32]:
     return np.asarray(np.rint(area / area.max() * np.float32(AREA_UNITS)))
 
 
-def cell_of(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32]:
+def find_cell(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32]:
     """The cell (N,) of a grid in which each direction (N, 3) lies."""
     d = directions.astype(np.float64)
     grid = make_grid(num_rings)

@@ -28,7 +28,7 @@ os.register_at_fork(after_in_child=_idle.clear)  # a child has none of its paren
 
 
 @contextmanager
-def pool_of(num_threads: int) -> Iterator[ThreadPoolExecutor]:
+def get_pool(num_threads: int) -> Iterator[ThreadPoolExecutor]:
     """Threads for one caller at a time, kept for the next: they keep their scratch, as fresh memory is slow.
 
     Callers in several threads have a pool each: none waits for what another's work keeps from being done.
@@ -61,7 +61,7 @@ def no_progress(values: Iterator[Value], total: int | None, label: str) -> Itera
 ProgressCallback = Callable[[str, int, int | None], None]
 
 
-def progress_to(callback: ProgressCallback) -> Progress:
+def report_progress(callback: ProgressCallback) -> Progress:
     """Progress that a callback is told of."""
 
     def watched(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
@@ -128,7 +128,7 @@ class Workers:
 @contextmanager
 def submit(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterator[list[Future[Value]]]:
     """Tasks on so many threads; at the end, those that have not begun are dropped, and others waited for."""
-    with pool_of(num_threads) as pool:
+    with get_pool(num_threads) as pool:
         futures = [pool.submit(task) for task in tasks]
         try:
             yield futures

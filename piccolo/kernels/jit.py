@@ -105,7 +105,7 @@ class Compiling:
 compiling = Compiling()
 
 
-def digest_of(name: str, payload: bytes) -> bytes:
+def compute_digest(name: str, payload: bytes) -> bytes:
     """What stands before a payload in the file of this name: it tells damage, not malice."""
     return hashlib.sha256(name.encode() + payload).digest()
 
@@ -117,7 +117,7 @@ def read_whole(path: Path) -> bytes | None:
     except OSError:
         return None
     payload = content[DIGEST_SIZE:]
-    if digest_of(path.name, payload) != content[:DIGEST_SIZE]:
+    if compute_digest(path.name, payload) != content[:DIGEST_SIZE]:
         warn_damaged(path.parent)
         return None
     mark_used(path)
@@ -184,7 +184,7 @@ class KernelCache:
         try:
             if path := self._file(signature, compiled.codegen):
                 payload = serialize.dumps(compiled._reduce())
-                write_atomically(path, digest_of(path.name, payload) + payload)
+                write_atomically(path, compute_digest(path.name, payload) + payload)
         except OSError as error:
             warn_not_kept(f"{kernel_folder()}: {error.strerror or error}")
         except Exception as error:  # as above

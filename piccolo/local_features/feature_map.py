@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
 from ..geometry.pose import Array
-from ..geometry.sphere import cell_of, direction_to_pixel, indices_of, pixel_rays
+from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
 from ..jobs.threads import Workers
 from ..kernels.jit import inline_kernel, kernel
@@ -75,11 +75,11 @@ NO_FEATURES = FeaturesOfView(
 )
 
 
-def features_of_view(octree: Octree, center_map: NDArray[np.float64]) -> FeaturesOfView:
+def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> FeaturesOfView:
     """The features seen from a centre (3,) [m] that have a point of the scan."""
     image = render_gray(octree, center_map, VIEW_WIDTH)
     found = find_keypoints(image.gray, image.is_filled)
-    ranges = image.ranges[indices_of(found.rays, VIEW_WIDTH)]
+    ranges = image.ranges[compute_indices(found.rays, VIEW_WIDTH)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
     found = found.take(kept)
     ranges = ranges[kept]
@@ -161,7 +161,7 @@ def find_features(
     octree: Octree, centers: NDArray[np.float64], workers: Workers
 ) -> tuple[FeaturesOfView, NDArray[np.uint16]]:
     """The features of the views from some centres (N, 3) [m], and the view that each is from."""
-    views = list(workers.map(lambda c: features_of_view(octree, c), list(centers), "find features"))
+    views = list(workers.map(lambda c: extract_view_features(octree, c), list(centers), "find features"))
     joined: list[Any] = [np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)]
     counts = np.array([len(view.points) for view in views], np.int64)
     return FeaturesOfView(*joined), np.repeat(np.arange(len(views), dtype=np.uint16), counts)
@@ -259,7 +259,7 @@ def next_unseen(order, begin, centers, kept, ranges, cells, spacing):
 def cell_table(num_rings: int) -> NDArray[np.int32]:
     """The cell (h, 2 h) of a grid in each direction, by the pixels of a sphere."""
     rays = pixel_rays(2 * TABLE_HEIGHT).astype(np.float32)
-    return cell_of(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
+    return find_cell(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
 
 
 def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 0) -> NDArray[np.int64]:

@@ -255,28 +255,28 @@ def list_members(matches, columns, R_cam_from_map, center_map, cos_rough, member
     return count
 
 
-def columns_of(matches: Matches) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def transpose_matches(matches: Matches) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """The matches' points and rays once more, (3, M) each."""
     return np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
 
 
-def members_of(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
+def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
     """Indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
     R, t = pose.R_cam_from_world, pose.center_world
-    return members[: list_members(matches, columns_of(matches), R, t, cos_rough, members)]
+    return members[: list_members(matches, transpose_matches(matches), R, t, cos_rough, members)]
 
 
 def count_matches(matches: Matches, pose: Pose) -> int:
     """Count the features of the photo that a pose puts where the map has them."""
-    return len(np.unique(matches.query[members_of(matches, pose, COS_EXACT)]))
+    return len(np.unique(matches.query[find_inliers(matches, pose, COS_EXACT)]))
 
 
 def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) -> MatchedPose | None:
     """The pose that most matches near a rough one agree with, refined; None if they are too few."""
     up_cam = np.array([0.0, 0.0, 1.0]) if R_cam_from_level is None else R_cam_from_level[:, 2].copy()
     cos_tilt = -2.0 if R_cam_from_level is None else COS_TILT
-    members = members_of(matches, rough, COS_ROUGH)
+    members = find_inliers(matches, rough, COS_ROUGH)
     if len(members) < LEAST_MATCHES:
         return None
     pose = Pose(np.empty((3, 3)), np.empty(3))
@@ -285,13 +285,13 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
     if sample_poses(matches, members, columns, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
         return None
     for _ in range(2):
-        members = members_of(matches, pose, COS_EXACT)
+        members = find_inliers(matches, pose, COS_EXACT)
         rays, points = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
         descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
     return MatchedPose(pose, count_matches(matches, pose)) if R[:, 2] @ up_cam >= cos_tilt else None
 
 
-def poses_of(
+def propose_poses(
     matches: Matches, R_cam_from_level: Array | None, count: int, workers: Workers
 ) -> list[MatchedPose]:
     """At most `count` poses that most matches agree with, best first, in the map's frame.
@@ -305,7 +305,7 @@ def poses_of(
     votes = np.empty(len(voters))
     is_upright = R_cam_from_level is not None
     level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
-    columns = columns_of(matches)
+    columns = transpose_matches(matches)
 
     def vote(lo: int) -> None:
         some, *out = (values[lo : lo + BATCH] for values in (voters, rotations, centers, votes))

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.sphere import pixels_of
+from ..geometry.sphere import compute_pixels
 from ..jobs.threads import Workers
 
 FIELD_DEG = 65.0  # of a view, across
@@ -73,7 +73,7 @@ def perspective_views(width: int) -> list[PerspectiveView]:
     middles = np.stack(turns)[:, :, 0]
     views = []
     for k, R in enumerate(turns):
-        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in pixels_of(rays @ R.T, width))
+        columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays @ R.T, width))
         is_nearest = np.argmax(rays @ R.T @ middles.T, axis=-1) == k
         own = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
         views.append(PerspectiveView(R, columns, rows, np.asarray(own)))

@@ -29,7 +29,7 @@ def scale(factor, a):
 
 
 @inline_kernel
-def axes_of(a, b):
+def compute_axes(a, b):
     """Three axes: along the vector a (3,), across it on b's side, and along the cross product."""
     normal = cross(a, b)
     across = cross(normal, a)
@@ -206,7 +206,7 @@ def polish_distances(ratios, cosines, sides2):
 
 
 @inline_kernel
-def order_of_corners(points):
+def order_corners(points):
     """The corners with the longest side between the last two, and that side's squared length."""
     first = 0
     longest2 = -1.0
@@ -232,10 +232,10 @@ def pencil(cosines, sides2, conics):
 
 
 @inline_kernel
-def pose_of_triangle(d01, d02, e01, e02, R):
+def solve_triangle(d01, d02, e01, e02, R):
     """Write R_cam_from_map (3, 3) of a triangle's edges from its corner 0, in the camera and in the map."""
-    cam = axes_of(d01, d02)
-    world = axes_of(e01, e02)
+    cam = compute_axes(d01, d02)
+    world = compute_axes(e01, e02)
     for i in range(3):
         for j in range(3):
             R[i, j] = cam[0][i] * world[0][j] + cam[1][i] * world[1][j] + cam[2][i] * world[2][j]
@@ -247,7 +247,7 @@ def p3p(bearings, points, rotations, centers):
 
     Bearings (3, 3) and points (3, 3) [m] are a row each. Points on a line and equal bearings have none.
     """
-    i0, i1, i2, longest2 = order_of_corners(points)
+    i0, i1, i2, longest2 = order_corners(points)
     b0 = bearings[i0]
     b1 = bearings[i1]
     b2 = bearings[i2]
@@ -277,7 +277,7 @@ def p3p(bearings, points, rotations, centers):
         d01 = minus(scale(y, b1), scale(x, b0))
         d02 = minus(scale(z, b2), scale(x, b0))
         R = rotations[count]
-        pose_of_triangle(d01, d02, e01, e02, R)
+        solve_triangle(d01, d02, e01, e02, R)
         for i in range(3):
             back = 0.0
             for j in range(3):

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..cloud.octree import Octree, collect, level_of
+from ..cloud.octree import Octree, collect, find_level
 from ..geometry.pose import Array
 from ..geometry.sphere import direction_to_pixel
 from ..kernels.jit import F0, F1, HALF, kernel
@@ -52,7 +52,9 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
             rho = math.sqrt(x * x + y * y)
             r = math.sqrt(x * x + y * y + z * z)
             node = tree.nodes[found[k]]
-            size = np.float32(tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - level_of(tree, found[k])))
+            size = np.float32(
+                tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - find_level(tree, found[k]))
+            )
             reach = REACH * size / max(r, np.float32(0.05)) * px_per_rad
             reach = min(max(reach, LEAST_REACH), MOST_REACH)
             across = min(reach * r / max(rho, np.float32(1e-3)), np.float32(0.25) * W)

@@ -16,7 +16,7 @@ from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
-from ..local_features.hypotheses import count_matches, poses_of
+from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.keypoints import HALVES
 from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
@@ -99,7 +99,7 @@ def search_views(
     is_brief: bool = False,
 ) -> Found:
     """Search by whole views and refine; True if the result is sure."""
-    asked = tilted_query(query) if is_brief else query
+    asked = tilt_query(query) if is_brief else query
     with watch.stage("search"):
         starts = search_poses(asked, gravity)
     with watch.stage("refine"):
@@ -123,7 +123,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
 def match_poses(query: Query) -> list[Pose]:
     """Return poses from feature matches, best first; without whole views, those that the prior allows."""
     level = query.photo.R_cam_from_level if query.settings.gravity == "known" else None
-    poses = [f.pose for f in poses_of(query.matches, level, NUM_MATCHED, query.workers)]
+    poses = [f.pose for f in propose_poses(query.matches, level, NUM_MATCHED, query.workers)]
     if query.method.uses_search:
         return poses
     return [pose for pose in poses if not contradictions(query.scan_map, pose, query.settings.prior)]
@@ -140,7 +140,7 @@ def brief_query(query: Query) -> Query:
     return replace(query, settings=settings)
 
 
-def tilted_query(query: Query) -> Query:
+def tilt_query(query: Query) -> Query:
     """Return a brief query with any tilt, for a whole photo that was searched as upright.
 
     It searches every other cell of the grid, with few rotations. That finds tilted photos without

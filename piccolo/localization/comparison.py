@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
-from ..geometry.sphere import BLOCK_RINGS, cell_of, make_grid, pixel_rays
+from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
-from ..views.points_around import place_of
+from ..views.points_around import round_position
 from ..views.view import average_colors, cell_statistics, empty_cells, locate
 from .query import Query
 
@@ -42,7 +42,7 @@ class Comparison(NamedTuple):
         beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
-    def ratio_to(self, other: "Comparison") -> float:
+    def compute_ratio(self, other: "Comparison") -> float:
         """Return what this pose explains divided by what another does, over blocks that both views show.
 
         Over all blocks, a pose from which more was scanned would gain by that alone. 0 if hardly any block
@@ -160,7 +160,7 @@ def compare(query: Query, pose: Pose) -> Comparison:
     if pose.key not in kept:
         config = query.method.fine_view
         view = config.arrays
-        place = place_of(pose)
+        place = round_position(pose)
         sums = query.cache.views.averages(place, config)
         *cells, center = empty_cells(len(sums), place)
         moments = np.empty((view.num_stats, 8), np.float32)
@@ -203,4 +203,4 @@ def mask_occluders(query: Query, pose: Pose) -> Query:
 def pixel_blocks() -> NDArray[np.int32]:
     """Return the block in which each pixel (h, 2 h) of a mask lies."""
     rays = pixel_rays(MASK_WIDTH).astype(np.float32)
-    return cell_of(rays.reshape(-1, 3), BLOCK_RINGS).reshape(rays.shape[:2])
+    return find_cell(rays.reshape(-1, 3), BLOCK_RINGS).reshape(rays.shape[:2])

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, step
-from ..geometry.sphere import cell_of
+from ..geometry.sphere import find_cell
 from ..optimize.channel_loss import channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
@@ -43,7 +43,7 @@ STEPS = (
 ROUGH_STEPS = DifferenceSteps(2, math.radians(0.3), 0.015, 1.0)
 
 
-def gradient_at(image: Texels, points: Cells, pose: Pose) -> Array:
+def compute_gradient(image: Texels, points: Cells, pose: Pose) -> Array:
     """Return the gradient (6,) of the robust loss, in the camera's frame."""
     sums = np.empty(NUM_SUMS)
     center = pose.center_world - points.center_map
@@ -68,7 +68,7 @@ def remove_poles(points: Cells, pose: Pose) -> Cells:
     return Cells(offsets, channels, weights, points.center_map)
 
 
-def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
+def compute_hessian(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too
@@ -76,7 +76,9 @@ def hessian_at(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps)
     """
     rows = []
     for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
-        rise = gradient_at(image, points, step(pose, delta)) - gradient_at(image, points, step(pose, -delta))
+        rise = compute_gradient(image, points, step(pose, delta)) - compute_gradient(
+            image, points, step(pose, -delta)
+        )
         rows.append(rise / (2.0 * delta.sum()))
     return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
 
@@ -95,7 +97,7 @@ def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[
 
 def assign_blocks(points: Cells) -> NDArray[np.integer]:
     """Return the block (N,) of the sphere in which each point lies."""
-    return cell_of(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], ERROR_RINGS)
+    return find_cell(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], ERROR_RINGS)
 
 
 def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
@@ -138,7 +140,7 @@ def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
 
     def by(steps: DifferenceSteps) -> Array | None:
         image = query.photo.images[steps.scale]()
-        hessian = hessian_at(image, points, pose, steps)
+        hessian = compute_hessian(image, points, pose, steps)
         covariance = sandwich_covariance(hessian, block_gradients(image, points, pose))
         return covariance if covariance is None else steps.inflation * covariance
 

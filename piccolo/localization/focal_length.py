@@ -21,7 +21,7 @@ from ..camera import Camera, Mount
 from ..camera.model import MODELS
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
-from ..geometry.sphere import indices_of
+from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
@@ -214,7 +214,7 @@ def mask_edge(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
     inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
     offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
     rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
-    is_kept = inner[indices_of(rays, is_valid.shape[1])] > 0
+    is_kept = inner[compute_indices(rays, is_valid.shape[1])] > 0
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 

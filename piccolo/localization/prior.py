@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
 from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
-from ..scan_map.named_scans import candidates_within, scan_at
+from ..scan_map.named_scans import candidates_within, find_scan_at
 from ..scan_map.prior import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap
 
@@ -85,7 +85,7 @@ def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ..
         return ()
     world = scan_map.to_world(pose)
     found = []
-    if prior.within and (scan := scan_at(scan_map, pose.center_world)) not in prior.within:
+    if prior.within and (scan := find_scan_at(scan_map, pose.center_world)) not in prior.within:
         found.append(f"the pose found is in the scan {scan!r}, not in {', '.join(map(repr, prior.within))}")
     if prior.near_world is not None and prior.radius is not None:
         given = [value for value in prior.near_world if value is not None]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, rotate_points
-from ..geometry.sphere import indices_of, make_grid
+from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches, match
@@ -22,7 +22,7 @@ from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
-from ..views.points_around import RecentViews, place_of
+from ..views.points_around import RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
 from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
 
@@ -64,13 +64,13 @@ class Photo:
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
 
-    def shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
+    def find_shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Return a mask (N,) of the grid cells around a pose that the photo shows."""
         grid = make_grid(num_rings)
         if self.small.valid_share > MOST_SHARE:
             return np.ones(len(grid), np.bool_)
         rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
-        return np.asarray(self.panorama.is_valid[indices_of(rays_cam, self.panorama.is_valid.shape[1])])
+        return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
 
 
 class Features(NamedTuple):
@@ -126,19 +126,19 @@ class Query:
 
     def view_at(self, pose: Pose, config: ViewConfig) -> Cells:
         """Return the cells seen from near a pose that the photo shows."""
-        place = place_of(pose)
-        shown = self.photo.shown_cells(config.num_rings, pose)
+        place = round_position(pose)
+        shown = self.photo.find_shown_cells(config.num_rings, pose)
         return normalize_view(self.cache.views.averages(place, config), place, config, shown)
 
     def points_at(self, pose: Pose) -> Cells:
         """Return the points of the last descent: seen from near a pose, and shown by the photo."""
         config = self.method.full_view
-        shown = self.photo.shown_cells(config.num_rings, pose)
-        return self.cache.views.points(place_of(pose), config, shown.tobytes(), NUM_POINTS)
+        shown = self.photo.find_shown_cells(config.num_rings, pose)
+        return self.cache.views.points(round_position(pose), config, shown.tobytes(), NUM_POINTS)
 
     def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
         """Return the points around a pose with which the photo is compared, and coarser ones."""
-        around = partial(self.cache.views.surroundings, place_of(pose))
+        around = partial(self.cache.views.surroundings, round_position(pose))
         return around(VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
 
 

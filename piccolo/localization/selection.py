@@ -51,7 +51,7 @@ def rank(hypotheses: Sequence[Hypothesis], count: int = MAX_COMPARED) -> Selecti
 def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
     """Return the evidence for the best pose and for others, compared over what both views show."""
     at_best = compare(query, best.pose)
-    ratios = [1.0, *(compare(query, h.pose).ratio_to(at_best) for h in others)]
+    ratios = [1.0, *(compare(query, h.pose).compute_ratio(at_best) for h in others)]
     return [s._replace(share=v) for s, v in zip(assess_alone(query, [best, *others]), ratios, strict=True)]
 
 
@@ -81,7 +81,7 @@ def select(query: Query, found: Selection) -> Selection:
     ranked = [found.best, *found.alternatives]
     seen = [compare(query, h.pose) for h in ranked]
     alone = assess_alone(query, ranked)
-    ratios = [[other.ratio_to(one) for other in seen] for one in seen]
+    ratios = [[other.compute_ratio(one) for other in seen] for one in seen]
     odds = np.array(
         [[log_odds(a._replace(share=v)) for a, v in zip(alone, row, strict=True)] for row in ratios]
     )

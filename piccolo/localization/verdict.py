@@ -11,10 +11,10 @@ import numpy as np
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
-from ..confidence.occlusion import Agreement, agreement_at, occlusion_at
-from ..local_features.hypotheses import count_matches, poses_of
+from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
+from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match
-from ..optimize.refine import DescentSettings, refine, sampling_loss_of
+from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
 from ..panorama import Panorama
 from ..views.zbuffer import visible_points
@@ -44,12 +44,12 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     points, coarse = query.surroundings_at(pose)
     if settings.solver != "gauss-newton":
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(points, sampling_loss_of(query.photo.colors()), pose, descent).pose
+        pose = refine(points, make_sampling_loss(query.photo.colors()), pose, descent).pose
     measures: list[Callable[[], Any]] = [
         partial(estimate_covariance, query, pose, fit and fit.pose_covariance),  # takes longest
-        lambda: occlusion_at(points, query.photo.given, pose).fractions(),
+        lambda: compare_occlusion(points, query.photo.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
-        lambda: agreement_at(coarse, query.photo.panorama, pose),
+        lambda: measure_agreement(coarse, query.photo.panorama, pose),
     ]
     covariance, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
@@ -122,5 +122,5 @@ def is_mirrored(query: Query, evidence: Evidence) -> bool:
     if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
-    found = poses_of(matches, None, 1, query.workers)
+    found = propose_poses(matches, None, 1, query.workers)
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)

@@ -15,8 +15,8 @@ from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.texels import Texels
 from ..views.pictures import checkerboard, fill_holes, resize_rgb
-from ..views.surfels import render_surfels, surfels_of, visible_indices
-from .refine import DescentSettings, Refined, refine, sampling_loss_of
+from ..views.surfels import make_surfels, render_surfels, visible_indices
+from .refine import DescentSettings, Refined, make_sampling_loss, refine
 
 FRAME_WIDTH = 512
 TEXT_HEIGHT = 24
@@ -52,7 +52,7 @@ def refine_with_history(
     def watch(part: int, pose: Pose, loss: float) -> None:
         tried.append((part, Iterate(len(tried), pose, loss)))
 
-    refined = refine(points, sampling_loss_of(texels), start, settings, watch)
+    refined = refine(points, make_sampling_loss(texels), start, settings, watch)
     history = []
     least: dict[int, float] = {}  # by the descent's part
     for part, iterate in tried:
@@ -67,7 +67,7 @@ def frames_of(
 ) -> list[Image]:
     """One image for each pose, with iteration and loss written on top; the last one stays for a while."""
     ends = [visible_indices(points, p.pose.center_world) for p in (history[0], history[-1])]
-    surfels = surfels_of(points.take(np.union1d(*ends)).subsample(MAX_SURFELS), workers)
+    surfels = make_surfels(points.take(np.union1d(*ends)).subsample(MAX_SURFELS), workers)
     photo = resize_rgb(panorama, width)
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
@@ -82,7 +82,7 @@ def frames_of(
     return [*frames, *[frames[-1]] * NUM_LAST]
 
 
-def gif_of(frames: Sequence[Image]) -> bytes:
+def encode_gif(frames: Sequence[Image]) -> bytes:
     """An animated GIF of frames."""
     file = BytesIO()
     first, *others = map(PIL.Image.fromarray, frames)

@@ -45,7 +45,7 @@ class Loss:
     equations: Callable[[PackedPoints, Pose], Equations]
 
 
-def sampling_loss_of(texels: Texels) -> Loss:
+def make_sampling_loss(texels: Texels) -> Loss:
     """The paper's sampling loss of a panorama."""
     return Loss(
         lambda points, pose: sampling_loss(points, texels, pose),
@@ -157,7 +157,7 @@ def refine(
     bounds = np.linspace(0, settings.num_iterations, settings.num_culls + 1).astype(int)
     pose = start
 
-    def seen_from(at: Pose) -> PackedPoints:
+    def find_seen(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
     def objective(part: int, seen: PackedPoints, at: Pose) -> Equations:
@@ -166,11 +166,11 @@ def refine(
         return found
 
     for part, num_iterations in enumerate(np.diff(bounds).tolist()):
-        of_part = partial(objective, part, seen_from(pose))
+        of_part = partial(objective, part, find_seen(pose))
         if settings.solver == "adam":
             adam.best_loss = np.inf
             pose = descend_adam(of_part, pose, adam, num_iterations).pose
         else:
             descend = descend_lbfgs if settings.solver == "lbfgs" else descend_gauss_newton
             pose = descend(of_part, pose, num_iterations).pose
-    return Refined(pose, loss.value(seen_from(pose), pose))
+    return Refined(pose, loss.value(find_seen(pose), pose))

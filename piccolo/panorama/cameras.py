@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from ..camera import Calibration, Mount
 from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
 from ..camera.resampling import View, shrunk
-from ..camera.rig import extent_of
+from ..camera.rig import compute_extent
 from ..errors import InputError
 from .cube import face_pixels
 from .gpano import ASPECT_TOLERANCE
 from .masks import black_borders
 from .model import ReadOptions
-from .photo import focal_of
+from .photo import read_focal_length
 from .picture import Picture
 
 # By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many
@@ -70,7 +70,7 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
     is_photo = lens is None and options.fov_deg is None and not has_gpano and not is_two_to_one
     if not (is_photo or lens == "pinhole"):
         return Cameras()
-    found = focal_of(picture.exif, picture.size)
+    found = read_focal_length(picture.exif, picture.size)
     if found is None:
         if lens == "pinhole":
             raise InputError(
@@ -102,7 +102,7 @@ def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[
     return tuple(mount.turn(R_stored_from_shown) for mount in mounts)
 
 
-def views_of(
+def read_views(
     path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: NDArray[np.bool_]
 ) -> tuple[list[View], tuple[str, ...]]:
     """Each camera with its part of a picture, black borders masked, and what the user should know.
@@ -110,7 +110,7 @@ def views_of(
     `is_valid` (H, W) tells the pixels that count so far.
     """
     pixels = face_pixels(picture.rgb, is_valid)
-    whole = extent_of(mounts)
+    whole = compute_extent(mounts)
     if picture.size[0] != picture.size[1] and picture.orientation in TURNED and whole == picture.size[::-1]:
         pixels = np.rot90(pixels, TURNED[picture.orientation][1])
     views = []

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Calibration, Camera, Mount
-from ..camera.resampling import View, sphere_of
+from ..camera.resampling import View, make_sphere
 from ..camera.rig import IDENTITY
 from ..errors import InputError
 from ..geometry.colors import Labels
@@ -55,7 +55,7 @@ class Panorama:
         """
         assert self.focal_prior is not None
         mount = self.cameras[0].with_camera(camera)
-        rgb, is_valid = sphere_of([self.focal_prior.view._replace(mount=mount)], width)
+        rgb, is_valid = make_sphere([self.focal_prior.view._replace(mount=mount)], width)
         hidden = self.focal_prior.is_hidden
         if hidden.any():
             at_width = cv2.resize(hidden.view(np.uint8), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)

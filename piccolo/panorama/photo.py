@@ -73,7 +73,7 @@ def _digest(files: list[Path]) -> str:
     return digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def photo_of(path: Path, rig: Calibration | None = None) -> PhotoFacts:
+def read_photo_facts(path: Path, rig: Calibration | None = None) -> PhotoFacts:
     """Return the facts that a photo's file gives, or the first file of a folder of cube faces or of a rig.
 
     InputError if the file is missing or no picture. Metadata that are damaged count as missing.
@@ -152,7 +152,7 @@ class ExifFocal(NamedTuple):
     source: str  # in words
 
 
-def focal_of(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | None:
+def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | None:
     """Return the focal length of a picture of this size [px]; None if EXIF does not say, or what can't be."""
     diagonal = math.hypot(*size)
     film = _number(exif, Base.FocalLengthIn35mmFilm)

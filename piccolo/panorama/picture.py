@@ -27,7 +27,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 
 from ..errors import InputError, ResourceError
 from ..files.json_file import read_bytes
-from ..geometry.colors import Labels, colors_of
+from ..geometry.colors import Labels, label_colors
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 
@@ -115,7 +115,7 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
             pixels = np.ascontiguousarray(pixels[..., :3])
         else:
             is_valid = np.ones(pixels.shape[:2], dtype=np.bool_)
-        more = _xmp(image), _warnings(image), exif_of(image), _orientation(image)
+        more = _xmp(image), _warnings(image), read_exif(image), _orientation(image)
         return Picture(np.asarray(pixels, np.uint8), is_valid, *more)
 
 
@@ -134,7 +134,7 @@ def read_labels(path: Path, labels: Labels) -> Picture:
         pixels = np.array(_decode(path, data, image, image.mode)).astype(np.int32)
         if pixels.ndim == 3:
             pixels = pixels[..., 0] << 16 | pixels[..., 1] << 8 | pixels[..., 2]
-        return Picture(colors_of(pixels), labels.are_kept(pixels), _xmp(image), _warnings(image))
+        return Picture(label_colors(pixels), labels.are_kept(pixels), _xmp(image), _warnings(image))
 
 
 def picture_size(path: Path) -> tuple[int, int]:
@@ -220,7 +220,7 @@ def _orientation(image: ImageFile) -> object:
         return None
 
 
-def exif_of(image: ImageFile) -> dict[int, object]:
+def read_exif(image: ImageFile) -> dict[int, object]:
     """Return what EXIF says of camera and exposure, by tag; empty where it is missing or damaged."""
     try:
         return dict(image.getexif().get_ifd(IFD.Exif))

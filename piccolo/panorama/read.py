@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Calibration, Mount
-from ..camera.resampling import View, sphere_of, sphere_width
+from ..camera.resampling import View, make_sphere, sphere_width
 from ..camera.rig import MAX_OFFSET
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..jobs.memory import check_memory
-from .cameras import cameras_of, rig_cameras, views_of
+from .cameras import cameras_of, read_views, rig_cameras
 from .cube import cube_of_cells, face_paths, read_cube_folder
 from .gpano import (
     ASPECT_TOLERANCE,
@@ -57,10 +57,10 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
         return _read_rig(path, options.rig, options)
     if path.is_dir():
         return _embed_and_mask(path, read_cube_folder(path), CropRegion(), options, None)
-    return panorama_of(path, read_picture(path), options)
+    return make_panorama(path, read_picture(path), options)
 
 
-def panorama_of(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
+def make_panorama(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
     """Return the panorama of a picture; `path` names it in errors and warnings."""
     if cube := cube_of_cells(path, picture, options.cube_order):
         return _embed_and_mask(path, cube, CropRegion(), options, None)
@@ -122,10 +122,10 @@ def _on_sphere(
         if 1 in masks:
             counts = masks[1] if counts is None else counts & masks[1]
         is_valid = picture.is_valid & masks[0] if 0 in masks else picture.is_valid
-        found, more = views_of(file, picture, mounts, is_valid)
+        found, more = read_views(file, picture, mounts, is_valid)
         views += found
         notes += [*picture.warnings, *more]
-    rgb, is_valid = sphere_of(views, width)
+    rgb, is_valid = make_sphere(views, width)
     panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
     masked = _mask(path, panorama, counts, options)
     if deviation == 0.0:

@@ -45,7 +45,7 @@ def channel(texel, shift):
 
 
 @inline_kernel
-def texel_at(x, y, z, rho, width):
+def locate_texel(x, y, z, rho, width):
     """Index of the upper left of four texels around a camera direction, and the fraction (fu, fv) beyond it.
 
     rho = hypot(x, y). Texel centres are at half-integers of the pixel coordinates, and a column and a row of
@@ -146,7 +146,7 @@ def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
     pose = pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):
         x, y, z = in_camera(X[n], Y[n], Z[n], pose)
-        p.index[n], p.fu[n], p.fv[n] = texel_at(x, y, z, math.sqrt(x * x + y * y), width)
+        p.index[n], p.fu[n], p.fv[n] = locate_texel(x, y, z, math.sqrt(x * x + y * y), width)
         p.x[n] = x
         p.y[n] = y
         p.z[n] = z

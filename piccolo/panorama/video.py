@@ -41,7 +41,7 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
             slot += 1
         if time >= (slot - NEIGHBORHOOD) * every:
             rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
-            sharpness = sharpness_of(rgb)
+            sharpness = measure_sharpness(rgb)
             if best is None or sharpness > best[0]:
                 best = sharpness, time, rgb
     if best is not None:
@@ -61,7 +61,7 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
             return
 
 
-def sharpness_of(rgb: NDArray[np.uint8]) -> float:
+def measure_sharpness(rgb: NDArray[np.uint8]) -> float:
     """Variance of the Laplacian of an image (H, W, 3), made smaller (Pech-Pacheco et al., 2000)."""
     height = max(round(rgb.shape[0] * SHARPNESS_WIDTH / rgb.shape[1]), 1)
     small = cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)

@@ -11,11 +11,11 @@ from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses
 from ..confidence.confidence import AMBIGUOUS, LEAST_SCORE, LOCALIZED, NOT_LOCALIZED
 from ..confidence.localization import Alternative, Evidence, Localization
-from ..confidence.occlusion import agreement_at, occlusion_at
+from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.rotations import uniform_rotations, uniform_yaws
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..optimize.refine import Loss, Refined, refine, sampling_loss_of
+from ..optimize.refine import Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
@@ -48,7 +48,7 @@ def make_loss(panorama: Panorama, settings: PaperSettings) -> Loss:
     """Return the loss that the settings select."""
     if settings.loss == "photometric":
         return make_photometric_loss(shrink(panorama, settings.photometric_width))
-    return sampling_loss_of(pack_texels(panorama.rgb, panorama.is_valid))
+    return make_sampling_loss(pack_texels(panorama.rgb, panorama.is_valid))
 
 
 def localize(
@@ -82,10 +82,10 @@ def evaluate(
     points: PackedPoints, panorama: Panorama, best: Refined, refined: list[Refined]
 ) -> tuple[Evidence, list[Hypothesis]]:
     """Return the evidence at the best pose, and the alternatives, best first."""
-    at_pose = agreement_at(points, panorama, best.pose)
-    others = [Hypothesis(r.pose, agreement_at(points, panorama, r.pose).score) for r in refined]
+    at_pose = measure_agreement(points, panorama, best.pose)
+    others = [Hypothesis(r.pose, measure_agreement(points, panorama, r.pose).score) for r in refined]
     others = alternative_poses(best.pose, others)
-    explained, contradicted = occlusion_at(points, panorama, best.pose).fractions()
+    explained, contradicted = compare_occlusion(points, panorama, best.pose).fractions()
     evidence = Evidence(
         score=at_pose.score,
         margin=at_pose.score - max([0.0, *(h.score for h in others)]),

@@ -19,17 +19,17 @@ from ..files.cache import digest_of_sources
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, progress_to
+from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
 from ..opened_scan import File
 from ..opening import Units
-from ..panorama.photo import photo_of
+from ..panorama.photo import read_photo_facts
 from ..result import FAILED, UNREADABLE, Result, check_scan
 from ..scan import Scan
 from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
-from ..views.surfels import MAX_SURFELS, Surfels, surfels_of
-from .entries import Entry, document_of_entry, entries_of, names_of, short_names_of
+from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
+from .entries import Entry, collect_entries, document_of_entry, shorten_names, unique_names
 from .pictures import extract_frames, make_pictures, read_options_of
 from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
@@ -86,7 +86,7 @@ def build_report(
         if not settings.is_self_contained:
             check_folder(out)
         begin_folder(folder)
-        tasks = [task_of(entry, scan_map, settings) for entry in entries]
+        tasks = [make_task(entry, scan_map, settings) for entry in entries]
         warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
         document = {**document_of(tasks, scan_map, folder, settings), "note": note}
         if not settings.is_self_contained:
@@ -110,14 +110,14 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     )
 
 
-def task_of(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
+def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
     """Return what is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
     photo = Path(result.pano)
     if settings.images is not None:
         photo = settings.images / photo.name
     try:
-        digest = photo_of(photo, read_options_of(result).rig).sha256
+        digest = read_photo_facts(photo, read_options_of(result).rig).sha256
     except (OSError, InputError):
         digest = ""
     parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
@@ -138,7 +138,7 @@ def write_pictures(
     points = scan_map.points.subsample(MAX_SURFELS)
     is_found = any(task.poses for task in todo)
     nothing = Surfels(points, np.empty((0, 3), np.float32), np.empty(0, np.float32))
-    scan = (surfels_of(points, workers) if is_found else nothing), points
+    scan = (make_surfels(points, workers) if is_found else nothing), points
 
     def write(task: Task) -> str:
         try:
@@ -158,9 +158,9 @@ def document_of(
     tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings
 ) -> dict[str, Any]:
     """All that the page knows at once; writes the plans."""
-    names = names_of([task.entry for task in tasks])
+    names = unique_names([task.entry for task in tasks])
     photos = []
-    for task, name, short in zip(tasks, names, short_names_of(names), strict=True):
+    for task, name, short in zip(tasks, names, shorten_names(names), strict=True):
         has_pictures = picture_path(folder, "photos", task.key).exists()
         thumb = f"thumbs/{task.key}.jpg" if picture_path(folder, "thumbs", task.key).exists() else None
         entry = document_of_entry(task.entry, name, task.key, scan_map)
@@ -278,7 +278,7 @@ def write_report(  # noqa: PLR0913  options by name
     PosixPath('report/index.html')
     """
     check_arguments(write_report, locals())
-    show = progress_to(progress) if progress else no_progress
+    show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     settings = ReportSettings(
         title=title,
@@ -297,7 +297,7 @@ def write_report(  # noqa: PLR0913  options by name
         scan_map = open_map(_paths(scan), CloudSettings(METRES[units], up), policy, workers, Stopwatch())
     if not isinstance(scan_map, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
-    return build_report(entries_of(_items(results)), scan_map, Path(out), settings, workers).page
+    return build_report(collect_entries(_items(results)), scan_map, Path(out), settings, workers).page
 
 
 def _items(results: File | Iterable[File | Result]) -> list[Path | Result]:

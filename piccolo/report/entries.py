@@ -34,7 +34,7 @@ class Entry(NamedTuple):
     time: float  # [s] by which a walk's photos are in order; else its place in the files
 
 
-def entries_of(items: Sequence[Path | Result]) -> list[Entry]:
+def collect_entries(items: Sequence[Path | Result]) -> list[Entry]:
     """Return the results given and those in files; the frames of a file, or those given, are one walk."""
     entries: list[Entry] = []
     for number, item in enumerate(items):
@@ -52,7 +52,7 @@ def entries_of_walk(results: Sequence[Result]) -> list[Entry]:
     return [Entry(r, 0, time) for r, time in zip(results, times, strict=True)]
 
 
-def names_of(entries: Sequence[Entry]) -> list[str]:
+def unique_names(entries: Sequence[Entry]) -> list[str]:
     """Return a name for each, which no other has: its path below the folder that all share."""
     paths = [Path(entry.result.pano) for entry in entries]
     folders = [path.parent.parts for path in paths]
@@ -68,7 +68,7 @@ def names_of(entries: Sequence[Entry]) -> list[str]:
     return names
 
 
-def short_names_of(names: Sequence[str]) -> list[str]:
+def shorten_names(names: Sequence[str]) -> list[str]:
     """Return the file's own name without its ending, or the name as it is where several would be the same."""
     own = [ENDING.sub(r"\1", name.rpartition("/")[2]) for name in names]
     counts = Counter(own)

@@ -77,14 +77,14 @@ def make_pictures(
         view_width = min(full, SCAN_WIDTH) & ~1
         view = scan_view(surfels, poses[0], view_width)
         document["scan"] = _base64(scan_picture(view))
-        document["reach"] = _base64(reach_of(view).tobytes())
+        document["reach"] = _base64(measure_reach(view).tobytes())
         mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
         document["mask"] = _base64(encode_image(mask, ".png"))
         document["alternatives"] = [
             _base64(scan_picture(scan_view(surfels, pose, ALTERNATIVE_WIDTH))) if is_shown else None
             for pose, is_shown in zip(poses[1:], _shown(result), strict=True)
         ]
-    return thumbnail_of(small, poses[0] if poses else None), json.dumps(document)
+    return make_thumbnail(small, poses[0] if poses else None), json.dumps(document)
 
 
 def _shown(result: Result) -> list[bool]:
@@ -100,7 +100,7 @@ def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
     return render_surfels(visible, pose, width, Workers())
 
 
-def reach_of(view: View) -> NDArray[np.uint8]:
+def measure_reach(view: View) -> NDArray[np.uint8]:
     """How far one can see (h, w) [0.1 m], on a small sphere; 255 for 25.5 m and more, or nothing scanned."""
     tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
     return np.asarray(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA), np.uint8)
@@ -124,7 +124,7 @@ def _grey_where_unscanned(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) ->
     return np.asarray(rgb + weight * (UNSCANNED - rgb), np.uint8)
 
 
-def thumbnail_of(panorama: Panorama, pose: Pose | None) -> bytes:
+def make_thumbnail(panorama: Panorama, pose: Pose | None) -> bytes:
     """JPEG of what lies ahead of the camera; level if the pose is known."""
     width, height = THUMB_SIZE
     camera = pinhole(width, height, 0.5 * width / math.tan(math.radians(0.5 * THUMB_FOV_DEG)))

@@ -82,12 +82,12 @@ def write_plan_file(entries: Sequence[Entry], scan_map: ScanMap, out: Path, sett
         begin_folder(folder)
         tasks = [Task(entry, Path(), "", []) for entry in entries]
         document = document_of(tasks, scan_map, folder, settings)
-        content = dxf_of(document) if suffix == DXF else figure_of(document, folder, suffix[1:])
+        content = make_dxf(document) if suffix == DXF else draw_figure(document, folder, suffix[1:])
     write_atomically(out, content)
     return len(document["storeys"])
 
 
-def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
+def draw_shapes(document: dict[str, Any], index: int) -> Iterator[Shape]:
     """Yield the shapes drawn of a storey, in the map's frame: paths first, marks last."""
     numbered = enumerate(document["photos"], 1)
     photos = [(n, photo) for n, photo in numbered if photo["isOnPlan"] and photo["storey"] in (index, None)]
@@ -108,7 +108,7 @@ def shapes_of(document: dict[str, Any], index: int) -> Iterator[Shape]:
         yield Mark(center, photo["status"], FRAME_SIZE if is_frame else SIZE, text, photo["name"])
 
 
-def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
+def draw_figure(document: dict[str, Any], folder: Path, form: str) -> bytes:
     """Return the plans one below the other as matplotlib draws them, with a scale each."""
     plans = [(k, storey) for k, storey in enumerate(document["storeys"]) if storey["plan"]]
     sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + MARGIN for _, s in plans]
@@ -120,7 +120,7 @@ def figure_of(document: dict[str, Any], folder: Path, form: str) -> bytes:
         box = MARGIN / 2, top + MARGIN / 4, width - MARGIN, height - MARGIN
         axes = figure.add_axes((np.array(box) / np.tile(figure.get_size_inches(), 2)).tolist())
         _draw_plan(axes, storey, folder)
-        for shape in shapes_of(document, k):
+        for shape in draw_shapes(document, k):
             _draw(axes, shape)
         if any(photo["walk"] is not None for photo in document["photos"]):
             _draw_scale(axes)
@@ -190,7 +190,7 @@ def _fraction(color: tuple[int, int, int]) -> tuple[float, ...]:
     return tuple(value / 255.0 for value in color)
 
 
-def dxf_of(document: dict[str, Any]) -> bytes:
+def make_dxf(document: dict[str, Any]) -> bytes:
     """Points, headings, 95 % ellipses and names in metres of the scan's coordinates."""
     ezdxf = import_optional("`plan`", "ezdxf", "tools")
     drawing = ezdxf.new("R2010", setup=True)
@@ -201,7 +201,7 @@ def dxf_of(document: dict[str, Any]) -> bytes:
     for k, storey in enumerate(document["storeys"]):
         layer = _layer_name(storey["name"], k)
         drawing.layers.add(layer)
-        for shape in shapes_of(document, k):
+        for shape in draw_shapes(document, k):
             _add(drawing.modelspace(), shape, layer, R_map_from_world, np.array(document["origin"]))
     file = io.StringIO()
     drawing.write(file)

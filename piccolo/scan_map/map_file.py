@@ -23,7 +23,7 @@ from ..cloud.readers.npz import damage_named
 from ..errors import InputError
 from ..files.array_archive import ArrayArchive, write_archive
 from ..files.atomic import replacing
-from ..files.cache import WRITABLE, is_own, key_of, mark_used, own_names, private_folder, recall, remember
+from ..files.cache import WRITABLE, is_own, make_key, mark_used, own_names, private_folder, recall, remember
 from ..local_features.feature_map import FeatureMap
 from ..views.candidate_views import CandidateViews
 from .map_validation import LAYOUT, check_arrays, clean_warnings
@@ -88,7 +88,7 @@ def hold_unchanged(path: Path, is_copied: bool) -> Iterator[Path | None]:
 def copy_into(path: Path, folder: Path) -> Path | None:
     """Copy a file into a folder unless its current copy is there; None if that fails."""
     with path.open("rb") as file:
-        copy = folder / f"{key_of('copy', os.fstat(file.fileno()))}.piccolo-map"
+        copy = folder / f"{make_key('copy', os.fstat(file.fileno()))}.piccolo-map"
         try:
             if not copy.exists():
                 with replacing(copy) as out:

@@ -60,7 +60,7 @@ def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bo
     return np.isin(scan_map.scan_of_candidate, named_so)
 
 
-def scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
+def find_scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
     """Return the scan in which a place (3,) lies, by the nearest candidate; None if there are no names."""
     if not (scan_map.scan_names and len(scan_map.centers)):
         return None
@@ -86,4 +86,4 @@ def add_places(scan_map: ScanMap, found: Localization) -> Localization:
 
 def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:
     """Return the scan in which a pose of the world lies."""
-    return scan_at(scan_map, scan_map.from_world(pose).center_world)
+    return find_scan_at(scan_map, scan_map.from_world(pose).center_world)

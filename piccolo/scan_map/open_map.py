@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud import open_cloud
-from ..cloud.crs import crs_of
+from ..cloud.crs import read_crs
 from ..cloud.settings import IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
@@ -72,7 +72,7 @@ def open_map(
             cloud, workers, cloud_settings.up, watch, prior=prior, has_features=has_features
         )
         has_labels = cloud_settings.labels is not None
-        return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=crs_of(paths))
+        return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=read_crs(paths))
 
     key = content_key(digest, cloud_settings) if digest else ""
     if not (cache.is_used and key):
@@ -111,7 +111,7 @@ def extend_map(
         old = load_map(map_path)
         cloud = open_cloud(paths, cloud_settings, workers.show)
         digest = sha256_of_files(paths)
-        crs = crs_of(paths)
+        crs = read_crs(paths)
     check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")

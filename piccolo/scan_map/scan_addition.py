@@ -23,7 +23,7 @@ from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, rend
 from ..views.view import BLOCK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
 from .named_scans import check_name
-from .scan_map import ScanMap, Voxelized, look_from, sparse_candidates
+from .scan_map import ScanMap, Voxelized, make_range_lookup, sparse_candidates
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -192,7 +192,7 @@ def join_features(old: ScanMap, octree: Octree, found: Candidates, workers: Work
     looked_at = np.concatenate([place[has_place], found.changed])
     centers = found.centers[looked_at]
     num_known = int(np.count_nonzero(has_place))
-    more = view_positions(centers, look_from(octree, centers), SEARCH_VIEW.num_rings, num_known)
+    more = view_positions(centers, make_range_lookup(octree, centers), SEARCH_VIEW.num_rings, num_known)
     anew = np.concatenate([place[has_place & ~is_kept], looked_at[more]])
     if np.count_nonzero(is_kept) + len(anew) > MOST_VIEWS:
         raise InputError(f"`add`: found more than {MOST_VIEWS} views with features, the most of one map")

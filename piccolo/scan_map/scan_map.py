@@ -222,11 +222,11 @@ def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[st
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
     """Find local features in views from few of a map's candidates, chosen by what they see."""
     centers = scan_map.centers
-    chosen = view_positions(centers, look_from(scan_map.octree, centers), SEARCH_VIEW.num_rings)
+    chosen = view_positions(centers, make_range_lookup(scan_map.octree, centers), SEARCH_VIEW.num_rings)
     return make_feature_map(scan_map.octree, centers[chosen], workers)
 
 
-def look_from(octree: Octree, centers: NDArray[np.float64]) -> Look:
+def make_range_lookup(octree: Octree, centers: NDArray[np.float64]) -> Look:
     """Return a function that gives the ranges seen from a centre of (N, 3) by its index."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 

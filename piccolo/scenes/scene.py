@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..camera import Calibration, Mount
-from ..camera.files import document_of, mounts_of
+from ..camera.files import document_of, read_mounts
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.json_file import DAMAGE, describe, read_json
@@ -114,7 +114,7 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
         raise ValueError(f"{entry['image']}: a center_world that is not three finite numbers")
     check_rotation(R_cam_from_world, MAX_SKEW, f"{entry['image']}: an R_cam_from_world that")
     labels = folder / entry["labels"] if entry.get("labels") else None
-    cameras = mounts_of(entry["camera"]) if entry.get("camera") else ()
+    cameras = read_mounts(entry["camera"]) if entry.get("camera") else ()
     pose = Pose(R_cam_from_world, center_world)
     return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *_walk_of(entry))
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..camera import Camera
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import pixels_of
+from ..geometry.sphere import compute_pixels
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..panorama.model import shrink
@@ -123,5 +123,5 @@ def _places(
     """Columns and rows of the sphere that pixels show (height, width), and which show any."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays, is_in = camera.rays(np.stack([u, v], axis=-1))
-    columns, rows = pixels_of(rays @ R_lens_from_cam, width)
+    columns, rows = compute_pixels(rays @ R_lens_from_cam, width)
     return columns.astype(np.float32), rows.astype(np.float32), is_in

@@ -158,7 +158,7 @@ class RecentViews:
         self.surroundings = lru_cache(NUM_SURROUNDINGS)(partial(points_around, octree))
 
 
-def place_of(pose: Pose) -> tuple[float, float, float]:
+def round_position(pose: Pose) -> tuple[float, float, float]:
     """The place [m] nearest to a pose of the map."""
     x, y, z = (round(float(value) / PLACE_SPACING) * PLACE_SPACING for value in pose.center_world)
     return x, y, z

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import pixels_of, rays_of
+from ..geometry.sphere import compute_pixels, compute_rays
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, inline_kernel, kernel
 from ..panorama.texels import channel
@@ -58,7 +58,7 @@ class Surfels(NamedTuple):
         return Surfels(self.points.take(indices), self.normals[indices], self.radii[indices])
 
 
-def surfels_of(points: PackedPoints, workers: Workers) -> Surfels:
+def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
     """Each point as a surfel over its nearest neighbours; points in the air are left out."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no picture need not wait for it
 
@@ -168,15 +168,15 @@ def splat(surfels, rgbx, extents, columns, rows, first_row, depth, sums):
 
 def axes_of_pixels(width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Cosines and sines of each column's azimuth (width, 2) and of each row's elevation (width / 2, 2)."""
-    columns = rays_of(np.arange(width) + 0.5, width / 4.0, width)[:, :2]
-    rows = rays_of(width / 2.0, np.arange(width // 2) + 0.5, width)[:, ::2]
+    columns = compute_rays(np.arange(width) + 0.5, width / 4.0, width)[:, :2]
+    rows = compute_rays(width / 2.0, np.arange(width // 2) + 0.5, width)[:, ::2]
     return columns.astype(np.float32), rows.astype(np.float32)
 
 
 def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> View:
     """The cloud at `pose`, `width` x width / 2 pixels; colours in uint8."""
     visible = points.take(visible_indices(points, pose.center_world)).subsample(MAX_SURFELS)
-    return render_surfels(surfels_of(visible, workers), pose, width, workers)
+    return render_surfels(make_surfels(visible, workers), pose, width, workers)
 
 
 def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
@@ -244,4 +244,4 @@ def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[NDArray[np.flo
     along = np.einsum("ni,ni->n", normals, x_cam)
     packed = np.column_stack([x_cam, normals, along, 1.0 / radii**2, ranges]).astype(np.float32)
     angles = np.maximum(np.arcsin(radii / ranges), MIN_RADIUS_PX * 2.0 * math.pi / width)
-    return packed, np.column_stack([*pixels_of(x_cam, width), angles])
+    return packed, np.column_stack([*compute_pixels(x_cam, width), angles])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.pose import Array
-from ..geometry.sphere import BLOCK_RINGS, PI, atan2, cell_of, interpolation, make_grid, make_neighbors
+from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import LEVELS_PER_UNIT, mean_and_inverse_std, opponent, zscore
 from .zbuffer import VISIBLE_FACTOR
@@ -85,7 +85,7 @@ class ViewConfig:
         return ViewArrays(
             grid.num_columns,
             grid.first,
-            cell_of(grid.directions, self.stats_rings),
+            find_cell(grid.directions, self.stats_rings),
             len(make_grid(self.stats_rings)),
             grid.solid_angle,
             neighbors.row,
@@ -94,7 +94,7 @@ class ViewConfig:
             *interpolation(self.num_rings, self.stats_rings),
             np.float32(self.front),
             np.float32(self.visible),
-            cell_of(grid.directions, BLOCK_RINGS),
+            find_cell(grid.directions, BLOCK_RINGS),
         )
 
 
@@ -241,7 +241,7 @@ def normalize_cells(sums, view, shown, offsets, channels, weights):
 
 
 @inline_kernel
-def as_level(channel):
+def encode_level(channel):
     """A normalised channel in 8 bits."""
     level = math.floor(channel * np.float32(LEVELS_PER_UNIT) + HALF)
     return np.int8(min(max(level, np.float32(-127)), np.float32(127)))
@@ -267,7 +267,7 @@ def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, l
         for i in range(3):
             for c in range(n):
                 offsets[k, i, c] = np.int16(points[i, c] / unit[k])
-                levels[k, i, c] = as_level(channels[i, c])
+                levels[k, i, c] = encode_level(channels[i, c])
         for c in range(n):
             is_seen[k, c] = weights[c] > F0
 
@@ -301,7 +301,7 @@ def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, s
                 total[3] += weights[c]
         for c in range(view.num_stats):
             for i in range(3):
-                features[k, i, c] = as_level(wide[c, i] / area[c])
+                features[k, i, c] = encode_level(wide[c, i] / area[c])
             seen[k, c] = np.uint8(min(wide[c, 3] / area[c], F1) * np.float32(255) + HALF)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from ..geometry.sphere import cell_of
+from ..geometry.sphere import find_cell
 from ..jobs.threads import Workers
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW
@@ -99,7 +99,7 @@ def look_past(
     m = scan_map
     toward = m.centers[second] - m.centers[first]
     length = np.linalg.norm(toward, axis=1)
-    cell = cell_of((toward / length[:, None]).astype(np.float32), SEARCH_VIEW.num_rings)
+    cell = find_cell((toward / length[:, None]).astype(np.float32), SEARCH_VIEW.num_rings)
     nodes = np.unique(first)
 
     def ranges_from(lo: int) -> NDArray[np.float32]:

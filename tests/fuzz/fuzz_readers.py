@@ -18,7 +18,7 @@ from piccolo.cloud import FORMATS
 from piccolo.cloud.settings import IN_METRES
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
-from piccolo.panorama.photo import photo_of
+from piccolo.panorama.photo import read_photo_facts
 from piccolo.result import Result
 from piccolo.scan_map.map_file import load_map
 from piccolo.scan_map.prior import Prior
@@ -27,7 +27,7 @@ from piccolo.scenes.scene import read_scene
 READERS = {suffix[1:]: form.open_source for form in FORMATS for suffix in form.suffixes}
 OTHERS = {
     "jpg": read_panorama,
-    "tif": photo_of,
+    "tif": read_photo_facts,
     "rig.json": read_rig,
     "cameras.txt": read_cameras,
     "map": load_map,

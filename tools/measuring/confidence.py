@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from piccolo.cli.command import option
 from piccolo.cli.errors import print_note
-from piccolo.cloud import read_cloud, stream_of
+from piccolo.cloud import read_cloud, stream_points
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_METRES
 from piccolo.geometry.pose import Pose, is_correct
@@ -182,7 +182,7 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     yield (cloud[0][wall], cloud[1][wall]), [r._replace(case="one wall") for r in right[:2]]
 
 
-def repeated_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
+def repeat_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
     """Yield a place of each kind that looks the same from several positions, with its trials."""
     rng = np.random.default_rng([seed, 51])
     for kind in REPEATED_KINDS:
@@ -232,7 +232,7 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
-        for points, trials in chain(room_trials(seed, workers), repeated_trials(seed, workers), alike):
+        for points, trials in chain(room_trials(seed, workers), repeat_trials(seed, workers), alike):
             yield f"seed {seed}", points, trials
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
@@ -256,7 +256,7 @@ def run(arguments: argparse.Namespace) -> int:
     rows: list[Case] = []
     with arguments.out.open("w") as file:
         for scene, (points, colors), trials in all_trials(arguments, workers):
-            cloud = stream_of(Path("trial"), RawCloud(points.astype(np.float64), colors))
+            cloud = stream_points(Path("trial"), RawCloud(points.astype(np.float64), colors))
             scan = scan_of(cloud, scene, IN_METRES, CoarseToFineSettings(), workers, Stopwatch())
             for trial in trials:
                 settings = CoarseToFineSettings(gravity=trial.gravity)

@@ -12,7 +12,7 @@ from PIL import Image as PillowImage
 
 from piccolo.camera.model import camera_of_fov
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.sphere import pixels_of
+from piccolo.geometry.sphere import compute_pixels
 from piccolo.scenes.synthetic.world import blur
 
 from .confidence import Image, Points, light_unevenly, mask_outside_field, occlude, thin_points
@@ -102,7 +102,7 @@ def cut_photo(rgb: Image, pose: Pose, rng: np.random.Generator, path: Path) -> P
     R_photo_from_pano = exp_so3(np.array([roll, pitch, 0.0])) @ yaw_rotation(rng.uniform(0.0, 2.0 * np.pi))
     columns, rows = (np.arange(size) + 0.5 for size in PHOTO_SIZE)
     rays, _ = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
-    u, v = pixels_of(rays @ R_photo_from_pano, rgb.shape[1])
+    u, v = compute_pixels(rays @ R_photo_from_pano, rgb.shape[1])
     map_u = (u - 0.5).astype(np.float32)  # OpenCV has pixel centres at whole numbers
     map_v = (v - 0.5).astype(np.float32)
     picture = cv2.remap(rgb, map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)

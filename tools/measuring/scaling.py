@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from piccolo.cloud import Cloud, read_cloud, stream_of
+from piccolo.cloud import Cloud, read_cloud, stream_points
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
@@ -55,7 +55,7 @@ def scene_case(scene: Scene, num_points: int) -> Case:
     taken = clean_queries(scene, NUM_QUERIES)
     queries = [(read_panorama(query.image), query.pose) for query in taken]
     raw = RawCloud(points + cloud.origin_world, cloud.colors[index])
-    return stream_of(scene.cloud, raw).read(), queries
+    return stream_points(scene.cloud, raw).read(), queries
 
 
 def rooms_case(num_rooms: int) -> Case:
@@ -65,7 +65,7 @@ def rooms_case(num_rooms: int) -> Case:
     points, colors, _ = scan_world(world, 50_000 * num_rooms, workers)
     taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
     queries = [(Panorama(q.rgb, np.ones(q.rgb.shape[:2], dtype=bool)), q.pose) for q in taken]
-    return stream_of(Path("rooms"), RawCloud(points.astype(np.float64), colors)).read(), queries
+    return stream_points(Path("rooms"), RawCloud(points.astype(np.float64), colors)).read(), queries
 
 
 def measure_file(scan_map: ScanMap) -> tuple[str, str]:

@@ -20,10 +20,10 @@ from .e57_file import (
     E57File,
     child,
     children,
-    number_of,
     open_file,
     parse_integer,
     pose_of,
+    read_number,
     read_scaled,
     refusing,
     text_of,
@@ -151,7 +151,7 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     """Return the values of a channel that mean dark and full brightness."""
     name = field.tag.removeprefix(NAMESPACE)
     limits = child(element, "colorLimits")
-    low, high = (number_of(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
+    low, high = (read_number(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
     if low is not None and high is not None and low < high:
         return low, high
     declared = [field.get(end) for end in ("minimum", "maximum")]
@@ -282,7 +282,7 @@ def _images(file: E57File) -> Iterator[E57Image]:
 
 
 def _side(path: Path, representation: Element, name: str) -> int:
-    value = number_of(path, child(representation, name)) or 0.0
+    value = read_number(path, child(representation, name)) or 0.0
     if not 0 < value <= MAX_SIDE:
         raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_SIDE}")
     return int(value)
@@ -290,7 +290,7 @@ def _side(path: Path, representation: Element, name: str) -> int:
 
 def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
     """Return the angles [deg] that a spherical image covers, across and down, by its pixel size."""
-    width, height = (number_of(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
+    width, height = (read_number(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
     if width is None or height is None:
         return None
     across = width * _side(path, representation, "imageWidth")

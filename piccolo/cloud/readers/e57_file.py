@@ -151,7 +151,7 @@ def text_of(element: Element | None, name: str) -> str:
     return "" if found is None else (found.text or "").strip()
 
 
-def number_of(path: Path, element: Element | None) -> float | None:
+def read_number(path: Path, element: Element | None) -> float | None:
     """Return the value of a number's element, None without one.
 
     An empty one is 0, a scaled integer is scaled.
@@ -205,4 +205,4 @@ def pose_of(path: Path, element: Element) -> Pose | None:
 
 
 def _numbers(path: Path, element: Element | None, names: str) -> Array:
-    return np.array([number_of(path, child(element, name)) or 0.0 for name in names])
+    return np.array([read_number(path, child(element, name)) or 0.0 for name in names])

@@ -94,7 +94,7 @@ def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points:
             yield _points(instance, k, rows, texels)
 
 
-def weights_of(k: NDArray[np.int64]) -> Array:
+def compute_weights(k: NDArray[np.int64]) -> Array:
     """Barycentric coordinates (N, 3) of the points k: the R2 sequence, its square folded to a triangle."""
     a, b = (np.modf(0.5 + k * step)[0] for step in R2_STEPS)
     is_beyond = a + b > 1.0
@@ -107,7 +107,7 @@ def _points(
 ) -> RawCloud:
     """Return the points k in the triangles `rows`; those on texels of alpha 0 are left out."""
     surface = instance.surface
-    weights = weights_of(k)
+    weights = compute_weights(k)
     matrix = instance.T_world_from_surface
     triangles = surface.triangles[rows]
     points_world = _blend(surface.vertices, triangles, weights) @ matrix[:3, :3].T + matrix[:3, 3]

@@ -60,7 +60,7 @@ class Texture(NamedTuple):
             return np.asarray(image.convert("RGBA"))
 
 
-def texture_of(path: Path, image: Any) -> Texture | None:
+def read_texture(path: Path, image: Any) -> Texture | None:
     """Return the texture in an image that trimesh opened; None if it only stands for a missing one."""
     file = getattr(image, "fp", None)
     if file is None:

@@ -19,8 +19,8 @@ from .mesh_files import (
     check_image,
     first_line,
     own_limit,
+    read_texture,
     sanitize_gltf,
-    texture_of,
 )
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
@@ -56,7 +56,7 @@ class Loaded:
     def texture(self, image: Any) -> Texture | None:
         """Return the texture in an image, the same one for all surfaces that share it."""
         if id(image) not in self.textures:
-            self.textures[id(image)] = texture_of(self.path, image)
+            self.textures[id(image)] = read_texture(self.path, image)
         return self.textures[id(image)]
 
 

@@ -23,8 +23,8 @@ from .reader import (
     BRIGHTEST,
     CloudFormat,
     PointSource,
-    brightest_of,
     color_chunks,
+    find_full_brightness,
     in_chunks,
     point_label,
     quote_line,
@@ -88,7 +88,7 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     points, colors = (_open_array(path, info.filename, info.file_size) for info in _members(path))
     if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {points} and {colors}, {WANTED}")
-    brightest = brightest_of(path, [colors.dtype.str[1:]])
+    brightest = find_full_brightness(path, [colors.dtype.str[1:]])
     return _source(path, lambda: zip(points.read_rows(), colors.read_rows(), strict=True), brightest, points)
 
 

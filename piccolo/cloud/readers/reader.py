@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.colors import Labels, colors_of
+from ...geometry.colors import Labels, label_colors
 from ..settings import CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] by which a format is known
@@ -96,7 +96,7 @@ def color_names(names: Collection[str]) -> tuple[str, ...]:
     return next((three for three in COLOR_NAMES if all(name in names for name in three)), ())
 
 
-def brightest_of(path: Path, types: Sequence[str]) -> float:
+def find_full_brightness(path: Path, types: Sequence[str]) -> float:
     """Return the value of full brightness in colours of these types, as "u1"."""
     if len(set(types)) > 1 or types[0] not in BRIGHTEST:
         raise InputError(f"{path}: the colours are of type {' '.join(types)}, wanted {TYPES_WANTED}")
@@ -166,7 +166,9 @@ def column_source(
 ) -> PointSource:
     """Points with three colours of these types, as "u1", or with one scalar: a label, else the intensity."""
     if len(types) == 3:
-        read_chunks: ChunkReader = partial(_read_colored, path, read_columns, brightest_of(path, types))
+        read_chunks: ChunkReader = partial(
+            _read_colored, path, read_columns, find_full_brightness(path, types)
+        )
     elif labels:
         read_chunks = label_reader(path, partial(_with_scalar, read_columns), labels)
     else:
@@ -249,6 +251,6 @@ def label_reader(path: Path, read_scalar: ScalarReader, labels: Labels) -> Chunk
                 raise InputError(f"{path}: {wrong}, wanted whole numbers")
             numbers = values.astype(np.int64)
             is_kept = labels.are_kept(numbers)
-            yield RawCloud(points[is_kept], colors_of(numbers[is_kept]))
+            yield RawCloud(points[is_kept], label_colors(numbers[is_kept]))
 
     return read_chunks

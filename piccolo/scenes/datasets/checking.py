@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from ...cloud import open_cloud
 from ...cloud.octree import build_octree
 from ...cloud.soa import pack_points
-from ...confidence.occlusion import VIEW_WIDTH, agreement_at
+from ...confidence.occlusion import VIEW_WIDTH, measure_agreement
 from ...geometry.pose import Array, Pose
 from ...jobs.threads import Progress, Workers, no_progress
 from ...panorama import read_panorama
@@ -63,7 +63,9 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress
         pose = Pose(query.pose.R_cam_from_world, query.pose.center_world - voxels.origin)
         panorama = shrink(read_panorama(query.image), VIEW_WIDTH)  # once for all variants
         variants = convention_variants(pose, voxels.origin)
-        scores = {words: agreement_at(points, panorama, variant).score for words, variant in variants.items()}
+        scores = {
+            words: measure_agreement(points, panorama, variant).score for words, variant in variants.items()
+        }
         best = max(scores, key=lambda words: scores[words])
         return ConventionCheck(scene.name_of(query), scores[AS_GIVEN], scores[best], best)
 

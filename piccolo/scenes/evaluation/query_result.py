@@ -93,7 +93,7 @@ class QueryResult:
             return cls(*words, row["is_in_box"], position_error, rotation_error, result)
 
 
-def query_result_of(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
+def make_query_result(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
     """Return a query's result with its errors."""
     pose = result.best_pose if query.is_answerable else None
     errors = (np.inf, np.inf) if pose is None else pose_errors(pose, query.pose)
@@ -143,7 +143,7 @@ def match_results(
             text = f"{len(named)} queries of this name" if named else "a result without a true pose"
             tell(f"{result.pano}: found {text}, wanted one of {names} ...")
             continue
-        row = query_result_of(*(found or named[0]), result, None)
+        row = make_query_result(*(found or named[0]), result, None)
         if row.key in done:
             raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")
         done.add(row.key)
@@ -176,7 +176,7 @@ def check_run(
 
 def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:
     """Return True if a result's errors are those of its pose against this query's true pose."""
-    again = query_result_of(scene, query, row.result, row.is_in_box)
+    again = make_query_result(scene, query, row.result, row.is_in_box)
     pairs = (row.position_error, again.position_error), (row.rotation_error, again.rotation_error)
     return all(a == b or abs(a - b) < MAX_DIFFERENCE for a, b in pairs)
 

@@ -58,7 +58,7 @@ def root_mean(squares: Array) -> float:
     return float(np.sqrt(squares.mean())) if len(squares) else np.nan
 
 
-def walks_of(scenes: Iterable[Scene], rows: Iterable[QueryResult]) -> dict[tuple[str, str], list[Frame]]:
+def group_walks(scenes: Iterable[Scene], rows: Iterable[QueryResult]) -> dict[tuple[str, str], list[Frame]]:
     """Return the frames that have a result, by scene and walk, each walk's in the order of time."""
     by_key = {row.key: row for row in rows}
     walks: dict[tuple[str, str], list[Frame]] = {}

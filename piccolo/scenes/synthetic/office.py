@@ -133,7 +133,7 @@ class Office:
     flights: tuple[Flight, ...]
 
 
-def plan_of(size: Array, num_rooms: int, num_storeys: int) -> Plan:
+def plan_building(size: Array, num_rooms: int, num_storeys: int) -> Plan:
     """The plan of a building; InputError if there can be none."""
     size = np.asarray(size, float)
     if not ((size >= MIN_ROOM) & (size <= MAX_SIZE)).all():
@@ -155,7 +155,7 @@ def plan_of(size: Array, num_rooms: int, num_storeys: int) -> Plan:
 
 def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins: float) -> Office:
     """A building of rooms of `size` (3,) [m], of which a fraction `twins` are exact copies of others."""
-    plan = plan_of(size, num_rooms, num_storeys)
+    plan = plan_building(size, num_rooms, num_storeys)
     if not 0.0 <= twins < 1.0:
         raise InputError(f"twins: found {twins}, wanted at least 0 and less than 1")
     rng = np.random.default_rng([seed, 50])

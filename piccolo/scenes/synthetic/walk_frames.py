@@ -13,7 +13,7 @@ from ...jobs.threads import Workers
 from .office import Office
 from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .walking import Walk
-from .world import make_query, make_world, other_light, photograph
+from .world import change_light, make_query, make_world, photograph
 
 BAD_KINDS = ("black", "mirrored", "elsewhere")
 WALK_VARIANTS = ("clean", "photo")
@@ -81,7 +81,7 @@ def frames_of(
             room = join_rooms([office.world.rooms[0], *present])
             rgb = photograph(room, pose, options.width, workers, meanwhile)
         if options.variant == "photo" and kind != "black":
-            rgb = other_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
+            rgb = change_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
         yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from ...camera import Calibration, Mount
-from ...camera.rig import extent_of
+from ...camera.rig import compute_extent
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, exp_so3, yaw_rotation
 from ...geometry.rotations import uniform_rotations
@@ -98,7 +98,7 @@ def photograph(
     return rgb
 
 
-def picture_by(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
+def render_picture(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
     """The picture (H, W, 3) by a camera of a room, its rig at `pose`; black where it shows nothing."""
     camera = mount.camera
     u = (np.arange(SUPERSAMPLING * camera.width) + 0.5) / SUPERSAMPLING
@@ -114,12 +114,14 @@ def picture_by(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArra
 
 def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
     """The one picture in which cameras have their parts, such as a dual fisheye."""
-    width, height = extent_of(mounts)
+    width, height = compute_extent(mounts)
     rgb = np.zeros((height, width, 3), np.uint8)
     for mount in mounts:
         left, top = mount.offset
         camera = mount.camera
-        rgb[top : top + camera.height, left : left + camera.width] = picture_by(mount, room, pose, workers)
+        rgb[top : top + camera.height, left : left + camera.width] = render_picture(
+            mount, room, pose, workers
+        )
     return rgb
 
 
@@ -128,7 +130,7 @@ def blur(image: Array, sigma: float) -> Array:
     return np.asarray(gaussian_filter(image, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest")))
 
 
-def other_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
+def change_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
     """The image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy."""
     gain = rng.uniform(0.7, 1.3) * rng.uniform(0.85, 1.15, 3)
     linear = (rgb / 255.0) ** rng.uniform(0.8, 1.25)
@@ -181,7 +183,7 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
     room, pose, rng = pose_of_query(world, index, variant)
     rgb = photograph(room, pose, width, workers)
-    return Query(other_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
+    return Query(change_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
 
 
 def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, np.random.Generator]:
@@ -215,7 +217,7 @@ def check_cameras(cameras: Calibration) -> None:
     mounts = cameras.mounts
     if cameras.is_choice and len(mounts) > 1:
         raise InputError(f"`camera`: found {len(mounts)} cameras in {path}, wanted one, or those of a rig")
-    if not cameras.has_sizes or max(extent_of(mounts)) > MAX_SIDE:
+    if not cameras.has_sizes or max(compute_extent(mounts)) > MAX_SIDE:
         raise InputError(f"`camera`: found pictures of no size in {path}, or over {MAX_SIDE} px")
     names = [mount.image for mount in mounts if mount.image is not None]
     if any(re.search(r"[*?|\[/]", name) or not name.endswith((".jpg", ".png")) for name in names):
@@ -231,9 +233,9 @@ def make_photos(
     """
     room, pose, rng = pose_of_query(world, index, variant)
     if cameras.is_rig:
-        pictures = [(m.image or "", picture_by(m, room, pose, workers)) for m in cameras.mounts]
+        pictures = [(m.image or "", render_picture(m, room, pose, workers)) for m in cameras.mounts]
     else:
         pictures = [("", picture_of_all(cameras.mounts, room, pose, workers))]
     if variant == "photo":
-        pictures = [(name, other_light(rgb, rng)) for name, rgb in pictures]
+        pictures = [(name, change_light(rgb, rng)) for name, rgb in pictures]
     return pictures, pose
