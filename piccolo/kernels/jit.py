@@ -19,17 +19,19 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, cast
 
 import llvmlite.binding as llvm
 import numba
 import numpy as np
 from numba.core import compiler, serialize
 from numba.core.runtime.nrt import rtsys
+from numpy.typing import NDArray
 
 from ..files.atomic import write_atomically
 from ..files.cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
 
+Function = TypeVar("Function", bound=Callable[..., Any])
 NAME = own_names("kernel")
 DIGEST_SIZE = hashlib.sha256().digest_size
 # of numba.config: they change the code that is made
@@ -44,7 +46,7 @@ log = logging.getLogger("piccolo")
 
 @cache
 def kernel_folder() -> Path | None:
-    """The folder of compiled kernels, made now; None, after a warning, where there can be none.
+    """Make and return the folder of compiled kernels; None, after a warning, where there can be none.
 
     Kernels are pickles, which run code: others must not be able to write there.
     """
@@ -73,7 +75,7 @@ def warn_damaged(folder: Path) -> None:
 
 @cache
 def sources_digest() -> str:
-    """Digest of the sources that hold kernels, as one kernel is compiled into another."""
+    """Return a digest of all sources that hold kernels, as one kernel is compiled into another."""
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).parents[1].rglob("*.py")):
         source = path.read_bytes()
@@ -106,12 +108,12 @@ compiling = Compiling()
 
 
 def compute_digest(name: str, payload: bytes) -> bytes:
-    """What stands before a payload in the file of this name: it tells damage, not malice."""
+    """Return the checksum written before a payload: it detects damage, not malice."""
     return hashlib.sha256(name.encode() + payload).digest()
 
 
 def read_whole(path: Path) -> bytes | None:
-    """The compiled code in a file, as written; None if there is none or (with a warning) if it is damaged."""
+    """Return the compiled code in a file; None if there is none or, with a warning, if it is damaged."""
     try:
         content = path.read_bytes()
     except OSError:
@@ -125,7 +127,7 @@ def read_whole(path: Path) -> bytes | None:
 
 
 def find_captured(function: Any) -> list[Any]:
-    """The functions that a function takes from around it, and those that these take: they are compiled in."""
+    """Return the functions in a function's closure, and those in theirs: they are compiled into it."""
     found = []
     for cell in getattr(function, "py_func", function).__closure__ or ():
         found += [cell.cell_contents, *find_captured(cell.cell_contents)]
@@ -135,7 +137,7 @@ def find_captured(function: Any) -> list[Any]:
 def rebuild(
     target_context: Any, library: tuple[str, str, tuple[bytes, bytes]], description: Any, *others: object
 ) -> Any:
-    """A compiled kernel from its pickled parts.
+    """Make a compiled kernel from its pickled parts.
 
     Numba parses a kernel's bitcode, up to 1 MB, to learn which names its machine code has, and to compile
     others that call it. Here the names that may be asked for stand in; it is parsed only for the latter.
@@ -159,7 +161,7 @@ class KernelCache:
         self.cache_path = None  # Numba's `stats` shows it
 
     def _file(self, signature: object, codegen: Any) -> Path | None:
-        """The file for a signature on this machine's processor."""
+        """Return the file for a signature on this machine's processor."""
         versions = numba.__version__, np.__version__, sys.version_info[:2], sys.byteorder
         how = versions, codegen.magic_tuple(), [getattr(numba.config, flag, None) for flag in FLAGS]
         key = repr((self.name, str(signature), how, sources_digest()))
@@ -191,7 +193,7 @@ class KernelCache:
             warn_not_kept(f"Numba {numba.__version__}: {error!r}")
 
     def flush(self) -> None:
-        """Nothing is held in memory."""
+        """Do nothing: nothing is held in memory."""
 
 
 # Without error_model="numpy" every float division carries a branch that raises ZeroDivisionError, and that
@@ -205,11 +207,16 @@ HALF = np.float32(0.5)
 
 # A function of scalars that kernels call. Always inlined, as are kernels in kernels: a call would go to
 # whichever copy of the callee was loaded first, and a first run had other last bits than the runs after it.
-inline_kernel = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)
+_compile_inline = numba.njit(nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True)
+
+
+def inline_kernel(function: Function) -> Function:
+    """Compile a function of arrays and scalars as part of each kernel that calls it."""
+    return cast(Function, _compile_inline(function))
 
 
 @inline_kernel
-def copy_to(target, source):
+def copy_to(target: NDArray[Any], source: NDArray[Any]) -> None:
     """Write an array into another of its shape, both contiguous.
 
     An assignment of slices compiles the text of the error that it might raise into the kernel, for seconds.
@@ -218,9 +225,9 @@ def copy_to(target, source):
         target.flat[k] = source.flat[k]
 
 
-def kernel(function: Callable[..., Any]) -> Any:  # a Numba dispatcher, which has no type
-    """Compile a function of arrays and scalars on its first call; kept between runs by KernelCache."""
-    dispatcher: Any = inline_kernel(function)
+def kernel(function: Function) -> Function:
+    """Compile a function of arrays and scalars on its first call; KernelCache keeps it between runs."""
+    dispatcher: Any = _compile_inline(function)  # Numba gives it no type
     if hasattr(dispatcher, "enable_caching"):  # not with NUMBA_DISABLE_JIT=1
         dispatcher._cache = KernelCache(function)
-    return dispatcher
+    return cast(Function, dispatcher)

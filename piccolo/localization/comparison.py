@@ -162,20 +162,24 @@ def compare(query: Query, pose: Pose) -> Comparison:
         view = config.arrays
         place = round_position(pose)
         sums = query.cache.views.averages(place, config)
-        *cells, center = empty_cells(len(sums), place)
+        offsets, colors, weights, center = empty_cells(len(sums), place)
         moments = np.empty((view.num_stats, 8), np.float32)
-        average_colors(sums, view, np.ones(len(sums), np.bool_), *cells, moments)
+        average_colors(sums, view, np.ones(len(sums), np.bool_), offsets, colors, weights, moments)
         photo = query.photo.small
         grid = make_grid(BLOCK_RINGS)
         by_block = np.empty((3, NUM_BLOCKS))
         compare_cells(
-            *cells,
+            offsets,
+            colors,
+            weights,
             (photo.rgbx, photo.width),
             pose.R_cam_from_world,
             pose.center_world - center,
             view,
             (grid.num_columns, grid.first),
-            *by_block,
+            by_block[0],
+            by_block[1],
+            by_block[2],
         )
         kept[pose.key] = Comparison(by_block[0], by_block[1], by_block[2], photo.valid_share)
     comparison: Comparison = kept[pose.key]

@@ -272,8 +272,11 @@ def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
 def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
     """Score a pose on cells, each in its block of the sphere."""
     t = pose.center_world - cells.center_map
-    shown = cells.offsets, to_levels(cells.channels), cells.weights
-    return Fit(pose, float(score(*shown, blocks, image.rgbx, image.width, pose.R_cam_from_world, t)))
+    levels = to_levels(cells.channels)
+    R = pose.R_cam_from_world
+    return Fit(
+        pose, float(score(cells.offsets, levels, cells.weights, blocks, image.rgbx, image.width, R, t))
+    )
 
 
 def descend_around(
@@ -289,13 +292,26 @@ def descend_around(
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
     t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)
     scores = np.empty(len(steps))
-    both = [(image.rgbx, image.width) for image in images]
+    levels = to_levels(cells.channels)
+    wide = (images[0].rgbx, images[0].width)
+    narrow = (images[1].rgbx, images[1].width)
     scale = COARSE_LOSS * LEVELS_PER_UNIT
-    problem = cells.offsets, to_levels(cells.channels), cells.weights, blocks, *both, scale
 
     def run(lo: int) -> None:
         part = slice(lo, lo + PERTURBED_BATCH)
-        descend_perturbed(*problem, steps[part], R[part], t[part], scores[part])
+        descend_perturbed(
+            cells.offsets,
+            levels,
+            cells.weights,
+            blocks,
+            wide,
+            narrow,
+            scale,
+            steps[part],
+            R[part],
+            t[part],
+            scores[part],
+        )
 
     workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
     best = int(np.argmax(scores))
