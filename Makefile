@@ -33,8 +33,8 @@ test: $(VENV)/ready
 KERNELS := channel_loss cloud_morton cloud_octree cloud_voxels p3p pose sampling_loss sphere zbuffer
 
 test-kernels: $(VENV)/ready
-	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
-	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest $(KERNELS:%=tests/test_%.py)
+	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)
+	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)
 
 test-browser: $(VENV)/browser page/node_modules/ready
 	$(BIN)/python -m pytest browser_tests

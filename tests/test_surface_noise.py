@@ -1,0 +1,54 @@
+import numpy as np
+import pytest
+
+from piccolo.cloud import Cloud
+from piccolo.cloud.octree import build_octree
+from piccolo.cloud.surface_noise import NOISE_SHARE, surface_variance
+
+SIZE = np.array([5.0, 4.0, 2.6])  # [m] of a room turned by 20 degrees, so that no wall is along an axis
+TURN = np.array([[0.9397, -0.342, 0.0], [0.342, 0.9397, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _room(count, seed=0):
+    rng = np.random.default_rng(seed)
+    points = rng.random((count, 3)) * SIZE
+    axis = rng.integers(0, 3, count)
+    points[np.arange(count), axis] = rng.integers(0, 2, count) * SIZE[axis]
+    return points @ TURN.T
+
+
+def _deviations(points):
+    """Square roots of the variance's eigenvalues (3,) [m], and axes (3, 3), greatest last."""
+    grey = np.full((len(points), 3), 128, np.uint8)
+    voxels = Cloud(points.astype(np.float32), grey, np.zeros(3)).voxels(np.eye(3))
+    values, axes = np.linalg.eigh(surface_variance(build_octree(voxels)))
+    return np.sqrt(np.maximum(values, 0.0)), axes
+
+
+def test_clean_surfaces_have_hardly_any():
+    deviations, _ = _deviations(_room(400_000))
+    assert deviations.max() < 0.002
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.02, 0.04])
+def test_a_part_of_the_noise_alike_in_all_directions(noise):
+    points = _room(800_000)
+    points += np.random.default_rng(1).normal(0.0, noise, points.shape)
+    deviations, _ = _deviations(points)
+    assert deviations.min() > 0.6 * NOISE_SHARE * noise
+    assert deviations.max() < 1.4 * NOISE_SHARE * noise
+
+
+@pytest.mark.parametrize("gap", [0.03, 0.05])
+def test_a_doubled_scan_has_half_the_gap_along_the_shift_alone(gap):
+    """Also where the shift is along a wall, which then does not show it."""
+    points, along = _room(800_000), TURN[:, 0]
+    points[::2] += gap * along
+    deviations, axes = _deviations(points)
+    assert abs(axes[:, 2] @ along) > 0.94
+    assert 0.5 * gap / 2 < deviations[2] < 1.15 * gap / 2
+    assert deviations[1] < 0.25 * deviations[2]
+
+
+def test_too_few_points_tell_nothing():
+    assert _deviations(_room(300))[0].max() == 0.0
