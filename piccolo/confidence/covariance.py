@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array
 
-CORRIDOR_RATIO = 2.5  # what is seen reaches so many times as far one way as across
-SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
+CORRIDOR_RATIO = 2.5  # least ratio of the reach of what is seen along a corridor and across it
+SAME_STD_RATIO = 1.5  # deviations whose ratio is smaller have no least constrained direction
 BAND = math.sin(math.radians(30.0))  # walls: what is seen up to 30 degrees above and below the horizon
 
 
@@ -44,8 +44,8 @@ class PoseCovariance:
 def least_constrained_direction(covariance_up: Array, covariance: Array, offsets: NDArray[np.float32]) -> str:
     """Return the direction of the largest translational deviation, in words.
 
-    Both are covariances (3, 3) of the position: in a frame whose z is up, with the offsets (3, N) [m] from
-    the camera to what it sees, and in the world, where headings are clockwise from +y.
+    Both are covariances (3, 3) of the position: `covariance_up` in a frame whose z is up, like the offsets
+    (3, N) [m] from the camera to what it sees; `covariance` in the world. Headings are clockwise from +y.
     """
     variances, axes = np.linalg.eigh(covariance_up)
     if variances[2] < SAME_STD_RATIO**2 * max(variances[0], 0.0):
