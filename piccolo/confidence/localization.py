@@ -13,8 +13,8 @@ class Evidence:
     """The measurements that a confidence rests on."""
 
     score: float  # [0, 1] what the photo's blocks explain beyond chance; of preset paper, Agreement.score
-    # lead over the best pose elsewhere in what both views show, divided by what this pose explains there; 1 if
-    # there is no pose elsewhere; of preset paper, score less that of the best pose elsewhere
+    # lead over the best pose elsewhere in what both views show, divided by what this pose explains there; 1
+    # if there is no pose elsewhere; of preset paper, score less that of the best pose elsewhere
     margin: float
     agreement: float  # correlation over what both show, charged where that is under half of the sphere
     explained_fraction: float  # of what the panorama shows, by solid angle, see Occlusion
