@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..geometry.pose import Array
 
-CORRIDOR_RATIO = 2.5  # least ratio of the reach of what is seen along a corridor and across it
-SAME_STD_RATIO = 1.5  # deviations whose ratio is smaller have no least constrained direction
+CORRIDOR_RATIO = 2.5  # what is seen reaches so many times as far one way as across
+SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
 BAND = math.sin(math.radians(30.0))  # walls: what is seen up to 30 degrees above and below the horizon
 
 
