@@ -90,18 +90,18 @@ class Compiling:
     """The kernels that this process has compiled, reported as the log's INFO."""
 
     count: int = 0
-    told: float = 0.0  # [s] when the first kernel was asked for and not found, or a line was last logged
+    quiet_since: float = 0.0  # [s] when the first kernel was not found, or a line was last logged
 
     def start(self) -> None:
         """Note the time at which the first kernel was asked for and not found."""
-        self.told = self.told or time.monotonic()
+        self.quiet_since = self.quiet_since or time.monotonic()
 
     def finish(self) -> None:
         """Count a kernel; from time to time log how many there are."""
         self.count += 1
         now = time.monotonic()
-        if now - self.told >= QUIET_S:
-            self.told = now
+        if now - self.quiet_since >= QUIET_S:
+            self.quiet_since = now
             log.info("compiling kernels, once: %d so far, half a minute in all", self.count)
 
 
