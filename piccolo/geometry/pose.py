@@ -106,7 +106,7 @@ def orthonormal(R: Array) -> Array:
 
 
 def check_rotation(R: Array, tolerance: float, label: str) -> Array:
-    """Return `R`; InputError, naming it `label`, if R R^T is not the identity (3, 3) or if R mirrors."""
+    """Return `R` (3, 3); InputError, naming it `label`, if R R^T is not the identity or if R mirrors."""
     # the bound on the entries keeps the product finite; NaN is not below it either
     is_tame = R.shape == (3, 3) and np.abs(R).max() < 2.0
     if not (is_tame and np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0.0):

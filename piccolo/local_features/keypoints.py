@@ -38,7 +38,7 @@ class Keypoints(NamedTuple):
         return Keypoints(*taken)
 
     def mirror(self) -> "Keypoints":
-        """Mirror the picture, left for right: return its rays, tangents and descriptors then."""
+        """Return the keypoints of the picture mirrored left for right: rays, tangents and descriptors."""
         left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
         histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
         return Keypoints(
