@@ -1,4 +1,4 @@
-"""Point clouds: one reader a format, then the same checks and the same order for all."""
+"""Point clouds: a reader for each format, then checks and an order common to all."""
 
 from .open import FORMATS, open_cloud, open_source, read_cloud
 from .stream import Cloud, CloudStream, stream_points

@@ -1,4 +1,4 @@
-"""The coordinate system that a scan's file names, and where a GPS position lies in it."""
+"""The coordinate system named in a scan's file, and GPS positions in it."""
 
 import math
 import struct
@@ -17,7 +17,7 @@ GEO_KEYS_ID = 34735
 PROJECTED_KEY = 3072  # GeoTIFF keys whose value is a code of EPSG
 GEOGRAPHIC_KEY = 2048
 USER_DEFINED = 32767
-MAX_LENGTH = 20_000  # characters of a system's description; what is longer is left aside
+MAX_LENGTH = 20_000  # characters of a system's description; a longer one is ignored
 
 
 def read_crs(paths: Sequence[Path]) -> str:
@@ -49,7 +49,7 @@ def _of_las(path: Path) -> str:
 
 
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
-    """X and y of a place in a projected system, in its own unit; None where it does not hold there."""
+    """Return x and y of a place in a projected system, in its unit; None if there are none."""
     system = check_crs(crs)
     pyproj = import_optional("GPS in photos", "pyproj", "tools")
     if not system.is_projected:

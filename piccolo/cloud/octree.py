@@ -1,4 +1,4 @@
-"""The octree of a cloud: a pyramid of its voxels, in Morton order, and what of it a view needs."""
+"""The octree of a cloud: a pyramid of its voxels, in Morton order, and the nodes that a view needs."""
 
 import math
 from typing import NamedTuple
@@ -6,19 +6,20 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.vectors import Triple
 from ..jobs.memory import check_memory
-from ..kernels.jit import F0, inline_kernel, kernel
+from ..kernels.jit import F0, Scalar, inline_kernel, kernel
 from .voxels import AT_ONCE, LEAF_SIZE, NUM_LEVELS, THIN, Voxels
 
 NODE_BYTES = 6 * 4 + 4  # mean, first child
 LEVEL_BYTES = 8 + 1 + 8 + 4 + 8  # codes, which begin a parent, first children, twice, codes of these
 MAX_NODES = 1 << 22  # that a view collects; reserved, but used only as far as a dense cloud fills it
-RANGES_BELOW = 1 / 20  # voxels by their distance: larger ones are drawn at one level in few places
+RANGES_BELOW = 1 / 20  # a voxel's width divided by its distance: larger ones are rarely drawn at one level
 DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so near to its mean
 
 
 class Octree(NamedTuple):
-    """Nodes of all levels, coarsest first, in Morton order within a level; kernels read it as it is."""
+    """Nodes of all levels, coarsest first, in Morton order within a level; kernels take it as an argument."""
 
     nodes: NDArray[np.float32]  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
     first_child: NDArray[np.int32]  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
@@ -69,10 +70,10 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
 
 
 @inline_kernel
-def uniform_level(least_distance, level, low, high):
-    """The level at which all below a node, its children of `level`, is drawn if it is from low to high away.
+def uniform_level(least_distance: NDArray[np.float32], level: int, low: Scalar, high: Scalar) -> int:
+    """Return the one level at which all below a node is drawn; 0 if there is none.
 
-    0 if there is none.
+    All of it is at distances from `low` to `high`; `level` is that of the node's children.
     """
     k = level + 1
     while least_distance[k] > low and least_distance[k] > F0:
@@ -81,8 +82,16 @@ def uniform_level(least_distance, level, low, high):
 
 
 @inline_kernel
-def take_all(nodes, first, last, center, found, directions, count):
-    """Write nodes that follow one another, and their positions relative to the centre, from `count` on."""
+def take_all(
+    nodes: NDArray[np.float32],
+    first: int | np.int64,
+    last: int | np.int64,
+    center: Triple,
+    found: NDArray[np.int32],
+    directions: NDArray[np.float32],
+    count: int,
+) -> None:
+    """Write the nodes from first to last, and their positions relative to the centre, from `count` on."""
     x, y, z = directions[0], directions[1], directions[2]
     for i in range(last - first):
         node = np.uintp(first + i)
@@ -94,8 +103,22 @@ def take_all(nodes, first, last, center, found, directions, count):
 
 
 @inline_kernel
-def take_far(nodes, first, last, center, least, found, directions, count, stack, top):
-    """The same with those at least so far, squared [m^2]; the others go on the stack. Returns both counts."""
+def take_far(
+    nodes: NDArray[np.float32],
+    first: int | np.int64,
+    last: int | np.int64,
+    center: Triple,
+    least: Scalar,
+    found: NDArray[np.int32],
+    directions: NDArray[np.float32],
+    count: int,
+    stack: NDArray[np.int32],
+    top: int,
+) -> tuple[int, int]:
+    """Write the nodes at a squared distance of at least `least` [m^2], like `take_all`; return both counts.
+
+    The other nodes go on the stack, from `top` on.
+    """
     x, y, z = directions[0], directions[1], directions[2]
     for node in range(first, last):
         i = np.uintp(node)
@@ -114,11 +137,18 @@ def take_far(nodes, first, last, center, least, found, directions, count, stack,
 
 
 @kernel
-def collect(tree, center, voxel_per_range, found, directions):
-    """Write the nodes that, seen from `center`, are as small as asked, or leaves; returns how many.
+def collect(
+    tree: Octree,
+    center: NDArray[np.float64],
+    voxel_per_range: float,
+    found: NDArray[np.int32],
+    directions: NDArray[np.float32],
+) -> int:
+    """Write the nodes that, seen from `center`, are small enough, or leaves; return their number.
 
-    `directions` (3, N) get the positions relative to the centre [m]. Where all below a node is drawn at one
-    level, its nodes there follow one another: most of them are found so, without a question to each.
+    Small enough are voxels of at most `voxel_per_range` times their distance. `directions` (3, N) get the
+    positions relative to the centre [m]. If all below a node is drawn at one level, its nodes there are
+    consecutive: most nodes are found in this way, without a test of each.
     """
     nodes = tree.nodes
     first_child = tree.first_child
@@ -158,7 +188,7 @@ def collect(tree, center, voxel_per_range, found, directions):
         last = min(last, first + len(found) - count)
         if is_uniform:
             take_all(nodes, first, last, at, found, directions, count)
-            count += last - first
+            count += int(last - first)
         else:
             least = least_distance[level] * least_distance[level]
             begin = top
@@ -168,8 +198,8 @@ def collect(tree, center, voxel_per_range, found, directions):
 
 
 @inline_kernel
-def find_level(tree, node):
-    """The level of a node, 0 for the coarsest voxels."""
+def find_level(tree: Octree, node: int) -> int:
+    """Return the level of a node, 0 for the coarsest voxels."""
     level = 0
     while node >= tree.level_start[level + 1]:
         level += 1

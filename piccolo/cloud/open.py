@@ -1,4 +1,4 @@
-"""Files of point clouds opened: the format is chosen by a file's first bytes, then by its name."""
+"""Opening files of point clouds: the format follows from a file's first bytes, or else from its name."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -26,8 +26,8 @@ def open_cloud(
 ) -> CloudStream:
     """Return the coloured cloud in one or several files, before its points are read.
 
-    Raises InputError if a file is missing, has a damaged header, no colours, or is no format that is read
-    here. Reading the points raises it where the data break or fail the checks of `PointValidator`.
+    Raises InputError if a file is missing, has a damaged header, no colours, or an unknown format. Reading
+    the points raises it where the data are damaged or fail the checks of `PointValidator`.
     """
     sources = [open_source(path, settings) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
@@ -38,13 +38,13 @@ def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
 
     The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
     metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
-    coordinates and a room at the origin take the same path. InputError as by open_cloud.
+    coordinates and a room at the origin take the same path. Raises InputError like `open_cloud`.
     """
     return open_cloud([path], settings).read()
 
 
 def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
-    """Return the points of a file in any format that is read here."""
+    """Return the points of a file in any supported format."""
     try:
         format_ = _format_of(path)
         if settings.labels and not format_.has_labels:
@@ -56,7 +56,7 @@ def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _format_of(path: Path) -> CloudFormat:
-    """Return the format of a file: by its first bytes, then by its name's end."""
+    """Return the format of a file: by its first bytes, or else by its suffix."""
     if not path.exists():
         raise InputError(f"{path}: no such file, {WANTED}")
     if not path.is_file():

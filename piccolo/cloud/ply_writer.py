@@ -1,4 +1,4 @@
-"""Writing PLY: binary vertices, a chunk at a time; and clouds written again under a rigid transform."""
+"""Writing PLY: binary vertices, a chunk at a time; and copies of clouds under a rigid transform."""
 
 import math
 import shutil
@@ -33,7 +33,7 @@ MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 def vertex_rows(
     points: NDArray[np.floating[Any]], colors: NDArray[np.uint8], labels: NDArray[np.int32] | None = None
 ) -> Rows:
-    """Vertices of points (N, 3), float32 or float64 as they are, colours (N, 3) RGB and labels (N,)."""
+    """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB and labels (N,)."""
     columns = dict(zip(("x", "y", "z", *COLOR_NAMES), [*points.T, *colors.T], strict=True))
     if labels is not None:
         columns["label"] = labels
@@ -60,14 +60,14 @@ def header(
 
 @dataclass
 class PlyWriter:
-    """Writes vertices as they come."""
+    """A writer of vertices, chunk by chunk."""
 
     file: IO[bytes]  # after the vertices the caller may write more elements, in little-endian order
     dtype: np.dtype[Any]  # little-endian
     num_vertices: int = 0
 
     def add(self, rows: Rows) -> None:
-        """Write vertices of the dtype that the file was begun with."""
+        """Write vertices of the writer's dtype."""
         self.file.write(np.ascontiguousarray(rows.astype(self.dtype, copy=False)).data)
         self.num_vertices += len(rows)
 
@@ -76,7 +76,7 @@ class PlyWriter:
 def writing_ply(
     path: Path, dtype: np.dtype[Any], comments: Sequence[str] = (), more: Sequence[str] = ()
 ) -> Iterator[PlyWriter]:
-    """Yield a writer of `path`, which is there when all is written and counted, and not after an error."""
+    """Yield a writer of `path`, which is replaced when all is written and counted, and not after an error."""
     with replacing(path) as file:
         writer = PlyWriter(file, dtype.newbyteorder("<"))
         file.write(header(writer.dtype, 0, comments, more))
@@ -86,13 +86,13 @@ def writing_ply(
 
 
 def write_ply(path: Path, rows: Rows) -> None:
-    """Write vertices, whole or not at all."""
+    """Write vertices to a file, whole or not at all."""
     with writing_ply(path, rows.dtype) as writer:
         writer.add(rows)
 
 
 def needs_double(box: Array, T_target_from_source: Array, scale: float) -> bool:
-    """Return True if float32 would lose over MAX_LOSS of a moved box (2, 3) [m].
+    """Return True if rounding to float32 would move a transformed box (2, 3) [m] by over MAX_LOSS.
 
     T is in units of `scale` metres.
     """
@@ -106,9 +106,9 @@ def write_transformed(
 ) -> tuple[str, ...]:
     """Write a cloud, read once before, as binary PLY under a transform (4, 4) in the files' unit.
 
-    One PLY file keeps its other properties and elements, its normals are turned and points with NaN stay; any
+    One PLY file keeps its other properties and elements and its points with NaN, its normals are rotated; any
     other cloud is written with x y z and red green blue. `finish` runs when all is written, just before `out`
-    appears. Returns a line for each element that was left out.
+    appears. Return a line for each element that was left out.
     """
     path = cloud.sources[0].path
     with path.open("rb") as file:
@@ -128,7 +128,7 @@ def write_transformed(
 def _write_copy(
     cloud: CloudStream, header: PlyHeader, T_target_from_source: Array, out: Path, finish: Callable[[], None]
 ) -> tuple[str, ...]:
-    """Write one PLY file with all that it holds, but for the elements in the lines returned.
+    """Copy one PLY file with all that it holds; return a line for each element that was left out.
 
     Elements after the vertices are copied as bytes, so those of ASCII and big-endian files are left out, as
     are elements before the vertices.
@@ -173,7 +173,7 @@ def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
 
 
 def _transform_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
-    """Vertices with x y z moved and nx ny nz turned, all else as it is."""
+    """Return the vertices with x y z transformed, nx ny nz rotated, and all else unchanged."""
     target = rows.astype(dtype)
     turn = T_target_from_source.copy()
     turn[:3, 3] = 0.0

@@ -1,4 +1,4 @@
-"""How the files of a cloud are to be understood."""
+"""Settings for reading the files of a cloud."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 
 @dataclass(frozen=True)
 class CloudSettings:
-    """How the files of a cloud are to be understood."""
+    """Unit, axes, colours and coordinate system of a cloud's files."""
 
     scale: float = 1.0  # metres per unit of the files
     up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
@@ -39,7 +39,7 @@ class CloudSettings:
 
 
 def check_crs(crs: str) -> Any:
-    """Return the system of x and y that a text names, as pyproj has it; InputError if there is none."""
+    """Return pyproj's system of x and y that a text names; InputError if there is none."""
     pyproj = import_optional("GPS in photos", "pyproj", "tools")
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()
@@ -52,7 +52,7 @@ IN_METRES = CloudSettings()
 
 
 def R_z_from_axis(up: UpAxis, of_file: UpAxis) -> Array:
-    """Return the rotation (3, 3) that turns a named axis to z; for auto that of the file."""
+    """Return the rotation (3, 3) that turns the axis `up` to z; for auto the axis `of_file`."""
     name = of_file if up == "auto" else up
     sign = -1.0 if name.startswith("-") else 1.0
     return np.round(rotation_to_z(sign * np.eye(3)["xyz".index(name[-1])])) + 0.0

@@ -1,4 +1,4 @@
-"""The points as kernels read them: structure of arrays, colours packed."""
+"""Points as kernels read them: structure of arrays, colours packed."""
 
 from dataclasses import dataclass
 
@@ -22,7 +22,7 @@ class PackedPoints:
     rgbx: NDArray[np.int32]  # (N,) as pack_rgbx
 
     def __len__(self) -> int:
-        """How many points there are."""
+        """Return the number of points."""
         return len(self.x)
 
     def take(self, indices: NDArray[np.integer] | slice) -> "PackedPoints":
@@ -30,7 +30,7 @@ class PackedPoints:
         return PackedPoints(self.x[indices], self.y[indices], self.z[indices], self.rgbx[indices])
 
     def subsample(self, count: int) -> "PackedPoints":
-        """At most `count` points, evenly in space as far as they are in Morton order."""
+        """Return at most `count` points, evenly spread in space if they are in Morton order."""
         if len(self) <= count:
             return self
         return self.take(np.linspace(0, len(self) - 1, count).astype(np.int64))
@@ -38,7 +38,7 @@ class PackedPoints:
 
 @dataclass(frozen=True)
 class LocalCloud:
-    """A cloud's points near a local origin, and where that is: x_local = R (x_world - origin_world)."""
+    """A cloud's points near a local origin: x_local = R_local_from_world (x_world - origin_world)."""
 
     points: PackedPoints
     R_local_from_world: Array  # (3, 3) turns the axis that points up, or the map's up, to z
@@ -46,7 +46,7 @@ class LocalCloud:
     warnings: tuple[str, ...]
 
     def from_world(self, pose: Pose) -> Pose:
-        """Return a pose of the world in the frame of `points`; one too far for float32 is an InputError."""
+        """Return a world pose in the frame of `points`; InputError if it is too far away for float32."""
         center_world = pose.center_world
         if not np.abs(center_world - self.origin_world).max() < FARTHEST:
             found = f"found a camera at {center_world.tolist()}"
@@ -55,12 +55,12 @@ class LocalCloud:
         return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
 
     def to_world(self, pose: Pose) -> Pose:
-        """Return a pose of the frame of `points` in the world."""
+        """Return a pose in the frame of `points` as one in the world."""
         R = self.R_local_from_world
         return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
 
 
 def pack_points(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> PackedPoints:
-    """Points (N, 3) [m] with colours (N, 3) as PackedPoints."""
+    """Pack points (N, 3) [m] with colours (N, 3)."""
     x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
     return PackedPoints(x, y, z, pack_rgbx(colors))

@@ -1,4 +1,4 @@
-"""Clouds in files, checked chunk by chunk, read as often as they are needed: into voxels, or into memory."""
+"""Clouds in files, read as often as needed and checked chunk by chunk: into voxels, or into memory."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -26,12 +26,12 @@ FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
 MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
 Chunk = tuple[NDArray[np.float64], NDArray[np.uint8]]  # finite points (N, 3) [m], colours (N, 3)
-ARRAYS = Path("arrays")  # how messages and results name a scan that is no file
+ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
 
 
 @dataclass
 class PointValidator:
-    """What is known of a file's points so far."""
+    """Checks of a file's points, and their counts so far."""
 
     path: Path
     scale: float  # metres per unit of the file
@@ -40,7 +40,7 @@ class PointValidator:
     brightest: int = 0
 
     def filter(self, raw: RawCloud) -> Chunk:
-        """Return the finite points of a chunk, after they have been counted."""
+        """Count the points of a chunk; return the finite ones in metres."""
         points = raw.points_world
         colors = raw.colors
         is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
@@ -60,7 +60,7 @@ class PointValidator:
         return points, colors
 
     def check(self) -> None:
-        """Refuse points that are no coloured cloud, when all have passed."""
+        """Refuse a file without enough points or colours, after its last chunk."""
         if self.num_finite < MIN_POINTS:
             found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
             raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
@@ -69,16 +69,16 @@ class PointValidator:
             raise InputError(f"{self.path}: {found}; numbers without a declared range are 0-255, not 0-1")
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a line if points were left out."""
+        """Return a warning if points were left out."""
         if self.num_dropped:
             return (f"{self.path}: {self.num_dropped} points with NaN or infinite coordinates left out",)
         return ()
 
 
 def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
-    """Return line if points (N, 3), in Morton order, look like millimetres or are too far apart for float32.
+    """Return a warning if points (N, 3) look like millimetres, or are too far apart for float32.
 
-    Millimetres: 98 % of the points span more than 2,000 along at least two axes.
+    It looks like millimetres if 98 % of the points span more than 2,000 along at least two axes.
     """
     samples = points[:: 1 + len(points) // MAX_SAMPLES]
     low, high = np.percentile(samples, [1.0, 99.0], axis=0)
@@ -101,7 +101,7 @@ class Cloud:
     origin_world: NDArray[np.float64]  # (3,) what was subtracted from the file's coordinates [m]
     num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
-    up: UpAxis = "z"  # the axis that points up by the files
+    up: UpAxis = "z"  # the axis that points up according to the files
 
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
         """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
@@ -112,7 +112,7 @@ class Cloud:
 
 
 def stream_points(path: Path, raw: RawCloud) -> "CloudStream":
-    """Points in memory as if they stood in a file named `path`."""
+    """Return points in memory as the stream of a file named `path`."""
     return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
 
 
@@ -122,34 +122,34 @@ def _no_box() -> Array:
 
 @dataclass(frozen=True)
 class CloudStream:
-    """One cloud in one or several files. Each reading starts again, and ends with the same checks."""
+    """One cloud in one or several files. Each reading begins at the start and ends with all checks."""
 
     sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
-    show: Progress = no_progress  # progress
+    show: Progress = no_progress
     sha256: str = ""  # of what is read, if that is known
     box: Array = field(default_factory=_no_box)  # (2, 3) least and greatest of all points read so far [m]
 
     @property
     def label(self) -> str:
-        """What messages about all files together call them."""
+        """The name of all files together in messages."""
         first = self.sources[0].path
         num_more = len(self.sources) - 1
         return f"{first} and {num_more} more" if num_more else str(first)
 
     @property
     def station_axes(self) -> Array:
-        """The z axes (S, 3) of the scanners whose poses the files tell, unit, in the files' axes."""
+        """The unit z axes (S, 3), in the files' axes, of the scanners whose poses the files contain."""
         return np.array([axis for source in self.sources for axis in source.station_axes]).reshape(-1, 3)
 
     @property
     def up(self) -> UpAxis:
-        """The axis that points up by the files; z where they disagree."""
+        """The axis that points up according to the files; z if they disagree."""
         axes = {source.up for source in self.sources}
         return axes.pop() if len(axes) == 1 else "z"
 
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
-        """Yield the finite points in metres; `validators` gets what is then known of each file."""
+        """Yield the finite points in metres; append each file's validator once it is read."""
         for source in self.sources:
             validator = PointValidator(source.path, self.scale)
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
@@ -182,7 +182,7 @@ class CloudStream:
         return voxels._replace(warnings=(*self._warnings(validators), *of_all))
 
     def read(self) -> Cloud:
-        """All points, in Morton order."""
+        """Return all points, in Morton order."""
         validators: list[PointValidator] = []
         chunks = list(self.chunks(validators))
         points_world = np.concatenate([points_world for points_world, _ in chunks])

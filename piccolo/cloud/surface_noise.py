@@ -1,6 +1,6 @@
-"""How far the points of a scan lie from its surfaces: range noise, and surfaces scanned twice.
+"""Distances of a scan's points from its surfaces: range noise, and surfaces scanned twice.
 
-Noise is alike for all points and averages out over those that a photo shows, but for a part of it; where
+Noise is similar at all points and averages out over those that a photo shows, but for a part of it; where
 scans are shifted against each other, each surface is there twice, and a pose may follow one or the other.
 """
 
@@ -14,18 +14,18 @@ CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the sc
 MIN_LEAVES = 20
 MIN_CELLS = 200
 MAX_CELLS = 20_000
-NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, by trials with noise of 1 to 5 cm
+NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, from trials with noise of 1 to 5 cm
 ONE_SHEET = 2.5  # kurtosis of noise within a cell, about; of two thin sheets it is 1
 ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
 NUM_ITERATIONS = 20
 LEAST_RESIDUAL = 1e-5  # [m^2] of cells that fit, all alike
-RIDGE = 3e-3  # on the squared norm of the tensor: between two walls that are square nothing tells
+RIDGE = 3e-3  # on the squared norm of the tensor: two walls at a right angle leave a part undetermined
 
 
 def surface_variance(octree: Octree) -> Array:
-    """Covariance (3, 3) [m^2] that a scan's own errors give to the position of what is aligned with it.
+    """Return the covariance (3, 3) [m^2] of a position aligned with a scan, from the scan's own errors.
 
-    Of a scan with too few points to tell it is zero. Each cell tells of one direction, its normal: the tensor
+    It is zero for a scan with too few points. Each cell measures one direction, its normal: the tensor
     is the one that fits most cells (least absolute deviations).
     """
     for levels_up in CELLS:
@@ -38,8 +38,8 @@ def surface_variance(octree: Octree) -> Array:
 def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
     """Return normals (C, 3) of the planes through the leaves of cells, and variances (C,) across them [m^2].
 
-    The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; of two sheets at +-b
-    and noise of variance s^2, E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. What counts is b^2 and a part of s^2.
+    The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; those of two sheets at
+    +-b with noise of variance s^2 have E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. The result is b^2 and a part of s^2.
     """
     leaves, first, counts = leaves_by_cell(octree, levels_up)
     cell = np.repeat(np.arange(len(counts)), counts)
@@ -57,7 +57,7 @@ def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
 
 
 def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Leaves (N, 3) [m] of the fuller cells of a level, where each cell's begin, and how many they are."""
+    """Return the leaves (N, 3) [m] of a level's fuller cells, and each cell's first one and their number."""
     level = len(octree.level_start) - 2 - levels_up
     edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
     for _ in range(levels_up):
@@ -73,7 +73,7 @@ def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, NDArray[np.in
 
 
 def fit_tensor(normals: Array, variances: Array) -> Array:
-    """Return positive tensor T (3, 3) with n T n nearest to each variance (C,) along its normal n (C, 3)."""
+    """Fit a positive tensor T (3, 3), so that n T n is near the variance (C,) along each normal n (C, 3)."""
     rows, columns = np.triu_indices(3)
     twice = np.where(rows == columns, 1.0, 2.0)
     design = normals[:, rows] * normals[:, columns] * twice

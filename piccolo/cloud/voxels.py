@@ -1,7 +1,7 @@
 """Voxels in Morton order, on a grid that is fixed in the map's axes, averaged as the points stream by.
 
 The memory grows with the scene, not with the points. All sums are integers: neither the order of the points
-nor how they are cut into chunks changes a bit, unless more than MAX_COUNT lie in one voxel.
+nor their chunks change a bit, unless more than MAX_COUNT points are in one voxel.
 """
 
 from typing import NamedTuple
@@ -42,15 +42,15 @@ NUM_COLUMNS = 10
 FIRST_ROWS = 1 << 15
 MORE_ROWS = 8  # an eighth more at a time
 MAX_VOXELS = 80_000_000  # 20,000 m^2 or more
-MAX_LOAD = 0.6  # share of the index in use
+MAX_LOAD = 0.6  # fraction of the index in use
 ROW_BYTES = 4 * NUM_COLUMNS
 SLOT_BYTES = 4
 SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
 
 
 @inline_kernel
-def spread_bits(cell):
-    """The lowest 21 bits of an int64, each followed by two zeros."""
+def spread_bits(cell: np.int64) -> np.int64:
+    """Return the lowest 21 bits of an int64, each followed by two zeros."""
     bits = cell & 0x1FFFFF
     bits = (bits | (bits << 32)) & 0x1F00000000FFFF
     bits = (bits | (bits << 16)) & 0x1F0000FF0000FF
@@ -60,7 +60,7 @@ def spread_bits(cell):
 
 
 @kernel
-def interleave(cells, codes):
+def interleave(cells: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
     """Write the 63-bit Morton code (N,) of each cell (N, 3), int64 in [0, 2^21); x has the lowest bit."""
     for i in range(len(cells)):
         x, y, z = spread_bits(cells[i, 0]), spread_bits(cells[i, 1]), spread_bits(cells[i, 2])
@@ -68,7 +68,7 @@ def interleave(cells, codes):
 
 
 def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Morton code (N,) of each cell (N, 3) in [0, 2^21)."""
+    """Return the Morton code (N,) of each cell (N, 3) in [0, 2^21)."""
     codes = np.empty(len(cells), dtype=np.int64)
     interleave(cells, codes)
     return codes
@@ -78,7 +78,7 @@ def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDAr
     """Return indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
 
     The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell coordinates and then
-    colours decide, so only points that are alike in every bit are left in the order of the input.
+    colours decide, so only points that are equal in every bit keep the order of the input.
     """
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max())
@@ -101,7 +101,7 @@ def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDAr
 
 
 class Voxels(NamedTuple):
-    """The voxels in which there are points, in Morton order."""
+    """The voxels that contain points, in Morton order."""
 
     codes: NDArray[np.int64]  # (M,) Morton codes; the three lowest bits choose among a parent's children
     nodes: NDArray[np.float32]  # (M, 6) mean x, y, z [m] less `origin`, mean r, g, b in [0, 1]
@@ -112,11 +112,9 @@ class Voxels(NamedTuple):
 def join_voxels(
     first: NDArray[np.float32], second: NDArray[np.float32], origin: NDArray[np.float64]
 ) -> Voxels:
-    """Return the voxels of two clouds' nodes (N, 6) about one origin (3,), as of Voxels.
+    """Join the nodes (N, 6) of two clouds, relative to one origin (3,), to the voxels of both.
 
-    Both may have some voxels.
-
-    Those that one of them has stay as they are, bit by bit; the others have the means of both means.
+    A voxel that one cloud has keeps its bits; one that both have gets the mean of the two means.
     """
     num = len(first) + len(second)
     check_memory(num * JOINING_BYTES, f"the scan: sorting {num} voxels of 2 cm", THIN)
@@ -131,16 +129,18 @@ def join_voxels(
 
 
 @inline_kernel
-def first_slot(x, y, z, num_slots):
-    """The slot of an index (2^k,) from which a cell is looked for."""
+def first_slot(x: np.int64, y: np.int64, z: np.int64, num_slots: int) -> np.int64:
+    """Return the slot of an index (2^k,) at which the search for a cell begins."""
     # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
     return (mixed ^ (mixed >> 17)) & (num_slots - 1)
 
 
 @inline_kernel
-def find_slot(index, rows, x, y, z):
-    """The slot that names a cell's row, or the free one where it belongs."""
+def find_slot(
+    index: NDArray[np.int32], rows: NDArray[np.int32], x: np.int64, y: np.int64, z: np.int64
+) -> np.int64:
+    """Return the slot that holds a cell's row, or else the free slot where it belongs."""
     slot = first_slot(x, y, z, len(index))
     while index[slot] != 0:
         row = rows[index[slot] - 1]
@@ -151,12 +151,19 @@ def find_slot(index, rows, x, y, z):
 
 
 @kernel
-def add_points(points, colors, base, index, rows, num_voxels):
+def add_points(
+    points: NDArray[np.float64],
+    colors: NDArray[np.uint8],
+    base: NDArray[np.int64],
+    index: NDArray[np.int32],
+    rows: NDArray[np.int32],
+    num_voxels: int,
+) -> tuple[int, int]:
     """Add points (N, 3) [m] with colours (N, 3) to the rows (n, 10) of `num_voxels` voxels.
 
-    `index` (2^k,) has, by a hash of their cells, their rows' numbers and 1, and 0 in free slots. Stops at a
-    point farther than the cells reach, or when no row is left. Returns how many points were added and how
-    many voxels there are.
+    `index` (2^k,), by a hash of the cells, holds the number of a cell's row plus 1, and 0 in free slots. Stop
+    at a point farther away than the cells reach, or when no row is left. Return the numbers of points added
+    and of voxels.
     """
     for i in range(len(points)):
         if num_voxels == len(rows):
@@ -191,8 +198,8 @@ def add_points(points, colors, base, index, rows, num_voxels):
 
 
 @kernel
-def fill_index(rows, num_voxels, index):
-    """Name the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
+def fill_index(rows: NDArray[np.int32], num_voxels: int, index: NDArray[np.int32]) -> None:
+    """Enter the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
     for k in range(num_voxels):
         x, y, z = np.int64(rows[k, CELL]), np.int64(rows[k, CELL + 1]), np.int64(rows[k, CELL + 2])
         index[find_slot(index, rows, x, y, z)] = k + 1
@@ -246,10 +253,7 @@ class VoxelTable:
         check_memory(num_bytes, f"{self.label}: a table of more than {self.num_voxels} voxels of 2 cm", THIN)
 
     def finish(self) -> Voxels:
-        """Return the means; those too far from the rest for a Morton code are left out.
-
-        The table is spent.
-        """
+        """Return the means, without voxels too far away for a Morton code; the table can't be used again."""
         num = self.num_voxels
         self.index = np.zeros(0, np.int32)
         check_memory(num * SORTED_BYTES, f"{self.label}: sorting {num} voxels of 2 cm", THIN)
@@ -278,7 +282,7 @@ class VoxelTable:
         return Voxels(codes[order], nodes, origin, warnings)
 
     def _without_far(self, rows: NDArray[np.int32]) -> tuple[NDArray[np.int32], tuple[str, ...]]:
-        """Return the rows of voxels near to the rest, and a line if others were left out."""
+        """Return the rows of voxels near the rest, and a warning if others were left out."""
         is_near = np.ones(len(rows), dtype=np.bool_)
         for column in rows[:, :COUNT].T:
             middle = int(np.partition(column, len(column) // 2)[len(column) // 2])

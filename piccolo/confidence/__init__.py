@@ -1,1 +1,1 @@
-"""How far a pose can be trusted: score, alternatives, covariance, status."""
+"""Trust in a pose: score, alternatives, covariance, status."""

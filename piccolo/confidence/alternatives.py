@@ -1,4 +1,4 @@
-"""Poses that may be right, and which of them are different answers."""
+"""Hypotheses, and the choice of those that are different answers."""
 
 import math
 from collections.abc import Sequence
@@ -19,11 +19,11 @@ class Hypothesis:
     """A pose that may be right."""
 
     pose: Pose
-    score: float  # more is better; in the end what of the panorama it explains, as in `localization.Evidence`
+    score: float  # more is better; in the end the part of the panorama that it explains, as in `Evidence`
 
 
 def sort_by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Sort hypotheses by falling score, equal ones in their order."""
+    """Sort hypotheses by falling score; those of equal score keep their order."""
     return sorted(poses, key=lambda p: -p.score)
 
 
@@ -41,7 +41,7 @@ def suppress_near(
 def best_distinct(
     poses: Sequence[Hypothesis], count: int, min_distance: float, min_angle: float
 ) -> list[Hypothesis]:
-    """Return at most `count` by falling score, none within distance [m] and angle [rad] of a better one."""
+    """Return at most `count` poses, best first, none within distance [m] and angle [rad] of a better one."""
     return suppress_near(sort_by_score(poses), count, min_distance, min_angle)
 
 

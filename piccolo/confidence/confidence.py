@@ -1,4 +1,4 @@
-"""From evidence to probabilities: how likely each pose is right, or none of them, and what to call that."""
+"""Probabilities from evidence: that each pose is right, or none of them; and the status that follows."""
 
 import math
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ MIN_CONFIDENCE = 0.9
 class Standing(NamedTuple):
     """Evidence for one of the poses found."""
 
-    share: float  # what it explains by what the best pose does, over what both views show; 1 of the best
+    share: float  # what it explains, divided by what the best pose does, over what both views show
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int  # local features that agree with it
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
@@ -32,8 +32,8 @@ class ChoiceModel(NamedTuple):
     none_weights: tuple[float, float]  # of none of them: a constant, and log10 of the best's deviation [m]
 
 
-LEAST_STD = 0.003  # [m] smaller tells nothing more
-MOST_STD = 0.3  # [m] larger
+LEAST_STD = 0.003  # [m] deviations below this are taken for it
+MOST_STD = 0.3  # [m] and those above this
 LEAST_SCORE = 0.02
 LEAST_SHARE = 0.1
 MOST_SHARE = 1.2
@@ -68,10 +68,10 @@ def none_features(covariance: PoseCovariance | None) -> Array:
 def posterior(
     standings: Sequence[Standing], covariance: PoseCovariance | None, model: ChoiceModel = MODEL
 ) -> Array:
-    """Probabilities (K + 1,) that each of K poses, the best first, is right to 0.1 m and 5 degrees; and none.
+    """Return the probabilities (K + 1,) that each of K poses, best first, is right, and that none of them is.
 
-    They hold where half of all queries have an answer, as in the trials from which they were learnt. None has
-    more where the best pose's own deviation makes 0.1 m doubtful.
+    Right is within 0.1 m and 5 degrees. They hold where half of all queries have an answer, as in the trials
+    from which they were learnt. None is more likely if the best pose's deviation makes 0.1 m doubtful.
     """
     logits = [log_odds(standing, model) for standing in standings]
     logits.append(float(none_features(covariance) @ np.array(model.none_weights)))
@@ -84,7 +84,7 @@ def posterior(
 
 
 def classify(probabilities: Array, min_confidence: float) -> str:
-    """Return the status of poses with probabilities (K + 1,); ambiguous if several are likely together."""
+    """Return the status for probabilities (K + 1,); ambiguous if only the poses together are likely."""
     if probabilities[0] >= min_confidence:
         return LOCALIZED
     return AMBIGUOUS if 1.0 - probabilities[-1] >= min_confidence else NOT_LOCALIZED

@@ -44,8 +44,8 @@ class PoseCovariance:
 def least_constrained_direction(covariance_up: Array, covariance: Array, offsets: NDArray[np.float32]) -> str:
     """Return the direction of the largest translational deviation, in words.
 
-    Both are covariances (3, 3) of the position: in a frame whose z is up, with the offsets (3, N) [m] from
-    the camera to what it sees, and in the world, where headings are clockwise from +y.
+    Both are covariances (3, 3) of the position: `covariance_up` in a frame whose z is up, like the offsets
+    (3, N) [m] from the camera to what it sees; `covariance` in the world. Headings are clockwise from +y.
     """
     variances, axes = np.linalg.eigh(covariance_up)
     if variances[2] < SAME_STD_RATIO**2 * max(variances[0], 0.0):

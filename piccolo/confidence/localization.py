@@ -1,4 +1,4 @@
-"""What a method finds for one panorama."""
+"""Results of a method for one panorama."""
 
 from dataclasses import dataclass
 
@@ -13,8 +13,8 @@ class Evidence:
     """The measurements that a confidence rests on."""
 
     score: float  # [0, 1] what the photo's blocks explain beyond chance; of preset paper, Agreement.score
-    # lead over the best pose elsewhere in what both views show, by what it explains; 1 if there is none;
-    # of preset paper, score less that of the best pose elsewhere
+    # lead over the best pose elsewhere in what both views show, divided by what this pose explains there; 1
+    # if there is no pose elsewhere; of preset paper, score less that of the best pose elsewhere
     margin: float
     agreement: float  # correlation over what both show, charged where that is under half of the sphere
     explained_fraction: float  # of what the panorama shows, by solid angle, see Occlusion
@@ -30,7 +30,7 @@ class Alternative:
 
     pose: Pose
     score: float  # as of Evidence
-    share: float | None = None  # what it explains by what the best does, over what both views show
+    share: float | None = None  # what it explains, divided by what the best does, over what both views show
     num_matches: int | None = None  # local features that agree with it
     probability: float | None = None  # that it is right; of the preset paper none is known
     scan: str | None = None  # name of the scan in which it lies, of a map that names its scans
@@ -38,7 +38,7 @@ class Alternative:
 
 @dataclass(frozen=True)
 class FocalLength:
-    """A focal length as a photo and the scan tell it, and what was known of it beforehand."""
+    """A focal length estimated from a photo and the scan, and its prior."""
 
     px: float  # across
     std_px: float
@@ -48,7 +48,7 @@ class FocalLength:
 
 @dataclass(frozen=True)
 class Localization:
-    """The best pose for one panorama, in world coordinates, and what speaks for it and against it."""
+    """The best pose for one panorama, in world coordinates, and the evidence for and against it."""
 
     status: str = NOT_LOCALIZED
     confidence: float = 0.0  # probability of the best pose

@@ -1,8 +1,8 @@
 """The parts of a photo that the scan explains, that contradict it, and that were not scanned.
 
 Photo and scan are compared by local contrast, as the exposure differs. An occluder pollutes mean and
-deviation around it: they are taken again over what agrees, the whole photo's at first, then more local ones.
-Their agreement is a correlation that a blank wall can't win.
+deviation around it: they are computed again over what agrees, of the whole photo first, then more locally.
+The agreement of photo and scan is a correlation, which a blank wall can't make high.
 """
 
 import math
@@ -118,9 +118,9 @@ def _squared_difference(
     weight: NDArray[np.float32],
     global_weight: float,
 ) -> NDArray[np.float32]:
-    """Return squared differences (H, W) of contrast from the scan's range within a cell around.
+    """Return the squared differences (H, W) of the photo's contrast from the scan's range within one cell.
 
-    An edge that is off by less than a cell, or blurred, differs by nothing.
+    An edge that is displaced by less than a cell, or blurred, makes no difference.
     """
     photo, scan = (_statistics(c, weight, global_weight) for c in (of_photo, of_scan))
     contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
@@ -132,11 +132,18 @@ def _squared_difference(
 
 
 @kernel
-def write_squares(channels, photo, scan, low, high, squares):
-    """Write the squared distance (H, W) of contrasts from a range (H, W, 3), `low` to `high`, over channels.
+def write_squares(
+    channels: NDArray[np.float32],
+    photo: NDArray[np.float32],
+    scan: NDArray[np.float32],
+    low: NDArray[np.float32],
+    high: NDArray[np.float32],
+    squares: NDArray[np.float32],
+) -> None:
+    """Write the squared distances (H, W) of the photo's contrast from a range (H, W, 3), `low` to `high`.
 
-    Of the photo's channels (H, W, 3) by its statistics (H, W, 6); flat surroundings, of the photo or of the
-    scan, make it count less.
+    They are summed over the photo's channels (H, W, 3), normalised by its statistics (H, W, 6). In flat
+    surroundings, of the photo or of the scan (H, W, 6), they count less.
     """
     for i in range(squares.shape[0]):
         for j in range(squares.shape[1]):
@@ -199,14 +206,14 @@ def _enlarge(small: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Cloud and panorama compared at a pose, by cells of the sphere."""
+    """Agreement of cloud and panorama at a pose, on cells of the sphere."""
 
     correlation: float  # of locally normalised colours over what both show
     seen_fraction: float  # of the sphere, what both show
 
     @property
     def value(self) -> float:
-        """The correlation; a view of which little is seen is charged below half a sphere."""
+        """The correlation, reduced if less than half of the sphere is seen."""
         return self.correlation * min(1.0, 2.0 * self.seen_fraction)
 
     @property

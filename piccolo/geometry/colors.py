@@ -1,4 +1,4 @@
-"""Colours packed as kernels read them; labels as colours far apart in RGB, alike in clouds and panoramas."""
+"""Colours packed as kernels read them; labels as colours far apart in RGB, equal in clouds and panoramas."""
 
 import functools
 from dataclasses import dataclass
@@ -13,18 +13,18 @@ NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not
 
 @dataclass(frozen=True)
 class Labels:
-    """How labels are to be understood."""
+    """The meaning of labels."""
 
     ignored: tuple[int, ...] = ()  # values that say nothing: masked in panoramas, left out of clouds
 
     def are_kept(self, labels: NDArray[np.integer]) -> NDArray[np.bool_]:
-        """True for the labels (...) that are not ignored."""
+        """Return True for the labels (...) that are not ignored."""
         return np.isin(labels, self.ignored, invert=True)
 
 
 @functools.cache
 def palette() -> NDArray[np.uint8]:
-    """RGB (NUM_COLORS, 3), each the farthest of a grid's colours from all those before it; none is black.
+    """Return RGB (NUM_COLORS, 3), each the colour of a grid farthest from all before it; none is black.
 
     The loss is a norm in RGB: a label mistaken for another costs their distance.
     """
@@ -41,12 +41,12 @@ def palette() -> NDArray[np.uint8]:
 
 
 def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
-    """Colour (..., 3) of each label (...); labels that differ by a multiple of NUM_COLORS share theirs."""
+    """Return the colour (..., 3) of each label (...); labels equal modulo NUM_COLORS have the same colour."""
     return np.asarray(palette()[labels % NUM_COLORS])
 
 
 def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
-    """One int32 (...) for each colour (..., 3): R, G, B from the lowest byte up and 1 where valid on top."""
+    """Pack each colour (..., 3) into an int32 (...): R, G, B from the lowest byte up, then 1 where valid."""
     shape = rgb.shape[:-1]
     if 0 in shape:
         return np.empty(shape, np.int32)
@@ -58,5 +58,5 @@ def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None)
 
 
 def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """The colours (N, 3) that pack_rgbx packed (N,)."""
+    """Return the colours (N, 3) that `pack_rgbx` packed (N,)."""
     return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]

@@ -1,6 +1,6 @@
 """SE(3) in NumPy, float64: `x_cam = R_cam_from_world @ (x_world - center_world)`.
 
-Points are turned term by term: BLAS sums in an order that depends on how many points there are.
+Points are rotated term by term: BLAS sums in an order that depends on the number of points.
 """
 
 import math
@@ -54,12 +54,12 @@ class Pose:
 
 
 def skew(w: Array) -> Array:
-    """The (3, 3) matrix of the cross product `w x .`."""
+    """Return the matrix (3, 3) of the cross product `w x .`."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
 def exp_so3(w: Array) -> Array:
-    """Rotation matrix (3, 3) by the rotation vector `w` (3,) [rad] (Rodrigues)."""
+    """Return the rotation matrix (3, 3) of a rotation vector `w` (3,) [rad] (Rodrigues)."""
     angle = float(np.linalg.norm(w))
     K = skew(np.asarray(w, dtype=np.float64))
     # np.sinc(x) is sin(pi x) / (pi x): exact at angle 0
@@ -69,7 +69,7 @@ def exp_so3(w: Array) -> Array:
 
 
 def log_so3(R: Array) -> Array:
-    """Rotation vector (3,) [rad] of a rotation (3, 3), of length [0, pi]: the inverse of `exp_so3`."""
+    """Return the rotation vector (3,) [rad], of length [0, pi], of a rotation (3, 3): `exp_so3` inverted."""
     w, *v = quaternion_wxyz(R)
     sine = float(np.linalg.norm(v))
     scale = 2.0 * float(np.arctan2(sine, w)) / sine if sine > 0.0 else 2.0
@@ -77,7 +77,7 @@ def log_so3(R: Array) -> Array:
 
 
 def left_jacobian(w: Array) -> Array:
-    """The (3, 3) matrix J with exp([w + dw]x) = exp([J dw]x) exp([w]x) to first order in `dw`."""
+    """Return the J (3, 3) with exp([w + dw]x) = exp([J dw]x) exp([w]x) to first order in `dw`."""
     angle = float(np.linalg.norm(w))
     K = skew(np.asarray(w, dtype=np.float64))
     a = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
@@ -86,16 +86,16 @@ def left_jacobian(w: Array) -> Array:
 
 
 def step(pose: Pose, delta: Array) -> Pose:
-    """`pose` moved by `delta` (6,), rotation [rad] then translation [m], both in the camera's frame.
+    """Move a pose by `delta` (6,), rotation [rad] then translation [m], both in the camera's frame.
 
-    R <- exp([w]x) R, center <- center + R^T d, with R before the turn.
+    R <- exp([w]x) R, center <- center + R^T d, with R before the rotation.
     """
     center_world = pose.center_world + pose.R_cam_from_world.T @ delta[3:]
     return Pose(orthonormal(exp_so3(delta[:3]) @ pose.R_cam_from_world), center_world)
 
 
 def orthonormal(R: Array) -> Array:
-    """The rotation (3, 3) nearest to `R` (3, 3), which is one but for rounding or a few per cent.
+    """Return the rotation (3, 3) nearest to `R` (3, 3), which differs from it by rounding or a few per cent.
 
     The polar factor by Newton and Schulz's iteration (Higham, "Functions of Matrices", 2008, eq. 8.20): each
     step squares the error.
@@ -106,7 +106,7 @@ def orthonormal(R: Array) -> Array:
 
 
 def check_rotation(R: Array, tolerance: float, label: str) -> Array:
-    """`R` as it is; InputError, naming it `label`, if R R^T is off the identity (3, 3) or R is a mirror."""
+    """Return `R` (3, 3); InputError, naming it `label`, if R R^T is not the identity or if R mirrors."""
     # the bound on the entries keeps the product finite; NaN is not below it either
     is_tame = R.shape == (3, 3) and np.abs(R).max() < 2.0
     if not (is_tame and np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0.0):
@@ -115,14 +115,14 @@ def check_rotation(R: Array, tolerance: float, label: str) -> Array:
 
 
 def angle_between(R_a: Array, R_b: Array) -> float:
-    """Angle [rad] of the rotation that takes one orientation (3, 3) to the other; exact near 0 and pi."""
+    """Return the angle [rad] of the rotation between two orientations (3, 3); exact near 0 and pi."""
     relative = R_a @ R_b.T
     sine = 0.5 * np.linalg.norm(relative - relative.T) / np.sqrt(2.0)
     return float(np.arctan2(sine, 0.5 * (np.trace(relative) - 1.0)))
 
 
 def yaw_rotation(yaw: float) -> Array:
-    """R_cam_from_world (3, 3) of an upright camera whose image centre looks along azimuth `yaw` [rad]."""
+    """Return R_cam_from_world (3, 3) of an upright camera whose image centre is at azimuth `yaw` [rad]."""
     c = np.cos(yaw)
     s = np.sin(yaw)
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
@@ -138,7 +138,7 @@ def rotation_to_z(direction: Array) -> Array:
 
 
 def quaternion_wxyz(R: Array) -> Array:
-    """Unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
+    """Return the unit quaternion (4,), scalar first and not negative, of a rotation (3, 3)."""
     # The eigenvector of Bar-Itzhack's symmetric matrix: no case distinction, accurate for every angle.
     K = np.array(
         [
@@ -153,7 +153,7 @@ def quaternion_wxyz(R: Array) -> Array:
 
 
 def rotation_from_quaternion_wxyz(q: Array) -> Array:
-    """Rotation (3, 3) of a quaternion (4,), scalar first, any length but zero."""
+    """Return the rotation (3, 3) of a quaternion (4,), scalar first, of any length but zero."""
     w, x, y, z = np.asarray(q, dtype=np.float64) / np.linalg.norm(q)
     return np.array(
         [
@@ -165,13 +165,13 @@ def rotation_from_quaternion_wxyz(q: Array) -> Array:
 
 
 def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:
-    """Position error [m] and rotation error [rad]."""
+    """Return the position error [m] and the rotation error [rad]."""
     distance = float(np.linalg.norm(pose.center_world - true_pose.center_world))
     return distance, angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world)
 
 
 def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
-    """True for a pose that counts as correct in the paper."""
+    """Return True if the paper counts the pose as correct: within MAX_DISTANCE and MAX_ANGLE; None is not."""
     if pose is None:
         return False
     distance, angle = pose_errors(pose, true_pose)
@@ -179,14 +179,17 @@ def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
 
 
 def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:
-    """A pose of the source in the target's coordinates, under a rigid transform (4, 4) in some unit."""
+    """Return a pose of the source in the target's coordinates.
+
+    T (4, 4) is rigid, its translation in units of `metres_per_unit`.
+    """
     R = T_target_from_source[:3, :3]
     center = R @ pose.center_world + T_target_from_source[:3, 3] * metres_per_unit
     return Pose(orthonormal(pose.R_cam_from_world @ R.T), center)
 
 
 def rotate_points(points: Array, R_target_from_source: Array) -> Array:
-    """Points (N, 3) under a rotation (3, 3); the same array under the identity."""
+    """Rotate points (N, 3) by a rotation (3, 3); under the identity the array itself is returned."""
     if np.array_equal(R_target_from_source, np.eye(3)):
         return points
     x, y, z = points.T
@@ -194,6 +197,6 @@ def rotate_points(points: Array, R_target_from_source: Array) -> Array:
 
 
 def transform_points(points: Array, T_target_from_source: Array) -> Array:
-    """Points (N, 3) under an affine transform (4, 4) for column vectors."""
+    """Transform points (N, 3) by an affine transform (4, 4) for column vectors."""
     x, y, z = points.T
     return np.stack([a * x + b * y + c * z + d for a, b, c, d in T_target_from_source[:3]], axis=1)

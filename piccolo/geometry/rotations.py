@@ -1,7 +1,7 @@
 """Rotations to try, and other tools' camera axes and angles. Ours: +x the image centre, +y left, +z up.
 
 A matrix other_from_cam takes our camera coordinates to theirs: R_other_from_world = other_from_cam @
-R_cam_from_world, and the camera's position stays as it is.
+R_cam_from_world; the camera's position does not change.
 """
 
 import math
@@ -26,13 +26,13 @@ DECIMALS = 9  # of degrees
 
 
 def uniform_yaws(num_rotations: int) -> NDArray[np.float64]:
-    """R_cam_from_world (num_rotations, 3, 3) of an upright camera at evenly spaced yaws."""
+    """Return R_cam_from_world (num_rotations, 3, 3) of an upright camera at evenly spaced yaws."""
     return np.stack([yaw_rotation(2.0 * math.pi * k / num_rotations) for k in range(num_rotations)])
 
 
 @lru_cache(maxsize=4)
 def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
-    """Rotations (num_rotations, 3, 3) spread evenly over SO(3) by the super-Fibonacci spiral."""
+    """Return rotations (num_rotations, 3, 3) spread evenly over SO(3) by the super-Fibonacci spiral."""
     s = np.arange(num_rotations) + 0.5
     r = np.sqrt(s / num_rotations)
     R = np.sqrt(1.0 - s / num_rotations)
@@ -45,23 +45,23 @@ def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
 
 
 def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
-    """A rotation (3, 3) drawn evenly from SO(3) (Shoemake, 1992: a normalised Gaussian quaternion)."""
+    """Draw a rotation (3, 3) evenly from SO(3) (Shoemake, 1992: a normalised Gaussian quaternion)."""
     quaternion = rng.normal(size=4)
     return rotation_from_quaternion_wxyz(quaternion / np.linalg.norm(quaternion))
 
 
 def turn_axes(pose: Pose, other_from_cam: Array) -> Pose:
-    """Return the camera with its rotation to other axes."""
+    """Return the pose with its rotation to another tool's camera axes, by `other_from_cam` (3, 3)."""
     return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
 
 
 def translation(pose: Pose) -> Array:
-    """The t (3,) of x_cam = R x_world + t."""
+    """Return the t (3,) of x_cam = R x_world + t."""
     return np.asarray(-pose.R_cam_from_world @ pose.center_world)
 
 
 def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> Array:
-    """R_cam_from_world (3, 3) of the angles [deg] that `heading_pitch_roll_deg` gives."""
+    """Return R_cam_from_world (3, 3) of the angles [deg] that `heading_pitch_roll_deg` returns."""
     yaw = exp_so3(np.radians([0.0, 0.0, 90.0 - heading_deg]))
     pitch = exp_so3(np.radians([0.0, -pitch_deg, 0.0]))
     roll = exp_so3(np.radians([roll_deg, 0.0, 0.0]))
@@ -69,10 +69,10 @@ def R_cam_from_angles(heading_deg: float, pitch_deg: float, roll_deg: float) -> 
 
 
 def heading_pitch_roll_deg(pose: Pose) -> tuple[float, float, float]:
-    """Heading in [0, 360), pitch in [-90, 90], roll in (-180, 180], by Photo Sphere XMP's definitions [deg].
+    """Return heading in [0, 360), pitch in [-90, 90], roll in (-180, 180] [deg], as Photo Sphere XMP does.
 
-    Heading is of the image centre, clockwise from the world's +y; pitch its elevation above the horizon; as
-    roll grows the camera's right side goes down, so the horizon turns counterclockwise in the image:
+    Heading is that of the image centre, clockwise from the world's +y; pitch is its elevation above the
+    horizon; as roll grows the camera's right side goes down: the horizon turns counterclockwise in the image:
     R_world_from_cam = R_z(90 deg - heading) R_y(-pitch) R_x(roll).
     https://developers.google.com/streetview/spherical-metadata
     """

@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..kernels.jit import F0, HALF, inline_kernel
+from ..kernels.jit import F0, HALF, Scalar, inline_kernel
 
 PI = np.float32(math.pi)
 HALF_PI = np.float32(math.pi / 2)
 TINY = np.float32(1e-18)
 
-# what files with poses say of them
+# the text with which files describe their poses
 CONVENTION = (
     "x_cam = R_cam_from_world @ (x_world - center_world) in metres; +x_cam points to the image centre, "
     "+y_cam left, +z_cam up; u = (1/2 - atan2(y, x) / 2 pi) W, v = (1/2 - atan2(z, hypot(x, y)) / pi) H, "
@@ -43,21 +43,24 @@ AREA_UNITS = 1000  # of the largest cell
 
 
 @inline_kernel
-def atan2(y, x):
-    """Angle [rad] of (x, y) in (-pi, pi], float32, within 6e-7 of math.atan2; 0 at the origin."""
-    abs_x = abs(x)
-    abs_y = abs(y)
+def atan2(y: Scalar, x: Scalar) -> Scalar:
+    """Return the angle [rad] of (x, y) in (-pi, pi], float32, within 6e-7 of math.atan2; 0 at the origin."""
+    abs_x: Any = abs(x)  # of a union abs has no type
+    abs_y: Any = abs(y)
     q = min(abs_x, abs_y) / max(abs_x, abs_y, TINY)
     s = q * q
-    angle = q * (A0 + s * (A1 + s * (A2 + s * (A3 + s * (A4 + s * (A5 + s * A6))))))
+    angle: Scalar = q * (A0 + s * (A1 + s * (A2 + s * (A3 + s * (A4 + s * (A5 + s * A6))))))
     angle = HALF_PI - angle if abs_y > abs_x else angle
     angle = PI - angle if x < F0 else angle
     return -angle if y < F0 else angle
 
 
 @inline_kernel
-def direction_to_pixel(x, y, z, rho, width):
-    """Continuous pixel (u, v) of the camera direction (x, y, z), rho = hypot(x, y), in a `width` image."""
+def direction_to_pixel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: Scalar) -> tuple[Scalar, Scalar]:
+    """Return the continuous pixel (u, v) of a camera direction (x, y, z) in an image of `width`.
+
+    rho is hypot(x, y).
+    """
     scale = width / (PI + PI)
     u = HALF * width - scale * atan2(y, x)
     v = HALF * HALF * width - scale * atan2(z, rho)
@@ -65,10 +68,13 @@ def direction_to_pixel(x, y, z, rho, width):
 
 
 @inline_kernel
-def pixel_jacobian(x, y, z, rho2, width):
-    """Derivative of (u, v) by the camera coordinates: (du/dx, du/dy, dv/dx, dv/dy, dv/dz); du/dz is 0.
+def pixel_jacobian(
+    x: Scalar, y: Scalar, z: Scalar, rho2: Scalar, width: Scalar
+) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:
+    """Return the derivatives du/dx, du/dy, dv/dx, dv/dy, dv/dz of a pixel (u, v); du/dz is 0.
 
-    At a pole and at the camera itself, where there is none, the divisor stays above zero and the rows finite.
+    x, y, z are camera coordinates, rho2 is x^2 + y^2. At a pole and at the camera itself, where there is no
+    derivative, the divisor stays above zero and the numbers finite.
     """
     scale = width / (PI + PI)
     rho2 = max(rho2, TINY)
@@ -78,12 +84,12 @@ def pixel_jacobian(x, y, z, rho2, width):
 
 
 def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
-    """Unit camera directions (width / 2, width, 3) of pixel centres of a `width` image, or of its `rows`."""
+    """Return the unit camera directions (width / 2, width, 3) of pixel centres, or of some `rows` of them."""
     return compute_rays(np.arange(width) + 0.5, np.arange(width // 2)[rows, None] + 0.5, width)
 
 
 def compute_rays(u: Any, v: Any, width: int) -> NDArray[np.float64]:
-    """Unit camera directions (..., 3) of columns u and rows v (...), continuous, of a `width` image."""
+    """Return the unit camera directions (..., 3) of continuous pixels u, v (...) in an image of `width`."""
     azimuth = (0.5 - u / width) * 2.0 * np.pi
     elevation = (0.5 - v / (width / 2.0)) * np.pi
     rays = np.empty((*np.broadcast_shapes(np.shape(u), np.shape(v)), 3))
@@ -96,7 +102,7 @@ def compute_rays(u: Any, v: Any, width: int) -> NDArray[np.float64]:
 def compute_pixels(
     rays: NDArray[np.floating], width: int
 ) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
-    """Columns u and rows v (...), continuous, of camera directions (..., 3) in a `width` image."""
+    """Return the continuous pixels u, v (...) of camera directions (..., 3) in an image of `width`."""
     x, y, z = np.moveaxis(rays, -1, 0)
     u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width
     v = (0.5 - np.arctan2(z, np.hypot(x, y)) / np.pi) * width / 2.0
@@ -104,13 +110,13 @@ def compute_pixels(
 
 
 def compute_indices(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns (...) of the pixels in which directions (..., 3) lie, in a `width` image."""
+    """Return rows and columns (...) of the pixels that contain directions (..., 3) in an image of `width`."""
     u, v = compute_pixels(rays, width)
     return np.minimum(v.astype(np.int64), width // 2 - 1), u.astype(np.int64) % width
 
 
 def ray_jacobian(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Derivatives (H, W, 3) of u and of v by the camera coordinates, at pixel_rays, 1 m from the camera."""
+    """Return the gradients (H, W, 3) of u and of v in camera coordinates, at `pixel_rays`, 1 m away."""
     x, y, z = np.moveaxis(rays, -1, 0)
     rho = np.hypot(x, y)
     scale = rays.shape[1] / (2.0 * math.pi)
@@ -120,7 +126,7 @@ def ray_jacobian(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
 
 
 def solid_angles(width: int) -> NDArray[np.float64]:
-    """Solid angle [sr] of a pixel of each row, (width / 2,), of an image of `width`; exact, sums to 4 pi."""
+    """Return the solid angle [sr] of a pixel of each row (width / 2,); exact: all pixels' sum to 4 pi."""
     edges = np.sin((0.5 - np.arange(width // 2 + 1) / (width // 2)) * np.pi)
     return np.asarray((edges[:-1] - edges[1:]) * 2.0 * np.pi / width)
 
@@ -149,7 +155,7 @@ class Neighbors:
 
 @lru_cache(maxsize=8)
 def make_grid(num_rings: int) -> SphereGrid:
-    """Rings from the zenith down, azimuth growing within a ring from -pi."""
+    """Make a grid of rings from the zenith down; within a ring the azimuth grows from -pi."""
     edges = np.pi * (0.5 - np.arange(num_rings + 1) / num_rings)
     middle = 0.5 * (edges[:-1] + edges[1:])
     num_columns = np.maximum(np.rint(2 * num_rings * np.cos(middle)), 3).astype(np.int32)
@@ -173,7 +179,7 @@ def make_grid(num_rings: int) -> SphereGrid:
 
 @lru_cache(maxsize=8)
 def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
-    """Gaussian weights of the cells of a grid within 2.3 sigmas of each cell."""
+    """Compute the Gaussian weights of the cells of a grid within 2.3 sigmas of each cell."""
     grid = make_grid(num_rings)
     sigma = np.radians(sigma_deg)
     cosine = grid.directions @ grid.directions.T
@@ -185,9 +191,10 @@ def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
 
 @lru_cache(maxsize=8)
 def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """Cells (cells, 4) of a coarser grid around each cell's middle, and bilinear weights (cells, 4).
+    """Return the cells (cells, 4) of a coarser grid around each cell's centre, and their bilinear weights.
 
-    Two rings, of each two cells; beyond the last ring it is that ring on the other side of the pole.
+    The four are two cells in each of two rings; beyond the last ring that ring is used again, on the other
+    side of the pole.
     """
     fine = make_grid(num_rings).directions.astype(np.float64)
     coarse = make_grid(coarse_rings)
@@ -210,20 +217,23 @@ def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32],
 
 @lru_cache(maxsize=4)
 def wider_cells(num_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-    """The cell of `num_rings` in which each search cell lies, and the sum (cells,) of `whole_areas` in it."""
+    """Return, for each search cell, the cell of `num_rings` that it lies in, and the areas (cells,) of those.
+
+    The area is the sum of the search cells' `whole_areas`.
+    """
     cells = find_cell(make_grid(SEARCH_RINGS).directions, num_rings)
     areas = np.bincount(cells, whole_areas(SEARCH_RINGS), len(make_grid(num_rings)))
     return cells, areas.astype(np.float32)
 
 
 def whole_areas(num_rings: int) -> NDArray[np.float32]:
-    """Solid angles (cells,) of a grid in whole numbers up to AREA_UNITS: sums of them are exact."""
+    """Return the solid angles (cells,) of a grid in whole numbers up to AREA_UNITS: their sums are exact."""
     area = make_grid(num_rings).solid_angle
     return np.asarray(np.rint(area / area.max() * np.float32(AREA_UNITS)))
 
 
 def find_cell(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32]:
-    """The cell (N,) of a grid in which each direction (N, 3) lies."""
+    """Return the cell (N,) of a grid in which each direction (N, 3) lies."""
     d = directions.astype(np.float64)
     grid = make_grid(num_rings)
     place = (0.5 - np.arcsin(np.clip(d[:, 2], -1, 1)) / np.pi) * num_rings

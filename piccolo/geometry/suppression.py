@@ -10,8 +10,14 @@ from .vectors import dot, minus, row
 
 
 @kernel
-def suppress(rotations, centers, min_distance, min_trace, kept):
-    """Write the indices of the poses, best first, that are near none kept before; returns how many."""
+def suppress(
+    rotations: NDArray[np.float64],
+    centers: NDArray[np.float64],
+    min_distance: float,
+    min_trace: float,
+    kept: NDArray[np.int64],
+) -> int:
+    """Write the indices of the poses, best first, that are near none kept before; return their number."""
     places = np.empty((len(kept), 3))
     count = 0
     for k in range(len(centers)):
@@ -41,7 +47,7 @@ def non_maximum_suppression(
     min_distance: float,
     min_angle: float,
 ) -> NDArray[np.int64]:
-    """Indices of the first `count` poses (n, 3, 3), (n, 3), best first, that are near none before.
+    """Return the indices of at most `count` poses (n, 3, 3), (n, 3), best first, that are near no better one.
 
     Near is within both the distance [m] and the angle [rad].
     """

@@ -32,6 +32,7 @@ from ..files.atomic import write_atomically
 from ..files.cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Scalar = float | np.floating[Any]  # a number in a kernel, of float64 or float32
 NAME = own_names("kernel")
 DIGEST_SIZE = hashlib.sha256().digest_size
 # of numba.config: they change the code that is made
@@ -89,18 +90,18 @@ class Compiling:
     """The kernels that this process has compiled, reported as the log's INFO."""
 
     count: int = 0
-    told: float = 0.0  # [s] when the first kernel was asked for and not found, or a line was last logged
+    quiet_since: float = 0.0  # [s] when the first kernel was not found, or a line was last logged
 
     def start(self) -> None:
         """Note the time at which the first kernel was asked for and not found."""
-        self.told = self.told or time.monotonic()
+        self.quiet_since = self.quiet_since or time.monotonic()
 
     def finish(self) -> None:
         """Count a kernel; from time to time log how many there are."""
         self.count += 1
         now = time.monotonic()
-        if now - self.told >= QUIET_S:
-            self.told = now
+        if now - self.quiet_since >= QUIET_S:
+            self.quiet_since = now
             log.info("compiling kernels, once: %d so far, half a minute in all", self.count)
 
 
@@ -139,21 +140,23 @@ def rebuild(
 ) -> Any:
     """Make a compiled kernel from its pickled parts.
 
-    Numba parses a kernel's bitcode, up to 1 MB, to learn which names its machine code has, and to compile
-    others that call it. Here the names that may be asked for stand in; it is parsed only for the latter.
+    Numba parses a kernel's bitcode, up to 1 MB, to learn the names in its machine code, and to compile other
+    kernels that call it. For the former a stub with the names that Numba may ask for replaces the bitcode; it
+    is parsed only for the latter.
     """
     name, kind, (machine_code, bitcode) = library
     wrappers = description.llvm_cpython_wrapper_name, description.llvm_cfunc_wrapper_name
     names = description.llvm_func_name, *wrappers
     stand_in = llvm.parse_assembly("".join(f'define void @"{each}"() {{ ret void }}\n' for each in names))
     parts = (name, kind, (machine_code, stand_in.as_bitcode())), description
-    compiled = compiler.CompileResult._rebuild(target_context, *parts, *others)
+    make: Callable[..., Any] = compiler.CompileResult._rebuild  # Numba gives it no type
+    compiled = make(target_context, *parts, *others)
     compiled.library._get_module_for_linking = cache(partial(llvm.parse_bitcode, bitcode))
     return compiled
 
 
 class KernelCache:
-    """What Numba asks for compiled code: one kernel's files. A file that is damaged is compiled anew."""
+    """One kernel's files, which Numba asks for compiled code. A damaged file is compiled again."""
 
     def __init__(self, function: Any) -> None:
         """Remember which kernel; nothing is opened."""
@@ -185,7 +188,8 @@ class KernelCache:
         compiling.finish()
         try:
             if path := self._file(signature, compiled.codegen):
-                payload = serialize.dumps(compiled._reduce())
+                dump: Callable[[Any], bytes] = serialize.dumps  # Numba gives it no type
+                payload = dump(compiled._reduce())
                 write_atomically(path, compute_digest(path.name, payload) + payload)
         except OSError as error:
             warn_not_kept(f"{kernel_folder()}: {error.strerror or error}")

@@ -1,4 +1,4 @@
-"""The scan's local features: where views are taken, what they show, and an index of descriptors."""
+"""Local features of the scan: positions of the views, the features in them, and an index of descriptors."""
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -18,16 +18,16 @@ from .view_image import render_gray
 
 VIEW_WIDTH = 640  # [px] of the views
 NUM_COMPONENTS = 64
-MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match tells little of the position
+MAX_RANGE = 30.0  # [m] farther away the scan is too thin, and a match hardly constrains the position
 SAMPLE = 20_000  # descriptors from which the components and the lists' middles are learnt
 LIST_SIZE = 128  # features of a list, on average
 MAX_LISTS = 4096
 MOST_VIEWS = 1 << 16
-GROWTH = 2  # of the features, by those for which the lists were made, before new ones are
+GROWTH = 2  # of the number of lists for all features: from this factor on new lists are made
 KMEANS_ROUNDS = 5
 BLOCK = 4096  # descriptors that are projected, or that a thread sorts into lists, at a time
 # From where features are taken: few positions that see all that a camera can see
-SPACING = 2.5  # [m] across: what is nearer and seen from a position needs none
+SPACING = 2.5  # [m] across: a nearer place that is seen from a position needs none
 LAYER = 2.4  # [m] in height
 MAX_VIEWS = 2500  # some minutes and 0.4 GB
 WIDER = 1.5  # growth of the spacing where there would be more
@@ -35,7 +35,7 @@ ABOVE_LOWEST = 1.0  # [m] first are positions so high above the lowest around
 HEIGHT_STEP = 0.3  # [m]
 Look = Callable[[int], NDArray[np.float32]]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
-TABLE_HEIGHT = 48  # directions, by 3.75 degrees
+TABLE_HEIGHT = 48  # rows of directions, 3.75 degrees each
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 
 
@@ -43,20 +43,20 @@ class FeatureMap(NamedTuple):
     """Local features in the map's frame, sorted by the list that each is in."""
 
     points: NDArray[np.float32]  # (F, 3) [m]
-    directions: NDArray[np.int8]  # (F, 3) from the camera to the point, by 127
-    tangents: NDArray[np.int8]  # (F, 3) in which the keypoint points, across the direction, by 127
+    directions: NDArray[np.int8]  # (F, 3) from the camera to the point, times 127
+    tangents: NDArray[np.int8]  # (F, 3) in which the keypoint points, across the direction, times 127
     sizes: NDArray[np.float32]  # (F,) diameter [m]
     descriptors: NDArray[np.int8]  # (F, NUM_COMPONENTS)
     views: NDArray[np.uint16]  # (F,) index of the view that each is from
     view_centers: NDArray[np.float64]  # (V, 3) [m]
     mean: NDArray[np.int16]  # (128,) of the descriptors, and
-    components: NDArray[np.int8]  # (128, NUM_COMPONENTS) their principal components, by 127
+    components: NDArray[np.int8]  # (128, NUM_COMPONENTS) their principal components, times 127
     middles: NDArray[np.int8]  # (L, NUM_COMPONENTS) of the lists
     list_start: NDArray[np.int32]  # (L + 1,) where each begins
 
 
 class FeaturesOfView(NamedTuple):
-    """The features of one view, as of FeatureMap but for whole descriptors (F, 128)."""
+    """Features of one view: arrays of FeatureMap, but whole descriptors (F, 128)."""
 
     points: NDArray[np.float32]
     directions: NDArray[np.int8]
@@ -76,7 +76,7 @@ NO_FEATURES = FeaturesOfView(
 
 
 def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> FeaturesOfView:
-    """The features seen from a centre (3,) [m] that have a point of the scan."""
+    """Find the features seen from a centre (3,) [m] whose ray meets the scan within MAX_RANGE."""
     image = render_gray(octree, center_map, VIEW_WIDTH)
     found = find_keypoints(image.gray, image.is_filled)
     ranges = image.ranges[compute_indices(found.rays, VIEW_WIDTH)]
@@ -95,7 +95,7 @@ def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> Fe
 def principal_components(
     descriptors: NDArray[np.uint8],
 ) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
-    """Mean (128,) and strongest components (128, NUM_COMPONENTS) by 127 of descriptors (N, 128)."""
+    """Return mean (128,) and first components (128, NUM_COMPONENTS), times 127, of descriptors (N, 128)."""
     values = descriptors.astype(np.float64)
     mean = np.rint(values.sum(axis=0) / max(len(values), 1))
     values -= mean
@@ -107,7 +107,10 @@ def principal_components(
 def project(
     descriptors: NDArray[np.uint8], mean: NDArray[np.int16], components: NDArray[np.int8]
 ) -> NDArray[np.int8]:
-    """Components (N, NUM_COMPONENTS) of descriptors (N, 128); sums of whole numbers below 2^24 are exact."""
+    """Return the components (N, NUM_COMPONENTS) of descriptors (N, 128).
+
+    Sums of whole numbers below 2^24 are exact in float32.
+    """
     projected = np.empty((len(descriptors), NUM_COMPONENTS), np.int8)
     for lo in range(0, len(descriptors), BLOCK):
         values = descriptors[lo : lo + BLOCK].astype(np.float32) - mean.astype(np.float32)
@@ -117,10 +120,10 @@ def project(
 
 
 @inline_kernel
-def squared_gap(first, second):
-    """Squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits.
+def squared_gap(first: NDArray[np.int8], second: NDArray[np.int8]) -> np.int32:
+    """Return the squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits.
 
-    Numba's products of 32 bits have 64, which are cut again: 16 at a time then.
+    Numba makes 64 bits of products of 32 bits; cut to 32 again, 16 are computed at a time.
     """
     total = np.int32(0)
     for d in range(NUM_COMPONENTS):
@@ -130,7 +133,9 @@ def squared_gap(first, second):
 
 
 @kernel
-def nearest_middle(descriptors, middles, nearest):
+def nearest_middle(
+    descriptors: NDArray[np.int8], middles: NDArray[np.int8], nearest: NDArray[np.int32]
+) -> None:
     """Write the index of the nearest middle (L, D) of each descriptor (N, D)."""
     for i in range(len(descriptors)):
         best = np.int32(2147483647)
@@ -142,7 +147,7 @@ def nearest_middle(descriptors, middles, nearest):
 
 
 def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.int8]:
-    """Middles (num_lists, D) of clusters of descriptors (N, D), by Lloyd's k-means from an even sample."""
+    """Cluster an even sample of descriptors (N, D) by Lloyd's k-means; return the middles (num_lists, D)."""
     sample = descriptors[:: 1 + len(descriptors) // SAMPLE]
     if len(sample) == 0:
         return np.zeros((num_lists, NUM_COMPONENTS), np.int8)
@@ -160,7 +165,7 @@ def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.in
 def find_features(
     octree: Octree, centers: NDArray[np.float64], workers: Workers
 ) -> tuple[FeaturesOfView, NDArray[np.uint16]]:
-    """The features of the views from some centres (N, 3) [m], and the view that each is from."""
+    """Find the features seen from centres (N, 3) [m]; return them and the index (F,) of the view of each."""
     views = list(workers.map(lambda c: extract_view_features(octree, c), list(centers), "find features"))
     joined: list[Any] = [np.concatenate(values) for values in zip(NO_FEATURES, *views, strict=True)]
     counts = np.array([len(view.points) for view in views], np.int64)
@@ -168,7 +173,7 @@ def find_features(
 
 
 def num_lists(num_features: int) -> int:
-    """The number of lists for so many features."""
+    """Return the number of lists for a number of features."""
     return int(np.clip(num_features // LIST_SIZE, 1, MAX_LISTS))
 
 
@@ -178,7 +183,10 @@ def put_in_lists(
     middles: NDArray[np.int8],
     workers: Workers,
 ) -> FeatureMap:
-    """The map of features by its first six arrays, in any order, its next three, and the lists' middles."""
+    """Sort features into the lists that have these middles; return the map.
+
+    `of_points` are the first six arrays of FeatureMap, in any order of the features, `of_all` its next three.
+    """
     descriptors = of_points[4]
     nearest = np.empty(len(descriptors), np.int32)
 
@@ -193,7 +201,7 @@ def put_in_lists(
 
 
 def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
-    """The features of the views from some centres (N, 3) [m]."""
+    """Make the map of the features seen from centres (N, 3) [m]."""
     found, views = find_features(octree, centers, workers)
     mean, components = principal_components(found.descriptors[:: 1 + len(found.points) // SAMPLE])
     descriptors = project(found.descriptors, mean, components)
@@ -210,9 +218,9 @@ def extend_feature_map(
     centers: NDArray[np.float64],
     workers: Workers,
 ) -> FeatureMap:
-    """The features of those views (V,) that are kept, and of the views from more centres (N, 3) [m].
+    """Keep the features of some of the views (V,), and add those seen from more centres (N, 3) [m].
 
-    The components stay; the lists too, unless they have grown to twice their size.
+    The components do not change, nor do the lists, unless the features need GROWTH times as many.
     """
     num_kept = np.count_nonzero(is_kept)
     if num_kept == 0:
@@ -232,11 +240,19 @@ def extend_feature_map(
 
 
 @kernel
-def next_unseen(order, begin, centers, kept, ranges, cells, spacing):
-    """The first place from `begin` in an order of positions that none of those kept (k,) sees nearby.
+def next_unseen(
+    order: NDArray[np.int64],
+    begin: int,
+    centers: Array,
+    kept: NDArray[np.int64],
+    ranges: NDArray[np.float32],
+    cells: NDArray[np.int32],
+    spacing: float,
+) -> int:
+    """Return the first place in `order`, from `begin`, whose position none of the kept ones (k,) sees nearby.
 
-    Ranges (k, cells) [m] are those of the view from each, 0 where nothing is seen; `cells` is a table
-    (h, 2 h) of the cell in each direction.
+    Ranges (k, cells) [m] are those of the view from each kept position, 0 where nothing is seen; `cells` is a
+    table (h, 2 h) of the cell in each direction. The length of `order` is returned if there is no such place.
     """
     height, width = cells.shape
     for place in range(begin, len(order)):
@@ -244,7 +260,8 @@ def next_unseen(order, begin, centers, kept, ranges, cells, spacing):
         for k in range(len(kept)):
             dx, dy, dz = minus(row(centers, order[place]), row(centers, kept[k]))
             across = dx * dx + dy * dy
-            if across >= spacing * spacing or abs(dz) >= LAYER:
+            up: Any = abs(dz)  # of a union abs has no type
+            if across >= spacing * spacing or up >= LAYER:
                 continue
             u, v = direction_to_pixel(dx, dy, dz, np.sqrt(across), width)
             limit = ranges[k, cells[min(int(v), height - 1), min(int(u), width - 1)]]
@@ -257,15 +274,16 @@ def next_unseen(order, begin, centers, kept, ranges, cells, spacing):
 
 
 def cell_table(num_rings: int) -> NDArray[np.int32]:
-    """The cell (h, 2 h) of a grid in each direction, by the pixels of a sphere."""
+    """Return the grid cell (h, 2 h) at each pixel of an equirectangular table of directions."""
     rays = pixel_rays(2 * TABLE_HEIGHT).astype(np.float32)
     return find_cell(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
 
 
 def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 0) -> NDArray[np.int64]:
-    """Indices of the candidates (N, 3) [m] from which features are taken, beside the first, already known.
+    """Choose the candidates (N, 3) [m] from which features are taken; return at most MAX_VIEWS indices.
 
-    At most MAX_VIEWS. A look from a candidate tells ranges on the cells of `num_rings`.
+    The first `num_known` have features already: they are not returned. `look` returns the ranges that a
+    candidate sees on the cells of `num_rings`.
     """
     if len(centers) == 0:
         return np.empty(0, np.int64)
@@ -290,7 +308,7 @@ def choose(
     cells: NDArray[np.int32],
     spacing: float,
 ) -> NDArray[np.int64] | None:
-    """Choose of some positions, in order, each that none known or before it sees; None if too many."""
+    """Choose, in order, each position that no known or chosen one sees; None if they exceed MAX_VIEWS."""
     room = num_known + MAX_VIEWS
     kept = np.arange(room)
     ranges = np.empty((room, cells.max() + 1), np.float32)

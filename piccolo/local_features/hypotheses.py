@@ -1,9 +1,9 @@
-"""Poses that matches vote for.
+"""Pose hypotheses that matches vote for.
 
-One match gives a pose by itself, roughly: its keypoint's size tells how far the point is, its direction and
-tangent how the camera is turned, if the camera is near where the map knows the feature from. The poses that
-most other matches agree with, in place, size and turn, are made exact by P3P within RANSAC (Fischler and
-Bolles, 1981) among those matches.
+A single match gives a rough pose: its keypoint's size gives the distance of the point, its direction and
+tangent give the rotation, if the camera is near the view from which the map has the feature. The poses that
+most other matches agree with, in direction, size and tangent, are made exact by P3P within RANSAC (Fischler
+and Bolles, 1981) on those matches.
 """
 
 import math
@@ -16,7 +16,7 @@ from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, copy_to, inline_kernel, kernel
+from ..kernels.jit import F0, Scalar, copy_to, inline_kernel, kernel
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
@@ -24,20 +24,20 @@ from ..panorama.texels import in_camera, pose_float32
 from .matching import LEAST_WEIGHT, Matches
 from .p3p import p3p
 
-COS_ROUGH = math.cos(math.radians(20.0))  # a match off by less agrees roughly
+COS_ROUGH = math.cos(math.radians(20.0))  # a match whose error is smaller agrees roughly
 COS_EXACT = math.cos(math.radians(1.0))
 # in float32 first, and a little wider
 COS2_NEAR, COS2_CLOSE = (np.float32(math.cos(math.radians(angle)) ** 2) for angle in (20.1, 1.1))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
-COS_TILT = math.cos(math.radians(12.0))  # by which a pose may be off the known vertical
+COS_TILT = math.cos(math.radians(12.0))  # most angle between a pose's vertical and the known one
 LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
 CLUSTER = (1.0, math.radians(30.0))  # [m], [rad] rough poses nearer than both are one
 SAME = (0.3, math.radians(10.0))  # exact poses nearer than both are one
 NUM_CLUSTERS = 48  # that are made exact, at most
-FIRST_CLUSTERS = 8  # of them, before it is asked which of the rest
+FIRST_CLUSTERS = 8  # of them, before the rest is chosen by the votes
 FAIR_PART = 0.2  # of the best pose's matches
 NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
@@ -47,19 +47,21 @@ REFINE_TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
 
 
 class MatchedPose(NamedTuple):
-    """A pose, and how many features of the photo it puts where the map has them."""
+    """A pose, and the number of the photo's features that it puts where the map has them."""
 
     pose: Pose
     num_matches: int
 
 
 @kernel
-def angular_equations(problem, R_cam_from_map, center_map, sums):
+def angular_equations(
+    problem: tuple[Array, Array, float], R_cam_from_map: Array, center_map: Array, sums: Array
+) -> None:
     """Write the sums (29,) of normal_equations for bearings (N, 3), points (N, 3) [m], scale [rad].
 
-    The scale is that of Geman and McClure's loss: what is off by much more hardly counts.
+    The scale is that of Geman and McClure's loss: much larger residuals hardly count.
     The residual is u - b, with u the unit ray to the point and b the bearing. At distance r,
-    du = w x u - (I - u u^T) d / r: its rows add up to products of u and b: no Jacobian is stored.
+    du = w x u - (I - u u^T) d / r. Sums over its rows are products of u and b: no Jacobian is stored.
     """
     bearings, points, scale = problem
     inverse_scale2 = 1.0 / (scale * scale)
@@ -99,8 +101,11 @@ descend_matches = kernel(levenberg_marquardt(angular_equations))
 
 
 @inline_kernel
-def agreement(m, j, R, t, cos_rough):
-    """Cosine of a match's ray and its point as seen from a pose; -1 if that, size or tangent differ."""
+def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scalar:
+    """Return the cosine between a match's ray and its point seen from a pose.
+
+    -1 if that is less than `cos_rough`, or if size or tangent differ.
+    """
     ray = rotate(R, minus(row(m.points, j), t))
     length = math.sqrt(dot(ray, ray))
     cosine = dot(ray, m.rays[j]) / max(length, 1e-9)
@@ -113,7 +118,7 @@ def agreement(m, j, R, t, cos_rough):
 
 
 @inline_kernel
-def write_upright(m, j, R_cam_from_level, R):
+def write_upright(m: Matches, j: int, R_cam_from_level: Array, R: Array) -> None:
     """Write the rotation (3, 3) whose yaw takes the azimuth of a match's direction to that of its ray."""
     L = R_cam_from_level
     d = m.directions[j]
@@ -128,7 +133,7 @@ def write_upright(m, j, R_cam_from_level, R):
 
 
 @inline_kernel
-def write_turned(m, j, R):
+def write_turned(m: Matches, j: int, R: Array) -> None:
     """Write the rotation (3, 3) that takes a match's direction and tangent to its ray and ray's tangent."""
     cam = (m.rays[j], m.ray_tangents[j], cross(m.rays[j], m.ray_tangents[j]))
     world = (m.directions[j], m.tangents[j], cross(m.directions[j], m.tangents[j]))
@@ -138,10 +143,18 @@ def write_turned(m, j, R):
 
 
 @inline_kernel
-def find_near(points, rays, R, t, cos2, is_near):
-    """Write which of the matches' points (3, M) a pose puts near their rays (3, M): most are not.
+def find_near(
+    points: NDArray[np.float32],
+    rays: NDArray[np.float32],
+    R: Array,
+    t: Array,
+    cos2: np.float32,
+    is_near: NDArray[np.bool_],
+) -> None:
+    """Write the mask (M,) of the matches whose points (3, M) a pose puts near their rays (3, M).
 
-    By the squared cosine, in float32: one a little smaller than is asked in float64.
+    This rules out most matches, in float32. The squared cosine `cos2` is a little below that of the exact
+    test, which follows in float64.
     """
     pose = pose_float32(R, t)
     for i in range(points.shape[1]):
@@ -151,9 +164,9 @@ def find_near(points, rays, R, t, cos2, is_near):
 
 
 @inline_kernel
-def agreeing_weight(m, is_near, R, t):
-    """Sum over the photo's features of the largest weight of a match that roughly agrees with a pose."""
-    total = 0.0
+def agreeing_weight(m: Matches, is_near: NDArray[np.bool_], R: Array, t: Array) -> Scalar:
+    """Sum, over the photo's features, the largest weight of a match that roughly agrees with a pose."""
+    total: Scalar = 0.0
     last = -1
     best = F0
     for i in range(len(m.query)):
@@ -169,10 +182,20 @@ def agreeing_weight(m, is_near, R, t):
 
 
 @kernel
-def rough_poses(matches, columns, voters, R_cam_from_level, is_upright, rotations, centers, votes):
-    """Write the pose (n, 3, 3), (n, 3) of each single match, and the weight (n,) of all that agree.
+def rough_poses(
+    matches: Matches,
+    columns: tuple[NDArray[np.float32], NDArray[np.float32]],
+    voters: NDArray[np.intp],
+    R_cam_from_level: Array,
+    is_upright: bool,
+    rotations: Array,
+    centers: Array,
+    votes: Array,
+) -> None:
+    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of all that agree.
 
-    `columns` are the matches' points and rays once more, (3, M) each.
+    `columns` are the matches' points and rays, transposed to (3, M). `is_upright`: the rotation is that of
+    `R_cam_from_level` (3, 3) but for the yaw.
     """
     m = matches
     is_near = np.empty(len(m.query), np.bool_)
@@ -190,10 +213,17 @@ def rough_poses(matches, columns, voters, R_cam_from_level, is_upright, rotation
 
 
 @inline_kernel
-def count_exact(m, members, columns, is_near, R, t):
-    """Count the features of the photo, of the matches `members`, that agree with a pose to a degree.
+def count_exact(
+    m: Matches,
+    members: NDArray[np.int64],
+    columns: NDArray[np.float32],
+    is_near: NDArray[np.bool_],
+    R: Array,
+    t: Array,
+) -> int:
+    """Count the photo's features of which a match among `members` (n,) agrees with a pose within a degree.
 
-    The members' points and rays are in columns (6, n), too.
+    `columns` (6, n) are the members' points and rays; `is_near` (n,) is overwritten.
     """
     count = 0
     last = -1
@@ -207,11 +237,19 @@ def count_exact(m, members, columns, is_near, R, t):
 
 
 @kernel
-def sample_poses(matches, members, columns, up_cam, cos_tilt, R_best, t_best):
-    """Write the pose, (3, 3) and (3,), of three members that most members agree with; returns how many do.
+def sample_poses(
+    matches: Matches,
+    members: NDArray[np.int64],
+    columns: NDArray[np.float32],
+    up_cam: Array,
+    cos_tilt: float,
+    R_best: Array,
+    t_best: Array,
+) -> int:
+    """Write the pose, (3, 3) and (3,), of three members that most members agree with; return their number.
 
-    The members' points and rays are in columns (6, n), too. Poses whose vertical is off `up_cam` (3,) by more
-    than the cosine says are left out. The samples are the same in every run.
+    `columns` (6, n) are the members' points and rays. Poses are left out if the cosine of the angle between
+    their vertical and `up_cam` (3,) is below `cos_tilt`. The samples are the same in every run.
     """
     best = 0
     bearings = np.empty((3, 3))
@@ -223,10 +261,10 @@ def sample_poses(matches, members, columns, up_cam, cos_tilt, R_best, t_best):
     for _ in range(NUM_SAMPLES):
         for i in range(3):
             state = np.uint32(state * np.uint32(1664525) + np.uint32(1013904223))
-            k = np.int64(state >> np.uint32(8)) % len(members)
+            drawn = np.int64(state >> np.uint32(8)) % len(members)
             for c in range(3):
-                points[i, c] = columns[c, k]
-                bearings[i, c] = columns[3 + c, k]
+                points[i, c] = columns[c, drawn]
+                bearings[i, c] = columns[3 + c, drawn]
         for k in range(p3p(bearings, points, rotations, centers)):
             R = rotations[k]
             if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] < cos_tilt:
@@ -240,10 +278,17 @@ def sample_poses(matches, members, columns, up_cam, cos_tilt, R_best, t_best):
 
 
 @kernel
-def list_members(matches, columns, R_cam_from_map, center_map, cos_rough, members):
-    """Write the indices of the matches that agree with a pose; returns how many.
+def list_members(
+    matches: Matches,
+    columns: tuple[NDArray[np.float32], NDArray[np.float32]],
+    R_cam_from_map: Array,
+    center_map: Array,
+    cos_rough: float,
+    members: NDArray[np.int64],
+) -> int:
+    """Write the indices of the matches that agree with a pose; return their number.
 
-    `columns` as of `rough_poses`; the cosine is of 20 degrees at most.
+    `columns` as in `rough_poses`; the angle whose cosine is `cos_rough` is 20 degrees at most.
     """
     count = 0
     is_near = np.empty(len(matches.query), np.bool_)
@@ -256,14 +301,15 @@ def list_members(matches, columns, R_cam_from_map, center_map, cos_rough, member
 
 
 def transpose_matches(matches: Matches) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The matches' points and rays once more, (3, M) each."""
+    """Return the matches' points and rays, transposed to (3, M) each."""
     return np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
 
 
 def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
-    """Indices of the matches that agree with a pose."""
+    """Return the indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
-    R, t = pose.R_cam_from_world, pose.center_world
+    R = pose.R_cam_from_world
+    t = pose.center_world
     return members[: list_members(matches, transpose_matches(matches), R, t, cos_rough, members)]
 
 
@@ -273,20 +319,22 @@ def count_matches(matches: Matches, pose: Pose) -> int:
 
 
 def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) -> MatchedPose | None:
-    """The pose that most matches near a rough one agree with, refined; None if they are too few."""
+    """Return the pose that most matches near a rough one agree with, refined; None if they are too few."""
     up_cam = np.array([0.0, 0.0, 1.0]) if R_cam_from_level is None else R_cam_from_level[:, 2].copy()
     cos_tilt = -2.0 if R_cam_from_level is None else COS_TILT
     members = find_inliers(matches, rough, COS_ROUGH)
     if len(members) < LEAST_MATCHES:
         return None
     pose = Pose(np.empty((3, 3)), np.empty(3))
-    R, t = pose.R_cam_from_world, pose.center_world
+    R = pose.R_cam_from_world
+    t = pose.center_world
     columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
     if sample_poses(matches, members, columns, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
         return None
     for _ in range(2):
         members = find_inliers(matches, pose, COS_EXACT)
-        rays, points = matches.rays[members].astype(np.float64), matches.points[members].astype(np.float64)
+        rays = matches.rays[members].astype(np.float64)
+        points = matches.points[members].astype(np.float64)
         descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
     return MatchedPose(pose, count_matches(matches, pose)) if R[:, 2] @ up_cam >= cos_tilt else None
 
@@ -294,10 +342,10 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
 def propose_poses(
     matches: Matches, R_cam_from_level: Array | None, count: int, workers: Workers
 ) -> list[MatchedPose]:
-    """At most `count` poses that most matches agree with, best first, in the map's frame.
+    """Return at most `count` poses that most matches agree with, best first, in the map's frame.
 
-    A pose with less than FAIR_PART of the best one's matches is none.
-    R_cam_from_level (3, 3) says how the camera was tilted, None if nobody knows.
+    Poses with less than FAIR_PART of the best one's matches are left out.
+    R_cam_from_level (3, 3) is the camera's tilt, None if it is unknown.
     """
     voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
     rotations = np.empty((len(voters), 3, 3))
@@ -308,8 +356,10 @@ def propose_poses(
     columns = transpose_matches(matches)
 
     def vote(lo: int) -> None:
-        some, *out = (values[lo : lo + BATCH] for values in (voters, rotations, centers, votes))
-        rough_poses(matches, columns, some, level, is_upright, *out)
+        part = slice(lo, lo + BATCH)
+        rough_poses(
+            matches, columns, voters[part], level, is_upright, rotations[part], centers[part], votes[part]
+        )
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")

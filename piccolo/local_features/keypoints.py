@@ -1,4 +1,4 @@
-"""Keypoints of a sphere: SIFT (Lowe, IJCV 2004) on overlapping perspective views, as rays and sizes."""
+"""Keypoints of a sphere, as rays and sizes: SIFT (Lowe, IJCV 2004) on overlapping perspective views."""
 
 import math
 from collections.abc import Sequence
@@ -30,15 +30,15 @@ class Keypoints(NamedTuple):
     rays: NDArray[np.float32]  # (N, 3) unit directions
     tangents: NDArray[np.float32]  # (N, 3) unit directions across the ray in which the keypoint points
     sizes: NDArray[np.float32]  # (N,) diameter [rad]
-    descriptors: NDArray[np.uint8]  # (N, 128) square roots of SIFT's shares (Arandjelovic, Zisserman 2012)
+    descriptors: NDArray[np.uint8]  # (N, 128) RootSIFT (Arandjelovic, Zisserman 2012), times 255
 
     def take(self, indices: NDArray[np.int64]) -> "Keypoints":
-        """The keypoints at `indices`."""
+        """Return the keypoints at `indices`."""
         taken: list[Any] = [values[indices] for values in self]
         return Keypoints(*taken)
 
     def mirror(self) -> "Keypoints":
-        """Those of the picture turned over, left for right: rays and descriptors alike."""
+        """Return the keypoints of the picture mirrored left for right: rays, tangents and descriptors."""
         left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
         histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
         return Keypoints(
@@ -60,7 +60,7 @@ class PerspectiveView(NamedTuple):
 
 @lru_cache(maxsize=4)
 def perspective_views(width: int) -> list[PerspectiveView]:
-    """Views of a sphere's picture of `width`, of its resolution in their middles."""
+    """Return the perspective views of a sphere's picture of `width`, with its resolution in their middles."""
     reach = math.tan(math.radians(FIELD_DEG / 2.0))
     side = round(2.0 * reach * width / (2.0 * math.pi))
     across = reach * (1.0 - (2.0 * np.arange(side) + 1.0) / side)
@@ -86,7 +86,7 @@ def find_keypoints(
     workers: Workers = ALONE,
     chosen: Sequence[int] = ALL_VIEWS,
 ) -> Keypoints:
-    """The keypoints of an equirectangular picture (H, W), W = 2 H, where it is valid, in the views chosen."""
+    """Find the keypoints of the valid part of an equirectangular picture (H, W), W = 2 H, in chosen views."""
     views = perspective_views(gray.shape[1])
     middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
     picture = _with_margin(gray)
@@ -109,12 +109,12 @@ def find_keypoints(
 
 
 def join_keypoints(parts: Sequence[Keypoints]) -> Keypoints:
-    """Keypoints of several views, one after the other."""
+    """Join the keypoints of several views, one after the other."""
     return Keypoints(*(np.concatenate(values) for values in zip(_nothing(), *parts, strict=True)))
 
 
 def _with_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """The picture with its other end beyond the seam, and its first and last rows repeated."""
+    """Pad a picture by MARGIN: columns wrap at the seam, the first and the last row are repeated."""
     return np.pad(np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap"), ((MARGIN, MARGIN), (0, 0)), "edge")
 
 
@@ -126,7 +126,7 @@ def _nothing() -> Keypoints:
 def _on_sphere(
     found: Sequence[cv2.KeyPoint], shares: NDArray[np.float32], view: PerspectiveView
 ) -> Keypoints:
-    """A view's keypoints as rays; descriptors (N, 128) of SIFT become square roots of their shares."""
+    """Convert a view's keypoints to rays, and their SIFT descriptors (N, 128) to RootSIFT."""
     side = len(view.rows)
     per_px = 2.0 * math.tan(math.radians(FIELD_DEG / 2.0)) / side
     points = np.array([(*k.pt, k.size, k.angle) for k in found])

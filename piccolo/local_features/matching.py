@@ -1,4 +1,4 @@
-"""Features of a photo and the features of the map that look alike."""
+"""Matches: a photo's features and the map's features with similar descriptors."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -13,10 +13,10 @@ from .feature_map import FeatureMap, project, squared_gap
 from .keypoints import Keypoints
 
 NUM_NEIGHBORS = 4  # features of the map that a feature of the photo is matched to, at most
-NUM_LISTS = 16  # that are looked through
+NUM_LISTS = 16  # that are searched
 APART = np.float32(0.3)  # [m] features of the map nearer to each other are one
 BATCH = 64  # features a thread takes at a time
-DISTINCT_RATIO = 0.8  # of squared distances, best by second best elsewhere (Lowe)
+DISTINCT_RATIO = 0.8  # of the best squared distance to the second best elsewhere (Lowe)
 LEAST_WEIGHT = 0.5
 FAR = np.int32(2147483647)
 
@@ -32,7 +32,7 @@ class Matches(NamedTuple):
     directions: NDArray[np.float32]  # (M, 3) from which the map knows it, camera to point
     tangents: NDArray[np.float32]  # (M, 3)
     sizes: NDArray[np.float32]  # (M,) diameter [m]
-    weights: NDArray[np.float32]  # (M,) how much it tells: 1 of a distinct one, else LEAST_WEIGHT
+    weights: NDArray[np.float32]  # (M,) 1 of a distinct one, else LEAST_WEIGHT
 
 
 _ROWS = np.empty((0, 3), np.float32)
@@ -41,10 +41,17 @@ NO_MATCHES = Matches(np.empty(0, np.int32), _ROWS, _ROWS, _NUMBERS, _ROWS, _ROWS
 
 
 @inline_kernel
-def place_taken(points, f, total, found, distances):
-    """Index of the feature kept (K,) that gives way to another: a worse one within APART, or the last.
+def place_taken(
+    points: NDArray[np.float32],
+    f: int,
+    total: np.int32,
+    found: NDArray[np.int32],
+    distances: NDArray[np.int32],
+) -> int:
+    """Return the index, among the features kept (K,), that feature `f` replaces; -1 if it replaces none.
 
-    -1 if one of the same place is no worse.
+    It competes with one within APART of it, and replaces that if it is nearer, `total` being its squared
+    distance. If there is no such feature it replaces the last.
     """
     for k in range(len(found)):
         if found[k] < 0:
@@ -56,8 +63,10 @@ def place_taken(points, f, total, found, distances):
 
 
 @inline_kernel
-def put_in_order(at, value, total, values, totals):
-    """Write a value in place of that `at`, moved forward before all (K,) with a larger total."""
+def put_in_order(
+    at: int, value: int, total: np.int32, values: NDArray[np.int32], totals: NDArray[np.int32]
+) -> None:
+    """Replace the value at `at` by another, moved forward past all (K,) with a larger total."""
     while at > 0 and totals[at - 1] > total:
         values[at] = values[at - 1]
         totals[at] = totals[at - 1]
@@ -67,11 +76,19 @@ def put_in_order(at, value, total, values, totals):
 
 
 @kernel
-def search_lists(descriptors, probes, map_descriptors, list_start, points, found, distances):
-    """Write the nearest features (N, K) of the map, of one place the nearest, and squared distances.
+def search_lists(
+    descriptors: NDArray[np.int8],
+    probes: NDArray[np.int32],
+    map_descriptors: NDArray[np.int8],
+    list_start: NDArray[np.int32],
+    points: NDArray[np.float32],
+    found: NDArray[np.int32],
+    distances: NDArray[np.int32],
+) -> None:
+    """Write the nearest features (N, K) of the map, of one place only the nearest, and squared distances.
 
-    `probes` (N, P) are the lists to look through; -1 and FAR where there is no other. A nearer feature takes
-    the place of the first kept one that is near it: of a few that stand in a row, two may stay.
+    `probes` (N, P) are the lists to search; -1 and FAR are written where there are fewer features. A nearer
+    feature replaces only the first kept one that is close to it: of several in a row, two may stay.
     """
     found[:] = -1
     distances[:] = FAR
@@ -87,8 +104,10 @@ def search_lists(descriptors, probes, map_descriptors, list_start, points, found
 
 
 @kernel
-def nearest_lists(descriptors, middles, probes):
-    """Write the indices (N, P) of the nearest middles of each descriptor, nearest first."""
+def nearest_lists(
+    descriptors: NDArray[np.int8], middles: NDArray[np.int8], probes: NDArray[np.int32]
+) -> None:
+    """Write the indices (N, P) of the middles nearest to each descriptor, nearest first."""
     best = np.empty(probes.shape[1], np.int32)
     for i in range(len(descriptors)):
         best[:] = FAR
@@ -99,7 +118,7 @@ def nearest_lists(descriptors, middles, probes):
 
 
 def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Matches:
-    """The matches of a photo's keypoints, the best few of each."""
+    """Match a photo's keypoints to the map's features, each to the best few."""
     m = feature_map
     descriptors = project(keypoints.descriptors, m.mean, m.components)
     found = np.empty((len(descriptors), NUM_NEIGHBORS + 1), np.int32)
@@ -107,9 +126,11 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
     probes = np.empty((len(descriptors), min(NUM_LISTS, len(m.middles))), np.int32)
 
     def run(lo: int) -> None:
-        some, *out = (values[lo : lo + BATCH] for values in (descriptors, probes, found, distances))
-        nearest_lists(some, m.middles, out[0])
-        search_lists(some, out[0], m.descriptors, m.list_start, m.points, *out[1:])
+        part = slice(lo, lo + BATCH)
+        own = descriptors[part]
+        lists = probes[part]
+        nearest_lists(own, m.middles, lists)
+        search_lists(own, lists, m.descriptors, m.list_start, m.points, found[part], distances[part])
 
     list(workers.map(run, range(0, len(descriptors), BATCH), "match"))
     query, rank = np.nonzero(found[:, :NUM_NEIGHBORS] >= 0)
@@ -130,7 +151,7 @@ def match(keypoints: Keypoints, feature_map: FeatureMap, workers: Workers) -> Ma
 
 
 def join_matches(parts: Sequence[Matches], counts: Sequence[int]) -> Matches:
-    """Matches of parts of a photo, of so many features each, which are numbered one part after the other."""
+    """Join the matches of a photo's parts; the features, `counts` of them, are numbered part after part."""
     first = np.repeat(np.cumsum([0, *counts])[:-1], [len(part.query) for part in parts])
     query, *others = (np.concatenate(values) for values in zip(NO_MATCHES, *parts, strict=True))
     return Matches(query + first.astype(np.int32), *others)

@@ -5,7 +5,7 @@ along it. With distances d and c_ij the cosine of two bearings, the triangle's s
     (1)  d_i^2 + d_j^2 - 2 c_ij d_i d_j = a_ij.
     (2)  M_0, M_1: the equations of the sides 01 and 02, each less a_ij times that of 12: conics d^T M d = 0
     (3)  det(M_m + x M_n) = 0: a degenerate conic of their pencil, which is two lines
-    (4)  where these meet the other conic are the distances, up to a factor that (1) tells.
+    (4)  the distances are where these meet the other conic, up to a factor that follows from (1).
 The lines are found by the adjugate, as in Ding et al., "Revisiting the P3P Problem", CVPR 2023.
 """
 
@@ -13,24 +13,27 @@ import math
 
 import numpy as np
 
-from ..geometry.vectors import cross, dot, minus, row
-from ..kernels.jit import inline_kernel, kernel
+from ..geometry.pose import Array
+from ..geometry.vectors import Triple, Vector, cross, dot, minus, row
+from ..kernels.jit import Scalar, inline_kernel, kernel
 
 LEAST_SINE2 = 1e-10  # of the angles of the triangle of points: below, they lie on a line
 LEAST_GAP = 5e-13  # 1 - cosine of two bearings: below a microradian they are the same
 ROUNDING = 1e-9  # by which the sides of a solution may miss, relative
 POLISHING = 4  # Newton steps on the distances
 
+Cofactors = tuple[float, float, float, float, float, float]  # of a symmetric matrix: 00, 01, 02, 11, 12, 22
+
 
 @inline_kernel
-def scale(factor, a):
-    """A vector times a number."""
+def scale(factor: Scalar, a: Vector) -> Triple:
+    """Multiply a vector by a number."""
     return factor * a[0], factor * a[1], factor * a[2]
 
 
 @inline_kernel
-def compute_axes(a, b):
-    """Three axes: along the vector a (3,), across it on b's side, and along the cross product."""
+def compute_axes(a: Vector, b: Vector) -> tuple[Triple, Triple, Triple]:
+    """Return three orthonormal axes: along a (3,), across it on the side of b (3,), and along a x b."""
     normal = cross(a, b)
     across = cross(normal, a)
     return (
@@ -41,8 +44,8 @@ def compute_axes(a, b):
 
 
 @inline_kernel
-def simple_cubic_root(b, c, d):
-    """A real root of x^3 + b x^2 + c x + d that is outside the extrema: Newton comes to it from outside."""
+def simple_cubic_root(b: float, c: float, d: float) -> float:
+    """Return a real root of x^3 + b x^2 + c x + d beyond the extrema: Newton reaches it from outside."""
     square = b * b - 3.0 * c
     x = -b / 3.0
     if square > 0.0:
@@ -64,8 +67,8 @@ def simple_cubic_root(b, c, d):
 
 
 @inline_kernel
-def adjugate(m):
-    """The six cofactors 00, 01, 02, 11, 12, 22 of a symmetric matrix (3, 3)."""
+def adjugate(m: Array) -> Cofactors:
+    """Return the six cofactors 00, 01, 02, 11, 12, 22 of a symmetric matrix (3, 3)."""
     return (
         m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2],
         m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2],
@@ -77,17 +80,18 @@ def adjugate(m):
 
 
 @inline_kernel
-def trace_product(a, m):
-    """The trace of a symmetric matrix of six entries times another, (3, 3)."""
+def trace_product(a: Cofactors, m: Array) -> float:
+    """Return the trace of a symmetric matrix of six entries times another, (3, 3)."""
     diagonal = a[0] * m[0, 0] + a[3] * m[1, 1] + a[5] * m[2, 2]
-    return diagonal + 2.0 * (a[1] * m[0, 1] + a[2] * m[0, 2] + a[4] * m[1, 2])
+    trace: float = diagonal + 2.0 * (a[1] * m[0, 1] + a[2] * m[0, 2] + a[4] * m[1, 2])
+    return trace
 
 
 @inline_kernel
-def degenerate_conic(conics):
-    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil (3); returns the other's index.
+def degenerate_conic(conics: Array) -> int:
+    """Turn one of two conics (2, 3, 3) into a degenerate one of their pencil (3); return the other's index.
 
-    A cubic of x, whose leading coefficient is det M_n.
+    x is a root of a cubic whose leading coefficient is det M_n.
     """
     first = adjugate(conics[0])
     second = adjugate(conics[1])
@@ -112,11 +116,11 @@ def degenerate_conic(conics):
 
 
 @inline_kernel
-def split_conic(conic, lines):
-    """Write the two lines (2, 3) that a degenerate conic (3, 3), which is changed, consists of.
+def split_conic(conic: Array, lines: Array) -> bool:
+    """Split a degenerate conic (3, 3), which is changed, into two lines (2, 3); False if they are complex.
 
     The conic is g h^T + h g^T, its adjugate -p p^T with p = g x h, and the conic plus [p]x is 2 h g^T
-    (Richter-Gebert, "Perspectives on Projective Geometry", 2011, section 11.1). False if they are complex.
+    (Richter-Gebert, "Perspectives on Projective Geometry", 2011, section 11.1).
     """
     a = adjugate(conic)
     p = (a[0], a[1], a[2])
@@ -143,12 +147,13 @@ def split_conic(conic, lines):
     for i in range(3):
         lines[0, i] = conic[place // 3, i]
         lines[1, i] = conic[i, place % 3]
-    return abs(conic[place // 3, place % 3]) > 0.0
+    largest: float = abs(conic[place // 3, place % 3])
+    return largest > 0.0
 
 
 @inline_kernel
-def meet(line, conic, ratios):
-    """Write where a line (3,) meets a conic (3, 3) (4), two homogeneous points (2, 3); returns how many."""
+def meet(line: Array, conic: Array, ratios: Array) -> int:
+    """Write the intersections (2, 3), homogeneous, of a line (3,) and a conic (3, 3); return their number."""
     k = 0
     for i in range(1, 3):
         if abs(line[i]) > abs(line[k]):
@@ -172,7 +177,7 @@ def meet(line, conic, ratios):
 
 
 @inline_kernel
-def polish_distances(ratios, cosines, sides2):
+def polish_distances(ratios: Array, cosines: Triple, sides2: tuple[Scalar, Scalar]) -> bool:
     """Scale distances (3,) known up to a factor, polish them by Newton on (1); False if they do not fit."""
     c01, c02, c12 = cosines
     a01, a02 = sides2
@@ -201,15 +206,15 @@ def polish_distances(ratios, cosines, sides2):
     ratios[0] = d0
     ratios[1] = d1
     ratios[2] = d2
-    is_fit = abs(e0) + abs(e1) + abs(e2) < ROUNDING * (1.0 + d0 * d0 + d1 * d1 + d2 * d2)
+    is_fit: bool = abs(e0) + abs(e1) + abs(e2) < ROUNDING * (1.0 + d0 * d0 + d1 * d1 + d2 * d2)
     return is_fit and d0 > 0.0 and d1 > 0.0 and d2 > 0.0
 
 
 @inline_kernel
-def order_corners(points):
-    """The corners with the longest side between the last two, and that side's squared length."""
+def order_corners(points: Array) -> tuple[int, int, int, Scalar]:
+    """Return the corners, those of the longest side last, and that side's squared length."""
     first = 0
-    longest2 = -1.0
+    longest2: Scalar = -1.0
     for i in range(3):
         side = minus(row(points, (i + 1) % 3), row(points, (i + 2) % 3))
         if dot(side, side) > longest2:
@@ -219,8 +224,8 @@ def order_corners(points):
 
 
 @inline_kernel
-def pencil(cosines, sides2, conics):
-    """Write the conics (2, 3, 3) on which the distances lie, by (2)."""
+def pencil(cosines: Triple, sides2: tuple[Scalar, Scalar], conics: Array) -> None:
+    """Write the conics (2, 3, 3) of equation (2), on which the distances lie."""
     conics[:] = 0.0
     for n in range(2):
         conics[n, 0, 0] = 1.0
@@ -232,8 +237,8 @@ def pencil(cosines, sides2, conics):
 
 
 @inline_kernel
-def solve_triangle(d01, d02, e01, e02, R):
-    """Write R_cam_from_map (3, 3) of a triangle's edges from its corner 0, in the camera and in the map."""
+def solve_triangle(d01: Vector, d02: Vector, e01: Vector, e02: Vector, R: Array) -> None:
+    """Write R_cam_from_map (3, 3) from a triangle's edges at its corner 0: d in the camera, e in the map."""
     cam = compute_axes(d01, d02)
     world = compute_axes(e01, e02)
     for i in range(3):
@@ -242,10 +247,10 @@ def solve_triangle(d01, d02, e01, e02, R):
 
 
 @kernel
-def p3p(bearings, points, rotations, centers):
-    """Write the poses that see three points, R_cam_from_map (4, 3, 3), centers (4, 3) [m]; returns how many.
+def p3p(bearings: Array, points: Array, rotations: Array, centers: Array) -> int:
+    """Write the poses that see three points, R_cam_from_map (4, 3, 3), centers (4, 3) [m]; return how many.
 
-    Bearings (3, 3) and points (3, 3) [m] are a row each. Points on a line and equal bearings have none.
+    Bearings (3, 3) and points (3, 3) [m] are in rows. Collinear points and equal bearings have no pose.
     """
     i0, i1, i2, longest2 = order_corners(points)
     b0 = bearings[i0]

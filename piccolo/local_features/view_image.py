@@ -1,4 +1,4 @@
-"""The scan as a grey picture from a position, to find keypoints in: surfaces closed, small gaps filled."""
+"""Grey pictures of the scan from a position, to find keypoints in: surfaces closed, small gaps filled."""
 
 import math
 from typing import Any, NamedTuple
@@ -13,13 +13,13 @@ from ..geometry.sphere import direction_to_pixel
 from ..kernels.jit import F0, F1, HALF, kernel
 from ..views.view import thread_scratch
 
-VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel by its distance
-REACH = np.float32(0.7)  # half width of what is drawn for a voxel, by the voxel's
+VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
+REACH = np.float32(0.7)  # half width of what is drawn for a voxel, divided by the voxel's width
 LEAST_REACH = np.float32(0.75)  # [px]
 MOST_REACH = np.float32(12.0)
 FRONT = np.float32(1.05)  # a pixel's grey is the mean up to this times its nearest range,
 FRONT_OFFSET = np.float32(0.05)  # [m] and this
-BEHIND = np.float32(1.2)  # by its range: a pixel all of whose surroundings are that much nearer is hidden
+BEHIND = np.float32(1.2)  # a pixel all of whose surroundings are nearer by this factor is hidden
 WIDER = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
 LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
@@ -36,8 +36,18 @@ class ViewImage(NamedTuple):
 
 
 @kernel
-def draw_voxels(tree, center, found, directions, ranges, sums):
-    """Write the nearest range (H, W) and weighted sums (H, W, 2) of grey and of weights near that range."""
+def draw_voxels(
+    tree: Octree,
+    center: Array,
+    found: NDArray[np.int32],
+    directions: NDArray[np.float32],
+    ranges: NDArray[np.float32],
+    sums: NDArray[np.float32],
+) -> None:
+    """Write the nearest range (H, W), and sums (H, W, 2) of weighted grey and of weights near that range.
+
+    `found` (N,) and `directions` (3, N) are scratch for `collect`.
+    """
     height, width = ranges.shape
     count = collect(tree, center, VOXEL_PER_RANGE, found, directions)
     ranges[:] = NOTHING
@@ -49,8 +59,8 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
             x = directions[0, k]
             y = directions[1, k]
             z = directions[2, k]
-            rho = math.sqrt(x * x + y * y)
-            r = math.sqrt(x * x + y * y + z * z)
+            rho: Any = math.sqrt(x * x + y * y)  # compiled, float32
+            r: Any = math.sqrt(x * x + y * y + z * z)
             node = tree.nodes[found[k]]
             size = np.float32(
                 tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - find_level(tree, found[k]))
@@ -60,8 +70,8 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
             across = min(reach * r / max(rho, np.float32(1e-3)), np.float32(0.25) * W)
             u, v = direction_to_pixel(x, y, z, rho, W)
             gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
-            top = max(np.int32(math.ceil(v - reach - HALF)), 0)
-            bottom = min(np.int32(math.floor(v + reach - HALF)), height - 1)
+            top: Any = max(np.int32(math.ceil(v - reach - HALF)), 0)
+            bottom: Any = min(np.int32(math.floor(v + reach - HALF)), height - 1)
             left = np.int32(math.ceil(u - across - HALF))
             right = np.int32(math.floor(u + across - HALF))
             for i in range(top, bottom + 1):
@@ -80,9 +90,10 @@ def draw_voxels(tree, center, found, directions, ranges, sums):
 
 
 def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask (H, W), by nearest ranges, NOTHING where there is none, of pixels no gap in what is nearer.
+    """Return the mask (H, W) of the pixels that are not seen through a gap in a nearer surface.
 
-    A pixel is seen through a gap if in all wider pixels around it there is something much nearer.
+    `ranges` (H, W) are the nearest, NOTHING where there is none. A pixel is seen through a gap if every wider
+    pixel around it shows something much nearer.
     """
     height, width = ranges.shape
     nearest = ranges.reshape(height // WIDER, WIDER, width // WIDER, WIDER).min(axis=(1, 3))
@@ -93,7 +104,7 @@ def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
 
 
 def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
-    """Grey (H, W) whose gaps take the colour around them, and where it means something.
+    """Fill the gaps of a weighted grey picture (H, W) from around them; return also the mask of known grey.
 
     Pull and push over a pyramid of means (Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 3.4.2).
     """
@@ -114,13 +125,13 @@ def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
 
 
 def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
-    """An image at another (width, height): means where that is smaller, else bilinear."""
+    """Resize an image to (width, height): by means if that is smaller, else bilinearly."""
     how = cv2.INTER_AREA if size[0] < image.shape[1] else cv2.INTER_LINEAR
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
 def render_gray(octree: Octree, center_map: Array, width: int) -> ViewImage:
-    """Draw the scan around a centre (3,) [m], `width` x width / 2 pixels."""
+    """Draw the scan seen from a centre (3,) [m] on `width` x width / 2 pixels."""
     scratch = thread_scratch()
     ranges = np.empty((width // 2, width), np.float32)
     sums = np.empty((width // 2, width, 2), np.float32)

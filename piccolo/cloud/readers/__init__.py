@@ -1,1 +1,1 @@
-"""Readers of point clouds, one file a format."""
+"""Readers of point clouds, a file for each format."""

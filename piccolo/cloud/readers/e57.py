@@ -58,21 +58,21 @@ class E57Scan:
     num_points: int
     coordinates: tuple[str, ...]  # CARTESIAN or SPHERICAL
     channels: tuple[str, ...]  # COLORS or INTENSITY alone
-    invalid: tuple[str, ...]  # fields that are 0 in points that count
+    invalid: tuple[str, ...]  # fields that are 0 in valid points
     color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
     pose: Pose | None  # the scanner is the camera
 
 
 class _UnusableError(Exception):
-    """A scan is whole, but not of use here."""
+    """A scan is intact, but can't be used."""
 
 
 def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return the coloured points of all scans of an E57 file.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
-    range is the scan's colorLimits, or else what the field's declaration says; it is never guessed. Scans
-    without colours beside others are left out, with a warning.
+    range is the scan's colorLimits, or else that of the field's declaration; it is never guessed. If only
+    some scans have colours, the others are left out, with a warning.
     """
     with open_file(path) as file:
         scans, left_out = _scans(file, COLORS)
@@ -94,7 +94,7 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:
-    """Return the scans that have the channels, and why others have not."""
+    """Return the scans that have the channels, and the reasons for leaving out others."""
     elements = children(file.root, "data3D")
     scans: list[E57Scan] = []
     left_out: list[str] = []
@@ -108,7 +108,7 @@ def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], lis
 
 
 def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> E57Scan:
-    """Return what is to be read of a scan; _UnusableError if nothing is."""
+    """Return the description of a scan; _UnusableError if it can't be used."""
     points = child(element, "points")
     prototype = child(points, "prototype")
     if points is None or prototype is None or points.get("type") != "CompressedVector":
@@ -136,7 +136,7 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
 
 
 def _num_bits(path: Path, field: Element) -> int:
-    """Return the length of a field in a record, at least."""
+    """Return the least number of bits that a field takes in a record."""
     type_ = field.get("type")
     if type_ == "Float":
         return 32 if field.get("precision") == "single" else 64
@@ -148,7 +148,7 @@ def _num_bits(path: Path, field: Element) -> int:
 
 
 def _color_range(path: Path, element: Element, field: Element) -> tuple[float, float]:
-    """Return the values of a channel that mean dark and full brightness."""
+    """Return the values of black and of full brightness of a channel."""
     name = field.tag.removeprefix(NAMESPACE)
     limits = child(element, "colorLimits")
     low, high = (read_number(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
@@ -164,7 +164,7 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
 
 
 def _read_colored(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
-    """Yield the points with channels scaled from the file's range to 0-255."""
+    """Yield the points with colours, scaled from the file's range to 0-255."""
     for scan, points_world, values in _read(path, scans):
         low, high = np.array(scan.color_ranges).T
         with np.errstate(over="ignore", invalid="ignore"):
@@ -178,7 +178,7 @@ def _read_colored(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
 
 
 def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Array]]:
-    """Yield the points that count (N, 3), in the world, of each scan, and its channels (N, C)."""
+    """Yield each scan with its valid points (N, 3), in the world, and their channels (N, C)."""
     with open_file(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
@@ -198,7 +198,7 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
-    """Yield the columns of a scan, a chunk at a time, in room that is used again."""
+    """Yield the columns of a scan, a chunk at a time, in arrays that the next chunk overwrites."""
     names = (*scan.coordinates, *scan.channels, *scan.invalid)
     columns = {name: np.empty(min(scan.num_points, CHUNK)) for name in names}
     buffers = file.libe57.VectorSourceDestBuffer()
@@ -237,13 +237,13 @@ class E57Image(NamedTuple):
 
 
 def list_images(path: Path) -> list[E57Image]:
-    """Return the images of an E57 file, in its order."""
+    """Return the images of an E57 file, in the order of the file."""
     with open_file(path) as file:
         return list(_images(file))
 
 
 def read_image(path: Path, index: int) -> bytes:
-    """Return the JPEG or PNG file that is the image of that index in list_images."""
+    """Return the JPEG or PNG file of the image at an index of `list_images`."""
     with open_file(path) as file:
         image = list(_images(file))[index]
         number, representation, blob = image.node
@@ -255,7 +255,7 @@ def read_image(path: Path, index: int) -> bytes:
 
 
 def _images(file: E57File) -> Iterator[E57Image]:
-    """Yield the representations of the elements of images2D that hold an image."""
+    """Yield the representations, of the elements of images2D, that contain an image."""
     elements = enumerate(children(file.root, "images2D"))
     for (number, element), (kind, representation_name) in product(elements, KINDS.items()):
         representation = child(element, representation_name)
@@ -289,7 +289,7 @@ def _side(path: Path, representation: Element, name: str) -> int:
 
 
 def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
-    """Return the angles [deg] that a spherical image covers, across and down, by its pixel size."""
+    """Return the angles [deg] of a spherical image across and down, from its pixel size; None without one."""
     width, height = (read_number(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
     if width is None or height is None:
         return None

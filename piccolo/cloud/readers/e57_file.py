@@ -1,7 +1,7 @@
-"""What E57 files have in common for their scans and their images: header, XML section, numbers, poses.
+"""Parts of E57 files that scans and images share: header, XML section, numbers, poses.
 
-The XML is read here, within limits, before libE57 sees the file: its parser would follow a document type
-definition or a schema to other files, and nest and count without end.
+The XML is read here, within limits, before libE57 opens the file: libE57's parser would follow a document
+type definition or a schema to other files, and has no limit on depth and number of elements.
 """
 
 import math
@@ -48,7 +48,7 @@ class E57File(NamedTuple):
 
 @contextmanager
 def open_file(path: Path) -> Iterator[E57File]:
-    """Yield an E57 file whose header and XML were checked, open to be read."""
+    """Check the header and XML of an E57 file, and yield it open for reading."""
     root = read_xml(path)
     libe57 = import_optional(path, "pye57.libe57")
     with refusing(path, libe57):
@@ -61,7 +61,7 @@ def open_file(path: Path) -> Iterator[E57File]:
 
 @contextmanager
 def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
-    """Turn what libE57 says of a broken file into an InputError."""
+    """Turn libE57's errors on a broken file into an InputError."""
     try:
         yield
     except (libe57.E57Exception, RuntimeError, UnicodeDecodeError) as error:  # the last in its own message
@@ -92,7 +92,7 @@ def read_xml(path: Path) -> Element:
 
 
 class _Limited(TreeBuilder):
-    """A tree of elements that grows within limits and takes in nothing from elsewhere."""
+    """A builder of a tree of elements within limits, which refuses references to other files."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -135,32 +135,32 @@ def _parse_xml(path: Path, xml: bytes) -> Element:
 
 
 def child(element: Element | None, name: str) -> Element | None:
-    """Return the child of that name in E57's namespace, if there is one."""
+    """Return the child of a name in E57's namespace; None if there is none."""
     return None if element is None else element.find(NAMESPACE + name)
 
 
 def children(element: Element, name: str) -> list[Element]:
-    """Return the children of the child of that name."""
+    """Return the children of the child of a name; empty if there is none."""
     found = child(element, name)
     return [] if found is None else list(found)
 
 
 def text_of(element: Element | None, name: str) -> str:
-    """Return the text of a child, empty if there is none."""
+    """Return the text of a child; empty if there is none."""
     found = child(element, name)
     return "" if found is None else (found.text or "").strip()
 
 
 def read_number(path: Path, element: Element | None) -> float | None:
-    """Return the value of a number's element, None without one.
+    """Return the value of a number's element, 0 if it is empty, scaled if it is a scaled integer.
 
-    An empty one is 0, a scaled integer is scaled.
+    None without an element.
     """
     return None if element is None else read_scaled(path, element, (element.text or "").strip() or "0")
 
 
 def read_scaled(path: Path, element: Element, text: str) -> float:
-    """Return the number that a text means in an element, which may be a scaled integer's."""
+    """Return the number of a text in an element, scaled if that is a scaled integer's."""
     value = parse_number(path, text)
     if element.get("type") != "ScaledInteger":
         return value
@@ -169,7 +169,7 @@ def read_scaled(path: Path, element: Element, text: str) -> float:
 
 
 def parse_number(path: Path, text: str) -> float:
-    """Return a finite number; InputError if the text is none."""
+    """Parse a finite number; InputError if the text is none."""
     try:
         value = float(text)
     except ValueError:
@@ -182,17 +182,14 @@ def parse_number(path: Path, text: str) -> float:
 
 
 def parse_integer(path: Path, text: str) -> int:
-    """Return an integer of 64 bits or little more; InputError if the text is none."""
+    """Parse an integer of 64 bits or little more; InputError if the text is none."""
     if not INTEGER.fullmatch(text):
         raise InputError(f"{path}: found {quote_line(text.encode())} in the XML section, wanted an integer")
     return int(text)
 
 
 def pose_of(path: Path, element: Element) -> Pose | None:
-    """Return the pose of a scan or an image.
-
-    None if it has none. A part that is missing is the identity's.
-    """
+    """Return the pose of a scan or an image; None if it has none. Missing parts are the identity's."""
     pose = child(element, "pose")
     if pose is None:
         return None

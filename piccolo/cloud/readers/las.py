@@ -86,7 +86,7 @@ class LasHeader(NamedTuple):
 
     @property
     def dtype(self) -> np.dtype[np.void]:
-        """The fields that are wanted of a record."""
+        """The fields that are read of a record."""
         fields = {"xyz": ("3<i4", 0), "intensity": ("<u2", INTENSITY_BYTE), "flags": ("u1", FLAGS_BYTE)}
         fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
         if self.has_colors:
@@ -98,7 +98,7 @@ class LasHeader(NamedTuple):
 
     @property
     def has_colors(self) -> bool:
-        """True if the records have fields for colours, whatever is in them."""
+        """True if the records have fields for colours, even if these are empty."""
         return self.point_format in COLORS_BYTE
 
 
@@ -149,7 +149,7 @@ class LasLayout(NamedTuple):
 
 
 def read_laz_layout(header: LasHeader) -> LasLayout:
-    """Return the compression of a LAZ file; InputError if its parts don't fit together or in the file."""
+    """Return the layout of a LAZ file; InputError if its parts don't fit together or into the file."""
     lazrs = import_optional(header.path, "lazrs")
     with header.path.open("rb") as file:
         laszip = record_content(header, file, LASZIP_USER, LASZIP_RECORD_ID)
@@ -168,7 +168,7 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
 
 
 def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
-    """Return the content of the variable-length record of this user and id; None if there is none."""
+    """Return the content of the variable-length record with a user and id; None if there is none."""
     position = header.header_size
     for _ in range(min(header.num_vlrs, MAX_VLRS)):
         if position + VLR_HEADER.size > header.points_offset:
@@ -182,7 +182,7 @@ def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted
 
 
 def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
-    """Return number of layers of a chunk, if the record is one that lazrs would write for these points."""
+    """Return the number of layers of a chunk; InputError if the record is not one that lazrs would write."""
     num_extra = header.record_size - RECORD_SIZES[header.point_format]
     expected = lazrs.LazVlr.new_for_compression(header.point_format, num_extra, False).record_data()
     if _without_versions(laszip[: len(expected)]) != _without_versions(expected):
@@ -197,9 +197,9 @@ def _without_versions(laszip: bytes) -> list[bytes]:
 
 
 def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
-    """Return the start and bytes of the compressed chunk table, if the file has room for what it promises.
+    """Return the start and bytes of the compressed chunk table; InputError if it can't fit into the file.
 
-    A writer that could not go back says in the file's last bytes where it begins.
+    A writer that can't seek back writes its start into the file's last bytes.
     """
     for position in (header.points_offset, header.size - 8):
         file.seek(position)
@@ -221,7 +221,7 @@ def _table(header: LasHeader, file: BinaryIO) -> tuple[int, bytes]:
 
 
 def _check_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) -> tuple[LazChunk, ...]:
-    """Return the chunks that hold the promised points, the last no more than is left."""
+    """Return the chunks of the promised points, the last cut to the points that are left."""
     chunks: list[LazChunk] = []
     num_left = header.num_points
     most = MAX_CHUNK_SIZE // header.record_size
@@ -244,7 +244,7 @@ def _check_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) ->
 def decompress(
     header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]
 ) -> NDArray[np.uint8]:
-    """Return the records, one after the other, of the `chunks` whose compressed bytes are `data`."""
+    """Decompress the bytes `data` of `chunks`; return their records, one after the other."""
     lazrs = import_optional(header.path, "lazrs")
     if layout.num_layers:
         _check_layers(header, layout.num_layers, data, chunks)
@@ -257,9 +257,9 @@ def decompress(
 
 
 def _check_layers(header: LasHeader, num_layers: int, data: bytes, chunks: Sequence[LazChunk]) -> None:
-    """Refuse layers larger than the chunk they lie in, and another number of points than was promised.
+    """Refuse layers larger than their chunk, and another number of points than was promised.
 
-    A chunk is a whole point, the number of points, the bytes of each layer, the layers.
+    A chunk consists of a whole point, the number of points, the bytes of each layer, the layers.
     """
     begin = 0
     head_size = header.record_size + 4 * (1 + num_layers)
@@ -276,7 +276,7 @@ def _check_layers(header: LasHeader, num_layers: int, data: bytes, chunks: Seque
 
 @contextmanager
 def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
-    """Turn what lazrs says of broken data into an InputError."""
+    """Turn lazrs' errors on broken data into an InputError."""
     try:
         yield
     except BaseException as error:  # a panic in Rust: no Exception, and of a class that can't be imported
@@ -289,9 +289,9 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
 def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return the points of a LAS or LAZ file; withheld ones are left out.
 
-    Colours are 16-bit, as the format says. They are taken for 8-bit if none of a million points, spread
-    evenly over the file, exceeds 255; the source's warnings then say so, and a larger value met later is
-    refused. If all of those points are black, the file has no colours, as in point formats without them.
+    Colours are 16-bit, as the format says. They are read as 8-bit if none of a million points, spread evenly
+    over the file, exceeds 255; the source then has a warning, and a larger value met later is refused. If all
+    of these points are black, the file counts as one without colours.
     """
     header = read_header(path)
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
@@ -328,7 +328,7 @@ def _gray_source(
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:
-    """Return records that are not compressed, in chunks of which NUM_SAMPLE_RUNS are a sample."""
+    """Return the layout of records that are not compressed, in chunks small enough to be sampled."""
     most = max(1, min(CHUNK, MAX_SAMPLES // NUM_SAMPLE_RUNS, MAX_CHUNK_SIZE // header.record_size))
     counts = [most] * (header.num_points // most) + [header.num_points % most]
     chunks = tuple((count, count * header.record_size) for count in counts if count)
@@ -336,7 +336,7 @@ def _plain_layout(header: LasHeader) -> LasLayout:
 
 
 def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> Iterator[Records]:
-    """Yield all records, CHUNK or fewer at once; as a sample about MAX_SAMPLES, evenly over the file."""
+    """Yield all records, CHUNK or fewer at once; for a sample about MAX_SAMPLES, spread over the file."""
     counts, sizes = np.array(layout.chunks, dtype=np.int64).T
     offsets = layout.offset + np.cumsum(sizes) - sizes
     if is_sample and header.num_points > MAX_SAMPLES:
@@ -363,7 +363,7 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
 
 
 def _largest(header: LasHeader, layout: LasLayout, name: str) -> tuple[int, int]:
-    """Return the largest `rgb` or `intensity` in a sample of the points, and the number of those."""
+    """Return the largest `rgb` or `intensity` in a sample of the points, and the size of the sample."""
     found = [(int(records[name].max()), len(records)) for records in _chunks(header, layout, is_sample=True)]
     return max(largest for largest, _ in found), sum(count for _, count in found)
 
@@ -376,7 +376,7 @@ def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[Po
 
 
 def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], Records]:
-    """Positions (N, 3) of the records that are not withheld, and these."""
+    """Return the positions (N, 3) of the records that are not withheld, and these records."""
     withheld = WITHHELD_OLD if header.point_format < 6 else WITHHELD
     is_withheld = (records["flags"] & withheld) != 0
     if is_withheld.any():

@@ -1,12 +1,12 @@
 """Textured and coloured meshes as point clouds: OBJ, glTF, GLB, and PLY files with faces.
 
-Coordinates are taken as they stand in the file, after its own scene graph: a glTF file's y stays y, in its
-unit. trimesh reads the files; what it would pass over in silence is checked before and after.
+Coordinates are those of the file, after its own scene graph: a glTF file's y stays y, in its unit. trimesh
+reads the files; faults that it would ignore silently are checked before and after.
 
-Point k of N stands at the fraction (k + 1/2) / N of the area, triangles laid one after the other, so that
-every triangle gets its part of the points within one. Its place in the triangle is the k-th point of the R2
-sequence (Roberts, 2018), which leaves no clumps and no gaps. All depends on k alone: not on chunks, not on
-chance.
+Point k of N lies at the fraction (k + 1/2) / N of the cumulative area of the triangles, so that the number of
+points in a triangle is proportional to its area within one. Its position in the triangle is the k-th point of
+the R2 sequence (Roberts, 2018), which leaves no clumps and no gaps. All depends on k alone: neither on chunks
+nor on chance.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,7 +33,7 @@ MAX_TRIANGLES = 200_000_000  # those of a mesh count again at each place where t
 
 
 class Surface(NamedTuple):
-    """Triangles of one material, in a frame of their own."""
+    """Triangles of one material, in their own frame."""
 
     vertices: Array  # (V, 3), NaN: the triangle is left out
     triangles: NDArray[np.int64]  # (T, 3) rows of vertices
@@ -45,13 +45,13 @@ class Surface(NamedTuple):
 
 
 class SurfaceInstance(NamedTuple):
-    """A surface where a node places it in the world."""
+    """A surface and the transform with which a node places it in the world."""
 
     surface: Surface
     T_world_from_surface: Array  # (4, 4)
 
     def areas(self) -> Array:
-        """Areas (T,) of the triangles; 0 for those that aren't finite."""
+        """Return the areas (T,) of the triangles; 0 for those that aren't finite."""
         surface = self.surface
         areas = np.empty(len(surface.triangles))
         with np.errstate(all="ignore"):
@@ -66,7 +66,7 @@ class SurfaceInstance(NamedTuple):
 
 
 def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points: int) -> Iterator[RawCloud]:
-    """Yield points of one surface after the other, at most CHUNK at once; `ends` (P,) are sums of areas."""
+    """Yield the points of each surface, at most CHUNK at once; `ends` (P,) are cumulative areas."""
     area_per_point = float(ends[-1]) / num_points
     # the first point at or behind each instance's end
     behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
@@ -95,7 +95,7 @@ def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points:
 
 
 def compute_weights(k: NDArray[np.int64]) -> Array:
-    """Barycentric coordinates (N, 3) of the points k: the R2 sequence, its square folded to a triangle."""
+    """Return barycentric coordinates (N, 3) of points k: the R2 sequence, its square folded to a triangle."""
     a, b = (np.modf(0.5 + k * step)[0] for step in R2_STEPS)
     is_beyond = a + b > 1.0
     a[is_beyond], b[is_beyond] = 1.0 - a[is_beyond], 1.0 - b[is_beyond]
@@ -105,7 +105,7 @@ def compute_weights(k: NDArray[np.int64]) -> Array:
 def _points(
     instance: SurfaceInstance, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
 ) -> RawCloud:
-    """Return the points k in the triangles `rows`; those on texels of alpha 0 are left out."""
+    """Return the points k in the triangles `rows`, without those on texels of alpha 0."""
     surface = instance.surface
     weights = compute_weights(k)
     matrix = instance.T_world_from_surface
@@ -127,13 +127,13 @@ def _points(
 
 
 def _blend(values: Array, corners: NDArray[np.int64], weights: Array) -> Array:
-    """Values (N, D) between those at the corners (N, 3)."""
+    """Interpolate values (V, D) between corners (N, 3), rows of them, by barycentric weights (N, 3)."""
     a, b, c = (values[corners[:, i]] * weights[:, i : i + 1] for i in range(3))
     return np.asarray(a + b + c)
 
 
 def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
-    """Return texels (N, 4) under uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
+    """Return texels (N, 4) at uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
     height, width = texels.shape[:2]
     turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
     turned -= np.floor(turned)
@@ -143,13 +143,13 @@ def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
 
 
 def srgb_to_linear(colors: NDArray[np.uint8]) -> Array:
-    """Linear light in [0, 1] of sRGB bytes (IEC 61966-2-1)."""
+    """Convert sRGB bytes to linear light in [0, 1] (IEC 61966-2-1)."""
     levels = np.arange(256) / 255.0
     return np.asarray(np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)[colors])
 
 
 def linear_to_srgb(linear: Array) -> Array:
-    """Values of sRGB in [0, 1] of linear light in [0, 1]."""
+    """Convert linear light in [0, 1] to sRGB in [0, 1]."""
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
@@ -158,12 +158,12 @@ def _bytes(colors: Array) -> NDArray[np.uint8]:
 
 
 def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """Return the points on the triangles of an OBJ, GLB or glTF file, 10,000 on a square metre.
+    """Return points on the triangles of an OBJ, GLB or glTF file, 10,000 per square metre.
 
-    The options' scale tells what a metre is in the file. A file that would give more than 30 million is
-    sampled at a lower density, with a warning. Colours: from the texture, whose texels of alpha 0 leave their
-    points out; else from the vertices, the faces, the material. In glTF they are multiplied in linear light:
-    texture, base colour's factor, vertex colours. Textures repeat beyond their edges. Surfaces without
+    The options' scale is the file's unit in metres. A file that would give more than 30 million points is
+    sampled at a lower density, with a warning. Colours are those of the texture (points on texels of alpha 0
+    are left out), or else of the vertices, the faces, the material. In glTF they are multiplied in linear
+    light: texture, base colour's factor, vertex colours. Textures repeat beyond their edges. Surfaces without
     colours are left out, with a warning.
     """
     content = path.read_bytes()
@@ -172,10 +172,7 @@ def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """Return the points on the faces of a PLY file, as by open_mesh.
-
-    With a texture if a comment names one.
-    """
+    """Return points on the faces of a PLY file, like `open_mesh`; textured if a comment names a texture."""
     return _source(load_ply(path), options.scale)
 
 
@@ -210,7 +207,7 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
 
 
 def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
-    """Return the coloured surfaces where the scene puts them, and what the user should know."""
+    """Return the coloured surfaces with the scene's transforms, and warnings for the user."""
     scene = loaded.scene
     path = loaded.path
     meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
@@ -246,7 +243,7 @@ def _is_one_color(surfaces: list[Surface]) -> bool:
 
 
 def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
-    """Return the triangles of a mesh with its colours; None if it has none."""
+    """Return the triangles of a mesh with its colours; None if it has no triangles."""
     vertices = np.array(mesh.vertices, dtype=np.float64)
     triangles = np.array(mesh.faces, dtype=np.int64)
     if not len(triangles):
@@ -272,7 +269,7 @@ def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
 
 
 def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
-    """Texture coordinates (V, 2); vertices without finite ones become NaN."""
+    """Return the texture coordinates (V, 2); vertices without finite ones become NaN."""
     uv: Array = np.array(raw, dtype=np.float64)
     if uv.shape != (len(vertices), 2):
         raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
@@ -309,7 +306,7 @@ def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray
 def _colors(
     path: Path, mesh: Any, triangles: NDArray[np.int64]
 ) -> tuple[Array, NDArray[np.int64]] | tuple[None, None]:
-    """Colours (C, 3) of vertices, faces or the material, and the corners' (T, 3) rows in them."""
+    """Return the colours (C, 3) of vertices, faces or the material, and the rows (T, 3) of the corners."""
     of_vertices = mesh.vertex_attributes.get("color")
     if of_vertices is not None:
         return _fractions(path, of_vertices, len(mesh.vertices)), triangles
@@ -325,7 +322,7 @@ def _colors(
 
 
 def _fractions(path: Path, raw: Any, count: int) -> Array:
-    """Colours (N, 3) in [0, 1] of a range that follows from their type."""
+    """Return colours (N, 3) in [0, 1]; their range in the file follows from their type."""
     colors = np.array(raw)
     if colors.ndim != 2 or len(colors) != count or colors.shape[1] < 3:
         raise InputError(f"{path}: colours of shape {colors.shape}, wanted {count} rows of red green blue")

@@ -1,8 +1,8 @@
-"""The files that a mesh names: materials, buffers, textures held to a size; and glTF before it is read.
+"""Files that a mesh names: materials, buffers, textures of limited size; and glTF before trimesh reads it.
 
-trimesh raises an error where data of glTF are cut off. But it takes zeros for compressed or sparse data,
-passes over what it doesn't know, and follows nodes and copies shared data without a limit: that is checked
-here, and its JSON left without what is not read.
+trimesh raises an error where data of glTF are cut off. But it reads compressed or sparse data as zeros,
+ignores what it doesn't know, and follows nodes and copies shared data without a limit: these are checked
+here, and unread parts are removed from the JSON.
 """
 
 import json
@@ -49,19 +49,19 @@ Json = dict[str, Any]
 
 
 class Texture(NamedTuple):
-    """An image as it stands in its file: textures are decoded one at a time."""
+    """An image, still encoded: textures are decoded one at a time."""
 
     path: Path  # of the mesh
     content: bytes
 
     def texels(self) -> NDArray[np.uint8]:
-        """Texels (H, W, 4) RGBA, the first row at the top."""
+        """Decode the texels (H, W, 4) RGBA, the first row at the top."""
         with _image(self.path, "", self.content) as image:
             return np.asarray(image.convert("RGBA"))
 
 
 def read_texture(path: Path, image: Any) -> Texture | None:
-    """Return the texture in an image that trimesh opened; None if it only stands for a missing one."""
+    """Return the texture in an image that trimesh opened; None for its placeholder of a missing image."""
     file = getattr(image, "fp", None)
     if file is None:
         return None
@@ -82,17 +82,14 @@ def own_limit() -> Iterator[None]:
 
 
 def check_image(path: Path, name: str, content: bytes) -> None:
-    """Refuse what is no image, before trimesh passes over it."""
+    """Refuse what is no image, which trimesh would ignore."""
     with _image(path, f" {name}", content):
         pass
 
 
 @contextmanager
 def _image(path: Path, name: str, content: bytes) -> Iterator[Image.Image]:
-    """Yield an image of a size that is allowed.
-
-    InputError if it can't be opened, or decoded by who uses it.
-    """
+    """Yield an image of an allowed size; InputError if it can't be opened, or decoded by the caller."""
     with own_limit():
         try:
             with Image.open(BytesIO(content), formats=FORMATS) as image:
@@ -113,7 +110,7 @@ def _check(path: Path, image: Any) -> None:
 
 
 def first_line(error: BaseException) -> str:
-    """Return the kind of an error and the beginning of what it says."""
+    """Return the type of an error and the beginning of its message."""
     text = (str(error).splitlines() or [""])[0]
     return f"{type(error).__name__}: {text[:100]!a}" if text else type(error).__name__
 
@@ -122,7 +119,7 @@ def first_line(error: BaseException) -> str:
 class FolderResolver:
     """The files in a mesh's own folder and below, and nothing else; a resolver for trimesh.
 
-    trimesh goes on without a file that it can't get, so the first refusal is kept for later.
+    trimesh continues without a file that it can't get, so the first refusal is kept for later.
     """
 
     path: Path  # the mesh
@@ -168,9 +165,9 @@ NO_MATERIAL = Material()  # of primitives without one, the first of all
 
 
 def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list[Material]]:
-    """Return a checked glTF or GLB file with triangles, base colours and nodes only.
+    """Return a checked glTF or GLB file with triangles, base colours and nodes only, and its materials.
 
-    Materials, by rows as named.
+    In the file the materials are named by their index in the list.
     """
     path = resolver.path
     is_glb = content.startswith(GLB_MAGIC)
@@ -196,7 +193,7 @@ def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list
 
 
 def _glb_parts(path: Path, content: bytes) -> tuple[bytes, bytes, bytes]:
-    """Head of a GLB file, its JSON, and the parts behind."""
+    """Return the head of a GLB file, its JSON, and the chunks after it."""
     version, size, json_size, kind = struct.unpack_from("<III4s", content.ljust(20, b"\0"), 4)
     if size > len(content) or 20 + json_size > size:
         raise InputError(f"{path}: {len(content)} bytes of {max(size, 20 + json_size)}, {WANTED}")
@@ -215,7 +212,7 @@ def _check_version(path: Path, tree: Json) -> None:
 
 
 def _num_bytes_of_files(tree: Json, resolver: FolderResolver) -> int:
-    """Size of the buffers that are files of their own; their names are decoded, which trimesh leaves out."""
+    """Return the size of the buffers in their own files; decode the files' names, which trimesh does not."""
     for kind in ("buffers", "images"):
         for entry in tree.get(kind, []):
             if entry.get("uri", "data:").startswith("data:"):
@@ -228,7 +225,7 @@ def _num_bytes_of_files(tree: Json, resolver: FolderResolver) -> int:
 
 
 def _check_data(path: Path, tree: Json, num_bytes: int) -> None:
-    """Refuse data that trimesh would take for zeros, count from the end or copy without a limit."""
+    """Refuse data that trimesh would read as zeros, index from the end or copy without a limit."""
     for kind, names in COUNTS.items():
         for entry in tree.get(kind, []):
             for name in entry.keys() & names:
@@ -278,7 +275,7 @@ def _material(path: Path, material: Json) -> Material:
 
 
 def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
-    """Leave the images of base colours only; materials take their rows as names."""
+    """Remove all images but those of base colours; name materials by their index."""
     shown = [tree["textures"][_count(m.texture["index"])] for m in materials if m.texture is not None]
     used = {_count(t.get("extensions", {}).get("EXT_texture_webp", t)["source"]) for t in shown}
     tree["images"] = [image if i in used else {} for i, image in enumerate(tree.get("images", []))]
@@ -289,7 +286,7 @@ def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
 
 
 def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes: int) -> None:
-    """Leave primitives of triangles only; refuse data that too many of them share."""
+    """Remove all primitives but those of triangles; refuse data that too many of them share."""
     accessors = tree.get("accessors", [])
     num_rows = 0
     for mesh in tree.get("meshes", []):
@@ -304,7 +301,7 @@ def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes
 
 
 def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:
-    """Return a primitive with its positions, colours and the base colour's uv."""
+    """Return a primitive with only its positions, colours and the base colour's uv."""
     if primitive.get("mode") == FAN:
         raise InputError(f"{path}: has triangle fans, wanted triangles")
     row = _count(primitive["material"]) + 1 if "material" in primitive else 0
@@ -325,7 +322,7 @@ def _primitive(path: Path, accessors: list[Json], materials: list[Material], pri
 
 
 def _count(value: object) -> int:
-    """Return a number from JSON that must be whole and not negative."""
+    """Check that a number from JSON is whole and not negative, and return it; else ValueError."""
     if not isinstance(value, int) or value < 0:
         raise ValueError(f"{str(value)[:40]} where a count or an index is wanted")
     return value

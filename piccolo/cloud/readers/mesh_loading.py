@@ -1,4 +1,4 @@
-"""Meshes read by trimesh, and what it passes over in silence checked before and after."""
+"""Meshes read by trimesh, with checks, before and after, of faults that it ignores silently."""
 
 import logging
 import re
@@ -46,7 +46,7 @@ warnings.filterwarnings("error", "string or file could not be read", Deprecation
 
 @dataclass(frozen=True)
 class Loaded:
-    """What trimesh made of a file."""
+    """A file as trimesh loaded it."""
 
     path: Path
     scene: Any  # trimesh.Scene
@@ -54,14 +54,14 @@ class Loaded:
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
 
     def texture(self, image: Any) -> Texture | None:
-        """Return the texture in an image, the same one for all surfaces that share it."""
+        """Return the texture in an image, one object for all surfaces that share it."""
         if id(image) not in self.textures:
             self.textures[id(image)] = read_texture(self.path, image)
         return self.textures[id(image)]
 
 
 def load_gltf(path: Path, content: bytes) -> Loaded:
-    """Return a glTF or GLB file."""
+    """Load a glTF or GLB file."""
     resolver = FolderResolver(path)
     sanitized, materials = sanitize_gltf(content, resolver)
     kind = "glb" if content.startswith(GLB_MAGIC) else "gltf"
@@ -69,7 +69,7 @@ def load_gltf(path: Path, content: bytes) -> Loaded:
 
 
 def load_obj(path: Path, content: bytes) -> Loaded:
-    """Return an OBJ file with its materials."""
+    """Load an OBJ file with its materials."""
     try:
         content.decode()
     except UnicodeDecodeError:
@@ -96,7 +96,7 @@ def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
-    """Return a mesh as trimesh loads it, without guessing its colours' range or cutting any off."""
+    """Make trimesh load colours as they are, without guessing their range or clipping them."""
     for mesh in (parsed, *parsed.get("geometry", {}).values()):
         if "faces" in mesh:
             mesh["process"] = False
@@ -128,7 +128,7 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
 
 
 def load_ply(path: Path) -> Loaded:
-    """Return a PLY file with faces."""
+    """Load a PLY file with faces."""
     content = path.read_bytes()
     resolver = FolderResolver(path)
     header = content.partition(b"end_header")[0].decode("utf-8", "replace")

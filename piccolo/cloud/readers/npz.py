@@ -1,7 +1,7 @@
 """NumPy files: .npy with one array of points and colours, .npz with one of each.
 
 Nothing is unpickled. A .npy file is read in chunks; an .npz file, and an array in Fortran order (column after
-column), is read whole, after the size that it promises has been compared with the file's.
+column), is read whole, after the size in its header has been compared with the file's.
 """
 
 import errno
@@ -93,7 +93,7 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
-    """Return the points of chunks of positions and colours, as many as there are `rows`."""
+    """Return the source of the points in chunks of positions and colours; their number is that of `rows`."""
     locate = partial(point_label, path)
     return PointSource(path, lambda: color_chunks(read_parts(), brightest, locate), rows.shape[0])
 
@@ -106,7 +106,7 @@ def has_npz_magic(head: bytes) -> bool:
 
 @contextmanager
 def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
-    """Turn what zipfile, zlib and NumPy's header parser raise on damaged files, 14 types, into one line."""
+    """Turn the errors of zipfile, zlib and NumPy's header parser on damaged files into an InputError."""
     try:
         yield
     except (InputError, MemoryError):
@@ -118,7 +118,7 @@ def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
 
 
 def _open(path: Path, member: str | None) -> IO[bytes]:
-    """Return a .npy file, or the member of that name of an archive."""
+    """Open a .npy file, or a member of an archive."""
     if member is None:
         return path.open("rb")
     with zipfile.ZipFile(path) as archive:

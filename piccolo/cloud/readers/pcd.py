@@ -1,7 +1,7 @@
 """PCD files of the Point Cloud Library, 0.5 to 0.7: ascii, binary and binary_compressed.
 
-VIEWPOINT is where the sensor was; the points are already in the cloud's frame, so it is not applied. The
-compression is LZF: runs of bytes as they are, and copies of what came before.
+VIEWPOINT is the sensor's pose; the points are already in the cloud's frame, so it is not applied. The
+compression is LZF: literal runs of bytes, and copies of earlier ones.
 """
 
 import re
@@ -57,7 +57,7 @@ TYPES = {  # of fields that are not colours on their own
 
 @dataclass(frozen=True)
 class PcdField:
-    """One of a point's fields."""
+    """A field of a point."""
 
     name: str
     type: str  # NumPy's, without byte order: all numbers are little-endian
@@ -92,7 +92,7 @@ class PcdHeader(NamedTuple):
 
 
 def read_header(path: Path) -> PcdHeader:
-    """Return the header of a PCD file; SIZE, TYPE and COUNT may be missing, as in old ones: 4, F and 1."""
+    """Return the header of a PCD file; SIZE, TYPE and COUNT, if missing as in old files, are 4, F and 1."""
     with path.open("rb") as file:
         head = file.read(MAX_HEADER_SIZE)
     entries: dict[str, list[str]] = {}
@@ -137,7 +137,7 @@ def _fields(path: Path, entries: dict[str, list[str]]) -> tuple[PcdField, ...]:
 
 
 def _num_points(path: Path, entries: dict[str, list[str]]) -> int:
-    """POINTS, or WIDTH x HEIGHT; both must be the same if both are there."""
+    """Return POINTS, or WIDTH x HEIGHT; InputError if both are there and differ."""
     found = {key: entries[key] for key in ("WIDTH", "HEIGHT", "POINTS") if key in entries}
     counts = {key: _count(" ".join(words)) for key, words in found.items()}
     if None in counts.values() or not counts.keys() & {"POINTS", "WIDTH"}:
@@ -155,10 +155,7 @@ def _count(text: str) -> int | None:
 
 
 def decompress_lzf(data: bytes, size: int) -> bytearray | None:
-    """Return the `size` bytes of compressed data.
-
-    None if they are more or less, or are copied from nowhere.
-    """
+    """Decompress data to `size` bytes; None if they make more or fewer, or copy from before the first."""
     out = bytearray()
     data = data + bytes(2)  # a last code that is cut off reads zeros, and makes too little or too much
     i = 0
@@ -188,8 +185,8 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
     in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
-    fields are left out. With the options for it, `intensity` or `label` stands in for colours. The size of a
-    binary file is compared with the header before memory is reserved.
+    fields are left out. If the options say so, `intensity` or `label` takes the place of colours. The size of
+    a binary file is compared with the header before memory is reserved.
     """
     header = read_header(path)
     fields = _select_fields(header, options)
@@ -208,7 +205,7 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
-    """Return fields x y z and the colour's one or three, or the intensity or label if the options say so."""
+    """Return the fields x y z and one or three of colours, or by the options the intensity or label."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
     if options.labels:
@@ -265,7 +262,7 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
 
 
 def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> Iterator[RawCloud]:
-    """Yield the points with colours 0xAARRGGBB of a declared type, whose numbers ASCII has as text."""
+    """Yield the points with colours 0xAARRGGBB, in numbers of a declared type, which ASCII has as text."""
     num_before = 0
     for columns in read_columns():
         points_world = points_of(columns)
@@ -284,7 +281,7 @@ def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> I
 
 
 def _bits_of_text(values: NDArray[np.float64], type_: str) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
-    """32 bits (N,) of each number, and whether it has as many."""
+    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits."""
     if type_ == "f4":
         # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
         is_right = np.abs(values) <= np.finfo(np.float32).max

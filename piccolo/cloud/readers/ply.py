@@ -1,6 +1,6 @@
 """PLY files: the vertices' positions and colours.
 
-plyfile reads the header: the names, types and byte order. It would reserve whatever size the header
+plyfile reads the header: the names, types and byte order. It would reserve any size that the header
 promises, and read ASCII and lists line by line in Python, so the numbers are read here.
 """
 
@@ -51,7 +51,7 @@ class PlyHeader:
     byte_order: str  # '<' or '>', '=' in ASCII
     is_ascii: bool
     size: int  # [byte], the data begin here
-    index: int  # which element the vertices are
+    index: int  # of the element of the vertices
 
     @property
     def vertices(self) -> PlyElement:
@@ -79,7 +79,7 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _has_faces(header: PlyHeader) -> bool:
-    """Return True for a mesh; colours whose range trimesh would get wrong are refused."""
+    """Return True for a mesh; InputError if trimesh would get the range of its colours wrong."""
     found = dict(zip((element.name for element in header.elements), header.counts, strict=True))
     if not found.get("face"):
         return False
@@ -92,7 +92,7 @@ def _has_faces(header: PlyHeader) -> bool:
 
 
 def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[Columns]:
-    """Yield the named columns of up to raw.CHUNK vertices, of an ASCII file float64 whatever their type."""
+    """Yield the named columns of up to raw.CHUNK vertices; those of an ASCII file are float64."""
     if not header.is_ascii:
         for rows in read_records(header.path, *place_of_vertices(header)):
             yield [rows[name] for name in names]
@@ -133,7 +133,7 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
-    """Which element the vertices are; it and all before it have rows of a fixed length."""
+    """Return the index of the vertices' element; InputError if it or one before it has lists."""
     for index, element in enumerate(elements):
         lists = [prop.name for prop in element.properties if isinstance(prop, PlyListProperty)]
         if lists:
@@ -163,7 +163,7 @@ def _property_names(header: PlyHeader, options: CloudSettings) -> tuple[str, ...
 
 
 def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
-    """Where the rows of a binary file begin [byte], how many there are, and what is in one."""
+    """Return the start [byte] of a binary file's vertices, their number and their dtype."""
     count = header.counts[header.index]
     before = zip(header.elements[: header.index], header.counts, strict=False)
     offset = header.size + sum(count * element.dtype().itemsize for element, count in before)

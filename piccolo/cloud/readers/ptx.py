@@ -30,17 +30,17 @@ WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
 
 
 class PtxScan(NamedTuple):
-    """How many points a scan has, and where they are in the world."""
+    """A scan's number of points and its transform to the world."""
 
-    num_points: int  # lines that are there, whether the beam came back or not
+    num_points: int  # lines in the file, with or without a return
     T_world_from_scanner: NDArray[np.float64]  # (4, 4)
 
 
 def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return the points of all scans of a PTX file, in the world.
 
-    0 0 0 stands where no beam came back and is left out. A last scan with fewer lines than its header
-    promises is read as far as it goes, with a warning; a line without end is then taken for cut off.
+    0 0 0 means that no beam came back, and is left out. A last scan with fewer lines than its header promises
+    is read up to its end, with a warning; a last line without a line end is then left out as cut off.
     """
     lines = NumberLines(path, COLORED, WANTED)
     scans: list[PtxScan] = []
@@ -67,7 +67,7 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
-    """Yield the z axes (3,) of the scanners in the world, unit; of those that have a place in it."""
+    """Yield the unit z axes (3,), in the world, of the scanners whose pose is not the identity."""
     for scan in scans:
         z = scan.T_world_from_scanner[:3, 2]
         length = float(np.linalg.norm(z))
@@ -82,7 +82,7 @@ def has_ptx_magic(head: bytes) -> bool:
 
 
 def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
-    """How many points the next scan's header promises, T_world_from_scanner; None at the file's end."""
+    """Return the next scan's number of points by its header, and T_world_from_scanner; None at the end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
         line = lines.take_line()
@@ -103,10 +103,7 @@ def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
 
 
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
-    """Return the finite numbers of a header's line, one of them a count.
-
-    None if the line has anything else.
-    """
+    """Return the finite numbers of a header's line; None if it has others. A single one is a count."""
     fields = line.split()
     if num_wanted == 1 and not (line.isdigit() and len(line) <= MAX_COUNT_DIGITS):
         return None

@@ -1,10 +1,10 @@
-"""Parts of all readers: chunks of points as they stand in a file, and points from columns of numbers.
+"""Parts of all readers: chunks of points as in a file, and points from columns of numbers.
 
 Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
 become 8 bits; their range follows from the declared type and is never guessed. Labels become colours in place
-of the file's own. Intensity becomes a gray for files that have no colours: its unit is each scanner's own,
-and a few mirrors outshine everything, so a file's 1st percentile becomes black and its 99th white, of all its
-points, in a reading of their own, whatever their order.
+of the file's own. Intensity becomes a gray for files that have no colours. Its unit differs from scanner to
+scanner, and a few mirrors outshine everything: the 1st percentile of a file becomes black, its 99th white.
+These are percentiles of all points, in any order, for which the file is read once more.
 """
 
 import functools
@@ -21,7 +21,7 @@ from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
 from ..settings import CloudSettings, UpAxis
 
-HEAD_SIZE = 512  # [byte] by which a format is known
+HEAD_SIZE = 512  # [byte] from which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
 MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 bytes have room
 CUT = "the file was cut while it was read, wanted a whole file"
@@ -41,10 +41,10 @@ Columns = list[NDArray[Any]]
 ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
 OPTION = "`intensity_as_gray` takes it for a gray"
-BLACK, WHITE = 0.01, 0.99  # share of the points that are darker
+BLACK, WHITE = 0.01, 0.99  # fraction of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
-# as they stand in PLY files, in lower case; the first that is there counts. CloudCompare prefixes `scalar_`
+# as in PLY files, in lower case; the first that is found counts. CloudCompare prefixes `scalar_`
 LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
 MOST = 2.0**32  # labels are below it, and above its negative
 
@@ -60,7 +60,7 @@ ChunkReader = Callable[[], Iterator[RawCloud]]  # each call from the start; Inpu
 
 
 class PointSource(NamedTuple):
-    """A file whose header has been checked, and the way to its points."""
+    """A file whose header has been checked, and a reader of its points."""
 
     path: Path
     read_chunks: ChunkReader
@@ -81,23 +81,23 @@ class CloudFormat(NamedTuple):
 
 
 def quote_line(line: bytes) -> str:
-    """Return the first line of `line`, short and printable, control characters as escapes."""
+    """Return the first line of `line`, shortened and printable, with control characters escaped."""
     text = line.splitlines()[0] if line else b""
     return ascii(text[:60].decode("latin-1")) + ("..." if len(text) > 60 else "")
 
 
 def point_label(path: Path, index: int) -> str:
-    """Return what messages call the point of that index in a file."""
+    """Return the name of a file's point in messages."""
     return f"{path}: point {index + 1}"
 
 
 def color_names(names: Collection[str]) -> tuple[str, ...]:
-    """Which of a file's names are the three colours'; empty if none are."""
+    """Return the names of the three colours among a file's names; empty if there are none."""
     return next((three for three in COLOR_NAMES if all(name in names for name in three)), ())
 
 
 def find_full_brightness(path: Path, types: Sequence[str]) -> float:
-    """Return the value of full brightness in colours of these types, as "u1"."""
+    """Return the value of full brightness in colours of these types, such as "u1"."""
     if len(set(types)) > 1 or types[0] not in BRIGHTEST:
         raise InputError(f"{path}: the colours are of type {' '.join(types)}, wanted {TYPES_WANTED}")
     return BRIGHTEST[types[0]]
@@ -156,7 +156,7 @@ def in_chunks(columns: list[NDArray[Any]]) -> Iterator[list[NDArray[Any]]]:
 
 
 def points_of(columns: Columns) -> NDArray[np.float64]:
-    """Points (N, 3) of the first three columns."""
+    """Return the points (N, 3) in the first three columns."""
     with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
         return np.stack(columns[:3], axis=1, dtype=np.float64)
 
@@ -164,7 +164,7 @@ def points_of(columns: Columns) -> NDArray[np.float64]:
 def column_source(
     path: Path, read_columns: ColumnReader, types: Sequence[str], num_points: int, labels: Labels | None
 ) -> PointSource:
-    """Points with three colours of these types, as "u1", or with one scalar: a label, else the intensity."""
+    """Return points with colours of three types, such as "u1", or with one scalar: label, else intensity."""
     if len(types) == 3:
         read_chunks: ChunkReader = partial(
             _read_colored, path, read_columns, find_full_brightness(path, types)
@@ -198,20 +198,20 @@ def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
 
 
 def check_option(path: Path, options: CloudSettings, wanted: str) -> None:
-    """Refuse a file with intensity and no colours unless the user wants its intensity for a gray."""
+    """Refuse a file with intensity and no colours, unless the options allow its intensity as a gray."""
     if not options.intensity_as_gray:
         raise InputError(f"{path}: has intensity and no colours, {wanted}; {OPTION}")
 
 
 def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
-    """Gray (N, 3) of intensity (N,): black up to `low`, white from `high` on; black where it is NaN."""
+    """Convert intensity (N,) to gray (N, 3): black up to `low` and for NaN, white from `high` on."""
     share = (np.nan_to_num(intensity, nan=low) - low) / (high - low)
     gray = np.rint(255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
     return np.repeat(gray[:, None], 3, axis=1)
 
 
 def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
-    """Percentiles of the intensity of points that have a position, within 1 %, or exact up to 255."""
+    """Return percentiles of the intensity of points with a position, within 1 %, or exact up to 255."""
     histogram = np.zeros(NUM_BINS, np.int64)
     for points, intensity in chunks:
         is_measured = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
@@ -226,7 +226,7 @@ def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, floa
 
 
 def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Bin (N,) of each value: the upper half of its bits as a float32, in ascending order."""
+    """Return the bin (N,) of each value: the upper half of its bits as a float32, in ascending order."""
     # + 0.0 turns -0.0 into 0.0
     bits = (np.clip(values, -LARGEST, LARGEST) + 0.0).astype(np.float32).view(np.uint32)
     bits = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))

@@ -1,6 +1,6 @@
 """Lines of numbers, parsed by np.loadtxt a chunk at a time; text files of lines x y z r g b, and PTS files.
 
-PTS: x y z intensity r g b after a count of points.
+PTS files have lines x y z intensity r g b after a count of points.
 """
 
 import os
@@ -49,7 +49,7 @@ class LineLayout(NamedTuple):
     num_columns: int | None = None  # of each line; None: there may be any more than those read
     start: int = 0  # [byte] of the first line
     delimiter: str | None = None  # None: blanks and tabs
-    has_counts: bool = False  # a lone whole number counts the lines that follow, and is passed over
+    has_counts: bool = False  # a lone whole number counts the lines that follow, and is skipped
 
 
 def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
@@ -74,7 +74,7 @@ def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
 
 
 class NumberLines:
-    """The lines of numbers in a file, one after the other; blank lines and comments are passed over."""
+    """The lines of numbers in a file, one after the other; blank lines and comments are skipped."""
 
     def __init__(self, path: Path, layout: LineLayout, wanted: str) -> None:
         self.path = path
@@ -85,20 +85,20 @@ class NumberLines:
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
 
     def peek(self) -> bytes | None:
-        """Return the next line, which stays the next; None at the end."""
+        """Return the next line without taking it; None at the end."""
         line = next(self._lines, None)
         if line is not None:
             self._lines = chain([line], self._lines)
         return line
 
     def take_line(self) -> bytes | None:
-        """Return the next line; None at the end."""
+        """Take and return the next line; None at the end."""
         line = next(self._lines, None)
         self.num_taken += line is not None
         return line
 
     def skip(self, count: int) -> int:
-        """Pass over lines, whatever is in them; how many: `count`, or as many as are left."""
+        """Skip `count` lines, or as many as are left, unparsed; return their number."""
         num_skipped = sum(1 for _ in islice(self._lines, count))
         self.num_taken += num_skipped
         return num_skipped
@@ -139,9 +139,9 @@ class NumberLines:
                 raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
 
     def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
-        """Points (N, 3) of as many lines as read_rows would read, and what else is in the columns.
+        """Yield the points (N, 3) of the lines that `read_rows` would read, with the other columns.
 
-        Colours (N, 3) of six columns x y z r g b, checked to be 0-255; the fourth (N,) of four.
+        These are colours (N, 3), checked to be 0-255, if six columns are read, else the fourth column (N,).
         """
         first = self.num_taken
         rows = self.read_rows(count)
@@ -152,16 +152,13 @@ class NumberLines:
         return ((chunk.points_world, chunk.colors) for chunk in chunks)
 
     def locate(self, index: int) -> str:
-        """Return the file and the number in it of the line that comes after `index` others."""
+        """Return the file, and the number in it of the line that follows `index` lines of numbers."""
         for number, _ in islice(self._number_lines(), index, None):
             return f"{self.path}: line {number}"
         raise InputError(f"{self.path}: {CUT}")
 
     def _number_lines(self) -> Iterator[tuple[int, bytes]]:
-        """Yield number in the file and text of all lines of numbers, from the first on.
-
-        The file is read again.
-        """
+        """Read the file again: yield the number in the file and the text of each line of numbers."""
         with self.path.open("rb") as file:
             number = len((file.read(self.layout.start) + b".").splitlines()) - 1
         for lines in line_blocks(self.path, self.layout.start):
@@ -171,14 +168,14 @@ class NumberLines:
                     yield number, kept
 
     def _complaint(self, otherwise: str) -> str:
-        """Describe the first broken line behind those taken, or return `otherwise` if all seem right."""
+        """Describe the first broken line after those taken; with `otherwise` if all seem right."""
         for number, line in islice(self._number_lines(), self.num_taken, None):
             if fault := self._fault(line):
                 return f"{self.path}: line {number}: {fault} ({quote_line(line)}), {self.wanted}"
         return f"{self.path}: {otherwise}, {self.wanted}"
 
     def _fault(self, line: bytes) -> str:
-        """Describe a broken line; empty for one that is right."""
+        """Describe the fault of a line; empty if it has none."""
         fields = line.decode("latin-1").split(self.layout.delimiter)
         exact = self.layout.num_columns
         columns = self.layout.columns
@@ -191,7 +188,7 @@ class NumberLines:
 
 
 def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
-    """Return the lines of numbers among all, without blanks at their ends."""
+    """Strip lines of blanks; return the lines of numbers."""
     return [
         line
         for line in filter(None, map(bytes.strip, lines))
@@ -200,7 +197,7 @@ def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
 
 
 def is_number(field: str) -> bool:
-    """Return True if np.loadtxt takes a field for a number."""
+    """Return True if np.loadtxt reads a field as a number."""
     try:
         float(field)
     except ValueError:
@@ -223,9 +220,9 @@ def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: 
 def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return the points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
-    A header line is passed over, or obeyed if it names x y z and r g b (or red green blue), or x y z and an
-    intensity, or refused if it names a line's columns, x y z among them, but neither. Without one the first
-    six columns count; four are x y z and intensity.
+    A header line is skipped. It determines the columns if it names x y z and r g b (or red green blue), or
+    x y z and an intensity; it is refused if it names all columns, x y z among them, but neither of these.
+    Without one the first six columns are read; four are x y z and intensity.
     """
     with path.open("rb") as file:
         layout = _layout(path, file.read(HEAD_SIZE))
@@ -233,7 +230,7 @@ def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
 
 
 def _layout(path: Path, head: bytes) -> LineLayout:
-    """How the file is laid out, judged by its first lines."""
+    """Return the layout of a file, from its first lines."""
     if b"\0" in head:
         raise InputError(f"{path}: holds bytes that are no text, {WANTED}")
     start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
@@ -267,7 +264,7 @@ def _delimiter(line: str) -> str | None:
 
 
 def _begins_numbers(line: bytes, fields: list[str]) -> bool:
-    """Return False for blank lines, comments, headers, and the count of points that .pts files begin with."""
+    """Return False for blank lines, comments, headers, and the count of points at the start of .pts files."""
     is_count = len(fields) == 1 and line.isdigit()
     return not line.startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields))
 
@@ -279,7 +276,7 @@ def _names(header: str) -> list[str]:
 
 
 def _find_columns(header: str) -> tuple[int, ...]:
-    """Return the fields of x, y, z and r, g, b, or of x, y, z and intensity, if a header line names them."""
+    """Return the columns of x, y, z and r, g, b, or of x, y, z and intensity; empty if not all are named."""
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
     more = color_names(once) or tuple(name for name in once if name in INTENSITY_NAMES)[:1]
@@ -293,10 +290,9 @@ TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_t
 def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return the points of all scans of a PTS file.
 
-    All lines must have as many columns as the first one: x y z r g b if there are
-    six, x y z intensity r g b and what else there is if there are more. The intensity may have any range. A
-    lone count may stand before any line and is not compared with the lines, as many programs write a wrong
-    one.
+    All lines must have as many columns as the first one: six are x y z r g b, more are x y z intensity r g b
+    and others. The intensity may have any range. A lone count may precede any line; it is not compared with
+    the number of lines, as many programs write a wrong one.
     """
     lines = NumberLines(path, LineLayout(has_counts=True), PTS_WANTED)
     line = lines.peek()
