@@ -55,7 +55,7 @@ class Result:
     Attributes
     ----------
     status
-        "localized", "ambiguous" or "not_localized"; in files also "unreadable" or "failed".
+        "localized", "ambiguous" or "not_localized"; "unreadable" or "failed" if the photo was not read.
     pose
         `Pose` of a localized photo in the scan's own coordinates, else None.
     best_guess

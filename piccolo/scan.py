@@ -112,9 +112,9 @@ class Scan:
             Path of a picture (JPEG, PNG, TIFF, WebP, HEIC) or of a folder of six cube faces; or an array
             (H, W, 3), RGB in uint8, which is a full equirectangular sphere, W = 2 H, or of a given camera.
         mask
-            **White is ignored**, as in a picture of the photo's size or a folder of such with the photos'
-            names. For an array, a mask (H, W) whose True is ignored. Masks of COLMAP, OpenSfM and nerfstudio
-            are the other way round (black is ignored): invert them.
+            **White is ignored**, in a picture of the photo's size, or in a folder of masks named like the
+            photos. For an array photo, a mask (H, W) whose True is ignored. COLMAP, OpenSfM and nerfstudio
+            ignore black: invert their masks.
         mask_nadir_deg
             Half angle [deg] of the cap about camera -z that is ignored, 0 by default. Only for files.
         fov_deg
