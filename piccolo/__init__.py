@@ -1,6 +1,6 @@
-"""Where in a coloured 3D scan a 360-degree photo was taken (PICCOLO, Kim et al., ICCV 2021), on the CPU.
+"""Localize 360-degree photos in coloured 3D scans on the CPU (PICCOLO, Kim et al., ICCV 2021).
 
-In the folder in which `make_room.py --out room --seed 4 --points 100000 --panoramas 2 --width 1024` was run:
+The example files are made by `make_room.py --out room --seed 4 --points 100000 --panoramas 2 --width 1024`:
 
 >>> import piccolo
 >>> scan = piccolo.open_scan("room/cloud.ply")
@@ -9,7 +9,7 @@ In the folder in which `make_room.py --out room --seed 4 --points 100000 --panor
 ('localized', array([2.6 , 3.17, 1.21]))
 """
 
-__version__ = "0.1.0"  # above the imports: a result repeats it
+__version__ = "0.1.0"  # above the imports: piccolo.result imports it
 
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -73,7 +73,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> object:
-    """Import what is asked for when it is (PEP 562): Numba, SciPy and OpenCV take most of a second."""
+    """Import a public name at its first use (PEP 562): Numba, SciPy and OpenCV take most of a second."""
     if name not in MODULES:
         raise AttributeError(f"module 'piccolo' has no attribute {name!r}")
     return getattr(import_module(MODULES[name], __name__), name)

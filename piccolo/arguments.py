@@ -1,4 +1,4 @@
-"""Check of the arguments of the API's functions by their annotations."""
+"""Checks of the public functions' arguments against their annotations."""
 
 import inspect
 import types
@@ -22,9 +22,10 @@ NUMBERS = {bool: bool | np.bool_, int: int | np.integer, float: float | int | np
 
 
 def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a function's arguments among some values, without those that are None.
+    """Return the arguments of a function that are not None, by name.
 
-    Arrays of numbers become tuples. Raises InputError if one is not as its annotation says.
+    `values` are the function's `locals()`. NumPy scalars become Python numbers, and rows of numbers tuples.
+    Raises InputError for an argument that is not of its annotated type.
     """
     given: dict[str, Any] = {}
     for name, kind in inspect.get_annotations(function).items():
@@ -37,7 +38,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) 
 
 
 def is_of_kind(value: object, kind: Any) -> bool:
-    """Return whether a value is as an annotation says; the dtype of an array is not looked at."""
+    """Return True if a value is of an annotated type. The dtype of an array is not checked."""
     origin = get_origin(kind) or kind
     parts = get_args(kind)
     if origin in (Union, types.UnionType):
@@ -52,7 +53,7 @@ def is_of_kind(value: object, kind: Any) -> bool:
 
 
 def is_collection(value: Any, origin: Any, parts: tuple[Any, ...]) -> bool:
-    """Return whether a value is a collection as an annotation says; the items of an iterator are not read."""
+    """Return True if a value is of an annotated collection type. Items of an iterator are not read."""
     if isinstance(value, str | bytes):
         return False
     if origin is tuple:
@@ -70,7 +71,7 @@ def is_collection(value: Any, origin: Any, parts: tuple[Any, ...]) -> bool:
 
 
 def describe(kind: Any) -> str:
-    """Return the words for an annotation."""
+    """Describe an annotated type in words."""
     origin = get_origin(kind) or kind
     parts = get_args(kind)
     if origin in (Union, types.UnionType):
@@ -90,7 +91,7 @@ def describe(kind: Any) -> str:
 
 
 def found_text(value: object) -> str:
-    """Return a value in a message: the type and shape of an array."""
+    """Return a value as text for a message: of an array, dtype and shape."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"
     text = repr(value)
@@ -98,7 +99,7 @@ def found_text(value: object) -> str:
 
 
 def plain(value: Any, kind: Any) -> Any:
-    """Return a value without types of NumPy, a list of an annotated tuple as a tuple."""
+    """Convert a NumPy scalar to a Python number, and a list or array to a tuple if a tuple is annotated."""
     origin = get_origin(kind)
     kinds = get_args(kind) if origin in (Union, types.UnionType) else (kind,)
     if isinstance(value, np.generic):

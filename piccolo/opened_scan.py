@@ -1,4 +1,4 @@
-"""A scan with all options as objects: `Scan`, the commands and the batches localize photos in it."""
+"""A scan prepared for a method: `Scan`, the commands and the batches localize photos in it."""
 
 from dataclasses import asdict, dataclass, field, replace
 from os import PathLike
@@ -40,31 +40,34 @@ Settings = CoarseToFineSettings | PaperSettings
 
 @dataclass(frozen=True)
 class OpenedScan:
-    """A scan that is prepared for a method; it may be used from several threads at once."""
+    """A scan prepared for a method. Several threads may use it at once."""
 
     prepared: ScanMap | PaperMap = field(repr=False)
     name: str | tuple[str, ...]  # path as given, or the paths of several files that are one scan
     cloud_settings: CloudSettings
-    settings: Settings  # of photos that say nothing else
+    settings: Settings  # defaults of photos
     workers: Workers
-    seconds: dict[str, float]  # spent once, on the scan
+    seconds: dict[str, float]  # [s] spent on reading and preparing the scan, by stage
 
     @property
     def points(self) -> PackedPoints:
-        """Coloured points of the scan, in the frame of `from_world`, for pictures."""
+        """Coloured points, to draw the scan, in the frame of `from_world`."""
         return self.prepared.points
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines that the user should read about the scan."""
+        """Warnings about the scan, one line each."""
         return self.prepared.warnings
 
     def from_world(self, pose: Pose) -> Pose:
-        """Return a pose of the world in the frame of `points`."""
+        """Transform a pose from the scan's own coordinates to the frame of `points`."""
         return self.prepared.from_world(pose)
 
     def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
-        """Return a walk with all options as objects, as `track` does."""
+        """Start a walk, to which frames are then added.
+
+        Raises InputError for the preset paper, and for a focal length that is to be refined.
+        """
         if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
             raise InputError("walks: not of the preset paper")
         if read_options.refine_focal:
@@ -83,7 +86,7 @@ class OpenedScan:
         read_options: ReadOptions,
         is_masked: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the pixels of a photo that contradict the scan at a pose, as `Scan.occlusion_mask`."""
+        """Return the pixels (H, W) of a photo that contradict the scan at a pose (`Scan.occlusion_mask`)."""
         picture = read_photo(panorama, read_options, is_masked)
         return occlusion_mask(self.points, picture, self.from_world(pose))
 
@@ -95,7 +98,11 @@ class OpenedScan:
         is_masked: NDArray[np.bool_] | None = None,
         calibration: Calibration | None = None,
     ) -> Result:
-        """Localize a photo, all options as objects; apart a mask that is an array, and the photo's camera."""
+        """Localize a photo.
+
+        `is_masked` (H, W) is the mask of a photo that is an array, True where it is ignored. `calibration` is
+        the photo's camera, if `read_options` give none.
+        """
         watch = Stopwatch()
         self.check_options(read_options, settings)
         repeated = settings_json(settings, self.cloud_settings, read_options)
@@ -134,14 +141,14 @@ class OpenedScan:
         )
 
     def check_options(self, read_options: ReadOptions, settings: Settings) -> None:
-        """Refuse options that this scan does not have."""
+        """Raise InputError for options that this scan or its method does not have."""
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             check_within(self.prepared, settings.prior.within)
         elif read_options.refine_focal:
             raise InputError("`refine_focal`: not an option of the preset paper")
 
     def make_gps_prior(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
-        """Return the photo's GPS position in the scan; None if it has none, or a position is given anyway."""
+        """Return the photo's GPS position in the scan; None if either is unknown or `near_world` is given."""
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
         if photo.gps is None or not crs or settings.prior.near_world is not None:
             return None
@@ -151,7 +158,7 @@ class OpenedScan:
 def settings_json(
     settings: Settings, cloud_settings: CloudSettings, read_options: ReadOptions
 ) -> dict[str, object]:
-    """Return the settings that a result repeats."""
+    """Return the settings as a result's JSON has them."""
     reading = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": reading}
 
@@ -164,9 +171,9 @@ def make_failed_result(
     settings: Settings,
     name: str | None = None,
 ) -> Result:
-    """Return the result of a photo that raised an error, which is raised if it is not the photo's.
+    """Return the result of a photo that raised an error; an error in the program is raised again.
 
-    `name` replaces the photo's path.
+    `name` replaces the photo's path in the result.
     """
     text, is_passing = describe_failure(error)
     digest = None

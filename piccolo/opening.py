@@ -1,4 +1,4 @@
-"""Opening a scan: it is read and prepared for a method, or taken from a map prepared before."""
+"""Opening of scans: files or arrays are read and prepared for a method, or a prepared map is read."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,40 +46,47 @@ def open_scan(  # noqa: PLR0913  options by name
     progress: ProgressCallback | None = None,
     settings: Settings = DEFAULT,
 ) -> Scan:
-    """Read and prepare a coloured scan, in which photos can then be localized.
+    """Read a coloured scan and prepare it, so that photos can be localized in it.
 
     Parameters
     ----------
     source
-        Path of a scan in any format of docs/USAGE.md, or of a map by tools/prepare_map.py; or several paths,
-        which are one scan; or points (N, 3) [m].
+        Path of a scan in any format of docs/USAGE.md; several paths, which together are one scan; the path
+        of a map that `Scan.save` or tools/prepare_map.py wrote; or points (N, 3) [m].
     colors
-        With points: (N, 3) RGB, uint8, uint16, or floats in [0, 1].
+        RGB of the points (N, 3), in uint8, uint16, or floats in [0, 1]. Only with an array of points.
     units
-        Of the coordinates of files.
+        Unit of the coordinates in files, "m" by default. Arrays and all poses are in metres.
     up
-        The axis that points up; "auto" is the file's: z, in glTF y.
+        Axis of the scan that points up. By default "auto": z, in glTF files y.
     intensity_as_gray
-        For files without colours.
+        Use intensities as grey levels where a file has no colours. False by default.
     labels
-        Semantic labels replace colours, in the scan's files and in panoramas.
+        Use semantic labels in place of colours, in scan and panoramas. False by default.
     ignore_labels
-        Labels left out of the scan, and masked in panoramas.
+        Labels that are left out of the scan and masked in panoramas. Only with `labels`.
     crs
-        Coordinate system, such as EPSG:25832, for photos with GPS; by default what the file names.
+        Coordinate system of the scan, such as "EPSG:25832", to use GPS positions of photos. By default the
+        one that a LAS, LAZ or E57 file names.
     cache
-        Keep the prepared map in the user's cache, nowhere, or in a folder.
+        Keep the prepared map in the user's cache (True, the default), nowhere (False), or in this folder.
     num_threads
-        All cores by default.
+        Threads that prepare the scan and localize photos, by default one for each core.
     progress
-        Is called with what is done, how many are done, and of how many, None if unknown.
+        Function that is called as `progress(what, done, total)`; `total` is None where it is unknown.
     settings
-        Of the method.
+        `CoarseToFineSettings` (the default method) or `PaperSettings` (the method of the paper).
+
+    Returns
+    -------
+    Scan
+        Its `warnings` say what may be wrong with the scan, such as its unit or vertical.
 
     Raises
     ------
     InputError
-        A file is missing or damaged, has no colours, or is of a format that is not read.
+        A file is missing or damaged, has no colours, or is of an unknown format; or an option is invalid.
+        A prepared map takes no `units`, `up` and `intensity_as_gray`.
 
     Examples
     --------
@@ -121,7 +128,7 @@ def open_files(
     cache: CachePolicy,
     workers: Workers,
 ) -> OpenedScan:
-    """Open the files of a scan; all options are objects."""
+    """Open the files of a scan, or a prepared map."""
     watch = Stopwatch()
     name = str(paths[0]) if len(paths) == 1 else tuple(map(str, paths))
     if isinstance(settings, CoarseToFineSettings):
@@ -144,7 +151,7 @@ def scan_of(
     workers: Workers,
     watch: Stopwatch,
 ) -> OpenedScan:
-    """Prepare a scan for the method of the settings."""
+    """Prepare a scan for the method that the settings belong to."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
         prior = settings.prior

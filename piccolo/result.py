@@ -50,54 +50,99 @@ class Source:
 
 @dataclass(frozen=True)
 class Result:
-    """The pose of one panorama, its status and its evidence."""
+    """Result of localizing one photo.
 
-    status: str  # "localized", "ambiguous", "not_localized", "unreadable" or "failed"
-    confidence: float  # [0, 1] how likely the pose is right, see piccolo.confidence
-    cloud: str | tuple[str, ...]  # path as given, or the paths of several files that are one cloud
-    pano: str  # path as given
-    best_pose: Pose | None  # found, in the scan's own coordinates; None if there was no start
-    loss: float | None  # sampling loss [0, sqrt(3)] over the points seen from the pose
+    Attributes
+    ----------
+    status
+        "localized", "ambiguous" or "not_localized"; "unreadable" or "failed" if the photo was not read.
+    pose
+        `Pose` of a localized photo in the scan's own coordinates, else None.
+    best_guess
+        The best `Pose` found for a photo that is not localized; None if there is none.
+    best_pose
+        `pose` or `best_guess`, whichever there is.
+    confidence
+        Probability that `best_pose` is within 0.1 m and 5 degrees.
+    probability_none
+        Probability that neither `best_pose` nor an alternative is right; None if unknown.
+    alternatives
+        Other poses that explain the photo, best first, at most 5.
+    evidence
+        The measurements from which the confidence is computed.
+    covariance
+        `PoseCovariance` of `best_pose`; None if the points do not determine it, or with the preset paper.
+    loss
+        Sampling loss over the points that are visible from `best_pose`, 0 to sqrt(3).
+    storey, height_above_floor
+        Storey of `best_pose`, 1 for the lowest, and its height [m] above the floor there; None if no floor
+        was found.
+    scan
+        Name of the scan in which `best_pose` lies, if the map has named scans.
+    cloud, pano
+        Paths of scan and photo as given; `cloud` is a tuple if several files are one scan.
+    source
+        Digests of scan and photo, the photo's size and capture time.
+    cameras, focal_length
+        Cameras of a photo that is no sphere; the estimate of a focal length that is not exact.
+    gps_prior
+        Where the photo's GPS position lies in the scan, if both are known.
+    walk
+        For a frame of a walk, how its pose was found. Status, pose and covariance are then those of the walk.
+    seconds
+        Time [s] spent on this photo, by stage.
+    settings, warnings
+        The settings as they took effect; warnings about scan and photo, one line each.
+    error
+        The reason why a photo is "unreadable" or has "failed".
+    """
+
+    status: str
+    confidence: float
+    cloud: str | tuple[str, ...]
+    pano: str
+    best_pose: Pose | None
+    loss: float | None
     evidence: Evidence | None
-    alternatives: tuple[Alternative, ...]  # poses elsewhere, best first, at most 5
-    covariance: PoseCovariance | None  # None with the preset paper, and where the points do not fix the pose
-    seconds: dict[str, float]  # of this photo: read, search, refine
-    settings: dict[str, object]  # effective settings, seed included
+    alternatives: tuple[Alternative, ...]
+    covariance: PoseCovariance | None
+    seconds: dict[str, float]
+    settings: dict[str, object]
     warnings: tuple[str, ...] = ()
     source: Source = Source()
-    error: str | None = None  # why a photo is "unreadable" or has "failed"
-    gps_prior: GpsPrior | None = None  # where the photo's GPS position lies in the scan, if both are known
-    cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
-    focal_length: FocalLength | None = None  # of a photo whose focal length is not exact
-    scan: str | None = None  # name of the scan in which the best pose lies, of a map that names its scans
-    probability_none: float | None = None  # that neither the pose nor an alternative is right, if known
-    storey: int | None = None  # in which the best pose lies, 1 the lowest; None where no floor was found
-    height_above_floor: float | None = None  # [m] of the best pose, above the floor there
-    walk: WalkFrame | None = None  # of a frame of one, whose status, pose and covariance are then the walk's
+    error: str | None = None
+    gps_prior: GpsPrior | None = None
+    cameras: tuple[Mount, ...] = ()
+    focal_length: FocalLength | None = None
+    scan: str | None = None
+    probability_none: float | None = None
+    storey: int | None = None
+    height_above_floor: float | None = None
+    walk: WalkFrame | None = None
 
     @property
     def is_calibrated(self) -> bool:
-        """True if probabilities were learnt on photos like this: not with labels or the preset paper."""
+        """Return True if the probabilities are calibrated: not with labels or the preset paper."""
         panorama: Any = self.settings.get("panorama", {})
         return self.probability_none is not None and not panorama.get("labels")
 
     @property
     def pose(self) -> Pose | None:
-        """The pose of a photo that is localized."""
+        """Pose of a localized photo, else None."""
         return self.best_pose if self.status == LOCALIZED else None
 
     @property
     def best_guess(self) -> Pose | None:
-        """The best pose found where it is not sure enough to be called localized."""
+        """The best pose found for a photo that is not localized; None if there is none."""
         return None if self.status == LOCALIZED else self.best_pose
 
     @property
     def cloud_name(self) -> str:
-        """The cloud's path, or those of its files, separated by commas."""
+        """Path of the scan, or paths of its files, separated by commas."""
         return self.cloud if isinstance(self.cloud, str) else ", ".join(self.cloud)
 
     def summary(self) -> str:
-        """Two lines for a person."""
+        """Return the result as a few lines of text."""
         if self.best_pose is None:
             why = self.error or "no place for a camera, or nothing of the panorama counts"
             return f"{printable(self.pano)}: {self.status}\n  {printable(why)}"
@@ -123,7 +168,7 @@ class Result:
         return "\n".join(lines)
 
     def to_json(self) -> str:
-        """One JSON object on one line. Numbers only: NaN and infinity raise ValueError."""
+        """Return the result as JSON on one line (docs/RESULT.md). NaN and infinity raise ValueError."""
         document = {
             "format": FORMAT,
             "status": self.status,
@@ -161,7 +206,7 @@ class Result:
 
     @classmethod
     def from_json(cls, text: str) -> "Result":
-        """Read back what `to_json` wrote; any other text is an InputError."""
+        """Return the result that `to_json` wrote. Raises InputError for any other text."""
         with document_of(text, FORMAT, "result") as document:
             cloud = document.pop("cloud")
             best = document if document["status"] == LOCALIZED else document["best_guess"]

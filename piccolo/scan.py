@@ -1,4 +1,4 @@
-"""A scan that photos are localized in: `import piccolo` gives it."""
+"""The public class `Scan`: photos and walks are localized in it."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
@@ -34,43 +34,43 @@ SETTINGS_FIELDS = {"gravity", "solver", "min_confidence"}
 
 
 class Scan:
-    """A prepared scan. `open_scan` makes one; it may be used from several threads at once."""
+    """A scan in which photos can be localized: `open_scan` returns it. Several threads may use it at once."""
 
     def __init__(self, opened: OpenedScan) -> None:
         self._opened = opened
 
     def __repr__(self) -> str:
-        """Return the scan's name."""
+        """Return `Scan(...)` with the scan's name."""
         return f"Scan({self.name!r})"
 
     @property
     def name(self) -> str | tuple[str, ...]:
-        """Path as given, or the paths of several files that are one scan."""
+        """Path of the scan as given; a tuple of paths if several files are one scan; "arrays" for arrays."""
         return self._opened.name
 
     @property
     def seconds(self) -> dict[str, float]:
-        """Seconds spent on the scan, by stage."""
+        """Time [s] spent on reading and preparing the scan, by stage."""
         return self._opened.seconds
 
     @property
     def points(self) -> PackedPoints:
-        """Coloured points of the scan, in the frame of `from_world`, for pictures."""
+        """Coloured points, to draw the scan: `x`, `y`, `z` (N,) [m] in the frame of `from_world`."""
         return self._opened.points
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Lines that the user should read about the scan."""
+        """Warnings about the scan, one line each."""
         return self._opened.warnings
 
     def from_world(self, pose: Pose) -> Pose:
-        """Return a pose of the world in the frame of `points`."""
+        """Transform a pose from the scan's own coordinates to the frame of `points`."""
         return self._opened.from_world(pose)
 
     def save(self, path: File) -> None:
-        """Write the prepared map, which `open_scan` opens in place of the scan's files.
+        """Write the prepared map to the file `path`, which `open_scan` opens in place of the scan's files.
 
-        Raises InputError for the preset paper, and for a part of a scan too large to prepare as a whole.
+        Raises InputError for a scan opened with `PaperSettings`, or too large to be prepared as a whole.
         """
         check_arguments(Scan.save, locals())
         if not isinstance(self._opened.prepared, ScanMap):
@@ -102,60 +102,61 @@ class Scan:
         within: Sequence[str] | None = None,
         min_confidence: float | None = None,
     ) -> Result:
-        """Find where a 360-degree photo was taken.
+        """Find the position and rotation of the camera that took a photo.
 
-        An option that is None is as in the settings of `open_scan`, or as the photo's file says.
+        An option that is None has the default given here, or else that of the `settings` of `open_scan`.
 
         Parameters
         ----------
         panorama
-            Path of a picture (JPEG, PNG, TIFF, WebP, HEIC) or of a folder of six cube faces; or an
-            equirectangular image (H, W, 3), W = 2 H, RGB in 8 bits.
+            Path of a picture (JPEG, PNG, TIFF, WebP, HEIC) or of a folder of six cube faces; or an array
+            (H, W, 3), RGB in uint8, which is a full equirectangular sphere, W = 2 H, or of a given camera.
         mask
-            White pixels of a picture, or True of an array, are ignored. Masks of COLMAP, OpenSfM and
-            nerfstudio are the other way round (black is ignored): invert them.
+            **White is ignored**, in a picture of the photo's size, or in a folder of masks named like the
+            photos. For an array photo, a mask (H, W) whose True is ignored. COLMAP, OpenSfM and nerfstudio
+            ignore black: invert their masks.
         mask_nadir_deg
-            The cap of this half angle about the camera's down axis is ignored.
+            Half angle [deg] of the cap about camera -z that is ignored, 0 by default. Only for files.
         fov_deg
-            Horizontal field of view of a picture that is a part of the sphere.
+            Horizontal field of view [deg], by default from the file's metadata: of a part of the sphere about
+            the horizon (only for files), or of a pinhole or fisheye picture, as `projection` says.
         projection
-            Of the picture.
+            By default "pinhole" if EXIF has a focal length and W is not 2 H, else "equirectangular".
         focal_px
-            Focal length of a pinhole photo [px].
+            Focal length [px] of a pinhole photo in its own pixels, known to 1 %; by default EXIF's.
         camera
-            Calibration of the camera, see docs/CAMERAS.md.
+            Calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md.
         rig
-            Calibration of several cameras; `panorama` is the folder of one instant's pictures.
+            Calibration of several cameras; `panorama` is the folder of the pictures of one instant.
         gravity_vector
-            Down, in the camera's axes.
+            Direction of gravity in camera axes (+x image centre, +y left, +z up), of any length; (0, 0, -1)
+            is an upright camera. By default from the file's metadata.
         refine_focal
-            The focal length is a first guess.
+            The focal length is known within 20 % only, and is estimated with the pose (False by default).
         cube_order
-            The picture is six cube faces in this order, such as "rludfb".
+            Order of six cube faces in one picture, such as "rludfb" (right, left, up, down, front, back).
         use_gps
-            A GPS position in the file narrows the search (default), or not.
+            Search near the file's GPS position first, if the scan's coordinate system is known (default).
         gravity
-            "known": upright camera; "unknown": any rotation; "auto": both are tried.
+            "known": the camera was upright, or as metadata or `gravity_vector` say; "unknown": any rotation;
+            "auto" (default): both are tried.
         solver
-            Of the last descent.
+            Solver of the last descent, "gauss-newton" by default.
         near_world, radius
-            The camera is within `radius` [m] of this place [m]; a z of None is any height.
+            The camera is within `radius` [m] of `near_world` [m]; a z of None is any height.
         height
-            Least and most [m] above the floor.
-        heading_deg
-            Of the image centre, clockwise from the scan's +y.
-        heading_tolerance_deg
-            Largest error of `heading_deg`.
+            Least and greatest height of the camera above the floor [m].
+        heading_deg, heading_tolerance_deg
+            Heading [deg] of the image centre, clockwise from the scan's +y, and its largest error (20).
         within
-            Names of the map's scans that the camera may be in.
+            Names of the scans in the map that the camera may be in, by default all.
         min_confidence
-            A pose with less is not called localized.
+            Least confidence of a pose that is called localized, 0.9 by default.
 
         Returns
         -------
         Result
-            Its `status` is "localized", "ambiguous" or "not_localized"; a photo that can't be found is a
-            result too.
+            Its `status` is "localized", "ambiguous" or "not_localized"; not to be found is no error.
 
         Raises
         ------
@@ -164,7 +165,8 @@ class Scan:
 
         Examples
         --------
-        >>> scan = open_scan("room/cloud.ply")
+        >>> import piccolo
+        >>> scan = piccolo.open_scan("room/cloud.ply")
         >>> result = scan.localize("room/images/clean_0.jpg", gravity="known")
         >>> result.status, result.pose.center_world.round(2)
         ('localized', array([2.6 , 3.17, 1.21]))
@@ -197,9 +199,10 @@ class Scan:
         within: Sequence[str] | None = None,
         min_confidence: float | None = None,
     ) -> Iterator[Result]:
-        """Return an iterator over the results of panoramas, in order; options as in `localize`.
+        """Return an iterator over the results of photos, in order; each is computed when it is asked for.
 
-        The status of a photo that can't be read is "unreadable", or "failed" if another try may succeed.
+        `panoramas` and the options are as in `localize`; all photos have the same options. The status of a
+        photo that can't be read is "unreadable", or "failed" if another try may succeed; `error` says why.
         """
         read_options, settings, is_masked = self._parse(check_arguments(Scan.localize_many, locals()))
         self._opened.check_options(read_options, settings)
@@ -237,17 +240,24 @@ class Scan:
         within: Sequence[str] | None = None,
         min_confidence: float | None = None,
     ) -> Walk:
-        """Follow a camera that is carried through the scan: `add` each frame as it comes.
+        """Track a camera that is carried through the scan, frame by frame.
 
         Parameters
         ----------
         max_speed
-            Largest speed [m/s] (2 by default); for frames without times, the largest distance [m] between
-            consecutive frames, by default estimated from their poses.
+            Largest speed of the camera [m/s], 2 by default. If frames have no times, it is the largest
+            distance [m] between consecutive frames, by default estimated from their poses.
         max_acceleration
-            Standard deviation [m/s^2] along each axis; it smooths the path of `finish`.
+            Standard deviation of the acceleration along each axis [m/s^2]: less smooths the path more.
         mask
-            As in `localize`, like all other parameters; of all frames.
+            Path of a mask of all frames, as in `localize`, like all options that follow.
+
+        Returns
+        -------
+        Walk
+            `add(frame, time=None)` returns the `Result` of the frame, from this frame and earlier ones;
+            `time` [s] increases, and is given for all frames or for none. `finish()` returns a list with the
+            result of each frame, from all frames.
         """
         given = check_arguments(Scan.track, locals())
         return self._track(given)
@@ -279,9 +289,36 @@ class Scan:
         within: Sequence[str] | None = None,
         min_confidence: float | None = None,
     ) -> list[Result]:
-        """Return the results of a walk's frames, in order, each of which narrows the others.
+        """Localize the frames of a walk together: each frame restricts the poses of the others.
 
-        `times` [s] rise; without them only the order counts. The others are as in `track`.
+        Parameters
+        ----------
+        frames
+            Photos in the order in which they were taken, each as in `localize`.
+        times
+            Time of each frame [s], increasing. Without times only the order counts.
+        max_speed, max_acceleration
+            As in `track`.
+        mask
+            Path of a mask of all frames, as in `localize`, like all options that follow.
+
+        Returns
+        -------
+        list of Result
+            One for each frame, in order; `walk` says how its pose was found.
+
+        Raises
+        ------
+        InputError
+            Times and frames differ in number, times do not increase, or an option is invalid.
+
+        Examples
+        --------
+        >>> import piccolo
+        >>> scan = piccolo.open_scan("room/cloud.ply")
+        >>> frames = ["room/images/clean_0.jpg", "room/images/clean_1.jpg"]
+        >>> [result.status for result in scan.localize_walk(frames, times=[0.0, 5.0])]
+        ['localized', 'localized']
         """
         given = check_arguments(Scan.localize_walk, locals())
         given.pop("frames")
@@ -310,10 +347,11 @@ class Scan:
         refine_focal: bool | None = None,
         cube_order: str | None = None,
     ) -> NDArray[np.uint8]:
-        """Return the pixels of a photo that contradict the scan at a pose: (H, W), of the full sphere.
+        """Return the pixels of a photo that contradict the scan at a pose, such as moved furniture.
 
-        255 where it contradicts, 0 where the scan explains it, 128 where one of them shows nothing. Options
-        are as in `localize`.
+        The array (H, W) of uint8 is a full sphere, W = 2 H, also for a photo of a part of it: 255 where the
+        photo contradicts the scan, 0 where the scan explains it, 128 where one of them shows nothing. The
+        options are those of `localize`.
         """
         given = check_arguments(Scan.occlusion_mask, locals())
         given.pop("pose")
@@ -328,7 +366,7 @@ class Scan:
         return self._opened.walk(read_options, settings, motion)
 
     def _parse(self, given: Mapping[str, Any]) -> tuple[ReadOptions, Settings, Mask | None]:
-        """Return options of a photo as objects; and the mask, if it is an array."""
+        """Return the options as objects, and the mask if it is an array."""
         reading = {name: given[name] for name in READ_FIELDS & given.keys()}
         mask = reading.pop("mask", None)
         is_masked = mask if isinstance(mask, np.ndarray) else None
@@ -355,7 +393,7 @@ def _replace_settings(settings: Settings, given: dict[str, Any]) -> Settings:
 
 
 def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
-    """Return the prior of some options; InputError if the method has none, or they mean nothing."""
+    """Return the prior that options give; InputError if one is invalid, or the method uses no prior."""
     if not isinstance(settings, CoarseToFineSettings):
         raise InputError(f"`{min(given)}`: not an option of the preset paper")
     return Prior(**given | {"within": tuple(given.get("within", ()))})

@@ -77,7 +77,10 @@ def test_api_page(folder, monkeypatch):
     assert tried > 20
 
 
-@pytest.mark.parametrize("name", ["piccolo", "piccolo.opening", "piccolo.scan", "piccolo.report.build"])
+PUBLIC = ["piccolo", "piccolo.opening", "piccolo.scan", "piccolo.report.build", "piccolo.geometry.pose"]
+
+
+@pytest.mark.parametrize("name", PUBLIC)
 def test_docstrings(name, folder, monkeypatch):
     monkeypatch.chdir(folder)
     known = {"piccolo": piccolo, "open_scan": piccolo.open_scan}

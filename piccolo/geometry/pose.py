@@ -20,10 +20,28 @@ TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to unde
 
 @dataclass(frozen=True)
 class Pose:
-    """Position and rotation of a camera: the map from world to camera coordinates."""
+    """Position and rotation of a camera: `x_cam = R_cam_from_world @ (x_world - center_world)`.
 
-    R_cam_from_world: Array  # (3, 3) rotation, camera axes: +x image centre, +y left, +z up
-    center_world: Array  # (3,) camera position [m]
+    Parameters
+    ----------
+    R_cam_from_world
+        Rotation (3, 3), float64. Camera axes are +x to the image centre, +y left, +z up.
+    center_world
+        Position of the camera (3,) [m], float64, in the scan's own coordinates.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from piccolo import Pose
+    >>> pose = Pose(np.diag([-1.0, -1.0, 1.0]), np.array([1.0, 2.0, 3.0]))
+    >>> pose.R_cam_from_world[0]  # viewing direction of the image centre
+    array([-1.,  0.,  0.])
+    >>> pose.T_world_from_cam @ [2.0, 0.0, 0.0, 1.0]  # the point 2 m ahead
+    array([-1.,  2.,  3.,  1.])
+    """
+
+    R_cam_from_world: Array
+    center_world: Array
 
     @property
     def key(self) -> bytes:
@@ -44,11 +62,11 @@ class Pose:
         return quaternion_wxyz(self.R_cam_from_world)
 
     def inverse(self) -> "Pose":
-        """Return the map from camera to world coordinates."""
+        """Return the inverse transform, which takes camera coordinates to the world's."""
         return Pose(self.R_cam_from_world.T, -self.R_cam_from_world @ self.center_world)
 
     def __matmul__(self, other: "Pose") -> "Pose":
-        """Return the pose that maps by `other` first: `c_from_w = c_from_b @ b_from_w`."""
+        """Compose two transforms, of which `other` is applied first: `c_from_w = c_from_b @ b_from_w`."""
         center_world = other.center_world + other.R_cam_from_world.T @ self.center_world
         return Pose(self.R_cam_from_world @ other.R_cam_from_world, center_world)
 

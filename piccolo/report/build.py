@@ -234,40 +234,48 @@ def write_report(  # noqa: PLR0913  options by name
     num_threads: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Path:
-    """Write a page that shows results on plans, and each photo over the scan; returns the page's path.
+    """Write a page that shows the photos on plans of the scan, and each photo over the scan.
 
     Parameters
     ----------
     results
-        Results, or paths of files of JSON lines by localize.py; or one path.
+        Results, or paths of files of JSON lines that localize.py wrote; one path or several items.
     scan
-        Path of the scan, or of a map by tools/prepare_map.py, or several; or a Scan that is open.
+        The open `Scan`; or the path of a scan or of a prepared map, or several paths.
     out
-        Folder, new, empty or with an earlier report, of which only what has changed is made again.
+        Folder that is new, empty, or has an earlier report, of which only the changed parts are written.
     title
-        Of the page; by default the scan's name.
+        Title of the page, by default the scan's name.
     storeys
-        Names, the lowest first.
+        Names of the storeys, the lowest first, by default numbers.
     images
-        Folder of the photos, where they are no more at the results' paths.
+        Folder of the photos, if they are no longer at the paths in the results.
     full_size
-        Spheres as wide as the photos, in place of 2048 px at most.
+        Keep the size of the photos. By default spheres are at most 2048 px wide.
     self_contained
-        `out` is one HTML file, of at most 50 photos.
+        Write one HTML file at `out`, of at most 50 photos.
     own_plans
-        By storey, 1 the lowest: an image, and a CSV of control points.
+        Plans in place of the drawn ones, by storey (1 is the lowest): paths of an image and of a CSV file of
+        two or more control points, with the columns u, v [px] and x, y [m].
     crs
-        The scan's coordinate system, if it does not name it.
+        Coordinate system of the scan, for an arrow to grid north, if the scan does not name it.
     force
-        Show results of another scan too; the page says so.
-    units, up, cache, num_threads, progress
-        As in `open_scan`; the first three only for files.
+        Show results of another scan too, with a note on the page. Otherwise they raise InputError.
+    units, up, cache
+        As in `open_scan`, if `scan` is a path.
+    num_threads, progress
+        As in `open_scan`.
+
+    Returns
+    -------
+    Path
+        The page: index.html in `out`, or `out` itself if `self_contained`.
 
     Raises
     ------
     InputError
-        A file can't be read, results are of another scan, the folder holds something else, or an option means
-        nothing.
+        A file can't be read, results are of another scan, the folder holds something else, or an option is
+        invalid.
 
     Examples
     --------
