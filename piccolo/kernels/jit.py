@@ -32,6 +32,7 @@ from ..files.atomic import write_atomically
 from ..files.cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+Scalar = float | np.floating[Any]  # a number in a kernel, of float64 or float32
 NAME = own_names("kernel")
 DIGEST_SIZE = hashlib.sha256().digest_size
 # of numba.config: they change the code that is made

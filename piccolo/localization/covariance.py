@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, step
 from ..geometry.sphere import find_cell
-from ..optimize.channel_loss import channel_equations, equations_by_part
+from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
@@ -47,7 +47,8 @@ def compute_gradient(image: Texels, points: Cells, pose: Pose) -> Array:
     """Return the gradient (6,) of the robust loss, in the camera's frame."""
     sums = np.empty(NUM_SUMS)
     center = pose.center_world - points.center_map
-    channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
+    problem = ChannelProblem(points.offsets, points.channels, points.weights, image.rgbx, image.width, SCALE)
+    channel_equations(problem, pose.R_cam_from_world, center, sums)
     return sums[GRADIENT:MATRIX].copy()
 
 
@@ -90,7 +91,7 @@ def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[
     offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
     begins = np.concatenate([[0], np.cumsum(counts)])
     sums = np.empty((len(counts), NUM_SUMS))
-    problem = offsets, levels, weights, image.rgbx, image.width, SCALE
+    problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
     return sums
 

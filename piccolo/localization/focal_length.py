@@ -30,7 +30,7 @@ from .comparison import mask_occluders, score_pose
 from .covariance import assign_blocks, equations_by_block, remove_poles
 from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
-from .refinement import FINE_LOSS, FULL_LOSS, descend, to_levels
+from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
 from .selection import Selection
 
 FOCALS = "f", "fx", "fy"
@@ -51,8 +51,8 @@ AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 5  # [px] within the picture's edge that no point may come near
-NEARBY = (FINE_LOSS, 12, 1e-4)
-CLOSE = (FULL_LOSS, 30, 1e-6)
+NEARBY = Limits(FINE_LOSS, 12, 1e-4)
+CLOSE = Limits(FULL_LOSS, 30, 1e-6)
 
 
 class FocalFit(NamedTuple):

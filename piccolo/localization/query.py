@@ -45,11 +45,11 @@ class Images(NamedTuple):
 
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:
     """Return the images of a panorama, each resized from the one before."""
-    images = []
-    for scale in scales:
+    images = {}
+    for name, scale in scales._asdict().items():
         panorama = resize(panorama, scale.width)
-        images.append(Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg)))
-    return Images(*images)
+        images[name] = Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg))
+    return Images(**images)
 
 
 @dataclass(frozen=True)

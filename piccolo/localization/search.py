@@ -81,11 +81,19 @@ def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Sampl
 
 
 @kernel
-def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validity):
+def widen(
+    samples: Samples,
+    validity: Samples,
+    cells: NDArray[np.int32],
+    cell_areas: Samples,
+    areas: Samples,
+    wide_samples: Samples,
+    wide_validity: Samples,
+) -> None:
     """Write the averages of rounded channels (n, 3, cells) and of validity by area, over wider cells.
 
-    `cells` and `cell_areas` (cells,) are the wider cell of each and its part of that cell's area in `areas`.
-    Validity is rounded.
+    Each cell lies in the wider cell of index `cells` (cells,) and has the area `cell_areas` (cells,); `areas`
+    (wider cells,) are the sums of these. Validity is rounded.
     """
     for k in range(len(samples)):
         channels = wide_samples[k]
@@ -107,13 +115,13 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
 def widen_samples(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
     """Average channels of the search grid to (rotations, 3, wide cells) [levels], and validity."""
     cells, areas = wider_cells(WIDE_RINGS)
-    parts = cells, whole_areas(SEARCH_RINGS), areas
+    cell_areas = whole_areas(SEARCH_RINGS)
     wide = np.empty((len(samples), 3, len(areas)), np.float32)
     is_valid = np.empty((len(samples), len(areas)), np.float32)
 
     def average(lo: int) -> None:
         part = slice(lo, lo + ROTATIONS_AT_ONCE)
-        widen(samples[part], validity[part], *parts, wide[part], is_valid[part])
+        widen(samples[part], validity[part], cells, cell_areas, areas, wide[part], is_valid[part])
 
     workers.map(average, range(0, len(samples), ROTATIONS_AT_ONCE), "search")
     return wide, is_valid
@@ -129,7 +137,7 @@ class Starts:
 
     def take(self, indices: NDArray[np.int64]) -> "Starts":
         """Select the starts at `indices`, in that order."""
-        return Starts(*(values[indices] for values in vars(self).values()))
+        return Starts(self.R_cam_from_map[indices], self.center_map[indices], self.candidate[indices])
 
     def poses(self) -> list[Pose]:
         """Return the poses as objects."""
@@ -137,10 +145,19 @@ class Starts:
 
 
 @kernel
-def unpack_views(features, seen, area, values, fractions, energy, total):
-    """Write views' 8-bit channels (n, 3 * cells) and what is seen (n, cells) as float32, and their energies.
+def unpack_views(
+    features: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+    area: Samples,
+    values: Samples,
+    fractions: Samples,
+    energy: Samples,
+    total: Samples,
+) -> None:
+    """Write views' 8-bit channels (n, 3 * cells) and fractions seen (n, cells) as float32, and energies.
 
-    Energies (n, cells) are squared channels by the area (cells,), in whole numbers; (n,) their totals.
+    Energies (n, cells) are squared channels times the area (cells,), in whole numbers; `total` (n,) their
+    sums.
     """
     num_cells = len(area)
     for i in range(len(features)):
@@ -206,19 +223,23 @@ def masked_correlation(
 def best_poses_wide(
     scan_map: ScanMap, samples: Samples, validity: Samples, pool: int, workers: Workers
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
-    """Return `best_poses` by the masked correlation of wide views with the averaged panorama.
+    """Return the best `pool` poses by the masked correlation of wide views with the averaged panorama.
 
-    In parts of the candidates: a campus in all rotations would have a gigabyte of scores.
+    The result is as of `best_poses`. Candidates are scored in parts: the scores of a campus in all rotations
+    would take a gigabyte.
     """
     area = wider_cells(WIDE_RINGS)[1]
-    panorama = weigh_by_area(*widen_samples(samples, validity, workers), area, 255)
+    wide_samples, wide_validity = widen_samples(samples, validity, workers)
+    panorama = weigh_by_area(wide_samples, wide_validity, area, 255)
     num_views = views_at_once(len(samples))
     least = LOWEST
     sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
     for lo in range(0, len(scan_map.sparse), num_views):
         part = slice(lo, lo + num_views)
-        views = scan_map.wide_features[part], scan_map.wide_seen[part]
-        row, turn, values = best_poses(masked_correlation(*views, area, panorama, workers), pool, least)
+        features = scan_map.wide_features[part]
+        seen = scan_map.wide_seen[part]
+        correlation = masked_correlation(features, seen, area, panorama, workers)
+        row, turn, values = best_poses(correlation, pool, least)
         sparse = np.concatenate([sparse, row + lo])
         rotation = np.concatenate([rotation, turn])
         scores = np.concatenate([scores, values])
@@ -234,10 +255,18 @@ def views_at_once(num_rotations: int) -> int:
 
 
 @kernel
-def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
+def correlate_pairs(
+    features: NDArray[np.int8],
+    is_seen: NDArray[np.bool_],
+    area: Samples,
+    panorama: TurnedPanorama,
+    row: NDArray[np.int64],
+    rotation: NDArray[np.int64],
+    scores: Samples,
+) -> None:
     """Write the masked correlation, up to a factor, of each pair of a view's row and a turned panorama.
 
-    Whole numbers in float64, exact in any order. The area (cells,) is in whole numbers too.
+    Products of whole numbers are summed in float64, exact in any order; the area (cells,) is whole too.
     """
     for k in range(len(scores)):
         f = features[row[k]]

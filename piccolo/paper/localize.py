@@ -60,7 +60,7 @@ def localize(
     rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
     loss = make_loss(panorama, settings)
     with watch.stage("search"):
-        starts = search(points, panorama, loss, (paper_map.positions, rotations), settings, workers)
+        starts = search(points, panorama, loss, paper_map.positions, rotations, settings, workers)
     with watch.stage("refine"):
         refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)

@@ -92,13 +92,12 @@ def search(
     points: PackedPoints,
     panorama: Panorama,
     loss: Loss,
-    grid: tuple[NDArray[np.float64], NDArray[np.float64]],
+    positions: NDArray[np.float64],
+    rotations: NDArray[np.float64],
     settings: PaperSettings,
     workers: Workers,
 ) -> list[Hypothesis]:
-    """Select the K2 poses to descend from, of all positions (N_t, 3) and rotations (N_r, 3, 3) of `grid`."""
-    positions, rotations = grid
-    near = (settings.min_distance, np.radians(settings.min_angle_deg))
+    """Select the K2 poses to descend from, of all positions (N_t, 3) with all rotations (N_r, 3, 3)."""
 
     def losses(center_world: Array) -> list[Hypothesis]:
         seen = visible_points(points, center_world) if settings.use_visibility else points
@@ -107,13 +106,15 @@ def search(
         return [h for h in found if np.isfinite(h.score)]
 
     scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
+    distance = settings.min_distance
+    angle = np.radians(settings.min_angle_deg)
     if settings.initialization == "loss-only":
-        return best_distinct(scored, settings.num_by_histogram, *near)
-    by_loss = best_distinct(scored, settings.num_by_loss, *near)
+        return best_distinct(scored, settings.num_by_histogram, distance, angle)
+    by_loss = best_distinct(scored, settings.num_by_loss, distance, angle)
     small = shrink(panorama, settings.histogram_width)
 
     def rescore(h: Hypothesis) -> Hypothesis:
         return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
 
     by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
-    return best_distinct(by_histogram, settings.num_by_histogram, *near)
+    return best_distinct(by_histogram, settings.num_by_histogram, distance, angle)

@@ -67,7 +67,7 @@ MAX_WARNING = 5000  # characters of a line
 
 
 @inline_kernel
-def is_in_range(node, reach):
+def is_in_range(node: NDArray[np.float32], reach: float) -> bool:
     """Return True if a node (6,) is within `reach` of zero along each axis and has a valid colour."""
     is_one = True
     for k in range(3):
@@ -76,7 +76,14 @@ def is_in_range(node, reach):
 
 
 @kernel
-def first_misplaced(nodes, first_child, level_start, origin, leaf_size, reach):
+def first_misplaced(
+    nodes: NDArray[np.float32],
+    first_child: NDArray[np.int32],
+    level_start: NDArray[np.int32],
+    origin: Array,
+    leaf_size: float,
+    reach: float,
+) -> int:
     """Return the first node outside its parent's voxel, beyond `reach` [m] or without valid colour, or -1.
 
     The links must be right. `origin` (3,) leads from a corner of all levels' grids to zero [m].

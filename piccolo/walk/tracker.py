@@ -19,7 +19,15 @@ from ..localization.covariance import estimate_covariance
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
-from ..localization.refinement import FULL_LOSS, descend, descend_fine, descend_middle, perturb_middle, refine
+from ..localization.refinement import (
+    FULL_LOSS,
+    Limits,
+    descend,
+    descend_fine,
+    descend_middle,
+    perturb_middle,
+    refine,
+)
 from ..localization.search import search_poses
 from ..localization.selection import CLEAR_SCORE, assess_poses, rank
 from ..localization.settings import CoarseToFineSettings
@@ -44,7 +52,7 @@ LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
 MOST_LISTED = 12  # poses of a frame
 KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
-LAST_LIMITS = (FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
+LAST_LIMITS = Limits(FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
 MOST_TRACKED = 6  # poses from which a frame is tracked
 MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
