@@ -1,4 +1,4 @@
-"""Comparison of the scan at a pose with the photo, in blocks of the sphere, over what both show.
+"""Compares the scan at a pose with the photo, in blocks of the sphere, over the area that both show.
 
 An occluder costs the blocks that it hides and no more: a right pose explains some blocks well and others not
 at all, a wrong one explains all of them a little.
@@ -228,7 +228,7 @@ def compare(query: Query, pose: Pose) -> Comparison:
 
 
 def score_pose(query: Query, pose: Pose) -> Hypothesis:
-    """Score a pose as poses are selected."""
+    """Score a pose by comparing the scan with the photo, as for selection."""
     return Hypothesis(pose, compare(query, pose).score)
 
 

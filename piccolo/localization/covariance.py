@@ -72,8 +72,7 @@ def remove_poles(points: Cells, pose: Pose) -> Cells:
 def compute_hessian(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
-    The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too
-    small.
+    The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
     """
     rows = []
     for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
@@ -112,7 +111,7 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
     """Return gradients (B, 6) as at a pose found without each block, by matrices (B, 6, 6).
 
     The more information one block holds, the more the pose has followed its errors, and the less of them its
-    gradient shows: g <- (I - A_b A^-1)^-1 g, of the block's part A_b of the Gauss-Newton matrix A
+    gradient shows: g <- (I - A_b A^-1)^-1 g, with the block's part A_b of the Gauss-Newton matrix A
     (the estimate CR3 of Bell and McCaffrey, 2002).
     """
     shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
@@ -122,8 +121,8 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, for errors correlated within blocks.
 
-    The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the points
-    do not fix the pose.
+    It is the sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the
+    points do not fix the pose.
     """
     variances, axes = np.linalg.eigh(hessian)
     if len(gradients) <= 12 or variances[0] <= 1e-9 * variances[-1]:

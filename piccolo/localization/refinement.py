@@ -131,7 +131,10 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
 
 
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
-    """Perturb and refine for as long as the score rises. Poses already converged are returned unchanged."""
+    """Perturb and refine a pose for as long as its score rises.
+
+    A pose that has converged before is returned unchanged.
+    """
     if fit.pose.key in query.cache.ends:
         return fit
     config = query.method.fine_view
@@ -157,7 +160,7 @@ def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
 def best_and_alternatives(
     rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, min_distance: float
 ) -> NDArray[np.int64]:
-    """Return indices of `count` of the poses (n, 3, 3), (n, 3), which come best first, in rising order.
+    """Return the indices of `count` of the ranked poses (n, 3, 3), (n, 3), best first, in ascending order.
 
     Three quarters are the best poses that differ a little, a quarter the best that lie far apart.
     """
@@ -306,7 +309,7 @@ def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
 
 
 def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
-    """Score a pose on cells, each in its block of the sphere."""
+    """Score a pose on cells, each of which lies in a block of the sphere."""
     t = pose.center_world - cells.center_map
     levels = to_levels(cells.channels)
     R = pose.R_cam_from_world

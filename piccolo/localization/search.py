@@ -1,7 +1,7 @@
 """Score every candidate position with every rotation, and keep the distinct best.
 
-All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products
-come out the same whatever the processor and its BLAS.
+All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products are
+equal on all processors and BLAS libraries.
 """
 
 import math
@@ -54,7 +54,7 @@ def to_whole_numbers(values: Samples, most: float, most_other: int, num_terms: i
 
 
 def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
-    """Return the factor of `to_whole_numbers`."""
+    """Return the factor by which `to_whole_numbers` multiplies."""
     return np.float32(EXACT // (most_other * num_terms) / most)
 
 
@@ -179,7 +179,7 @@ _local = threading.local()
 
 
 def thread_block(num_views: int, num_cells: int) -> list[Samples]:
-    """Return room for `unpack_views`, the thread's own: fresh memory costs as much as the products."""
+    """Return the calling thread's own arrays for `unpack_views`: allocation costs as much as products."""
     kept: list[Samples] = getattr(_local, "block", [])
     if not kept or len(kept[0]) < num_views or kept[1].shape[1] != num_cells:
         num_rows = max(BLOCK, num_views)
@@ -289,7 +289,7 @@ def best_poses(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
     """Return candidates, rotations and scores of the best `pool` poses above `least`, best first.
 
-    Of equal scores, the first. A threshold from a sample of the scores keeps the sorted part small.
+    Of equal scores, the first is taken. A threshold from a sample of the scores keeps the sorted part small.
     """
     flat = scores.ravel()
     pool = min(pool, flat.size)
@@ -304,13 +304,15 @@ def best_poses(
         alike = np.flatnonzero(flat == threshold)[: pool - len(top)]
         top = np.concatenate([top, alike])
     top = top[np.lexsort((top, -flat[top]))][:pool]
-    return *np.divmod(top, scores.shape[1]), flat[top]
+    row, column = np.divmod(top, scores.shape[1])
+    return row, column, flat[top]
 
 
 def search_poses(query: Query, gravity: Gravity) -> Starts:
     """Search all candidates with all rotations in two stages; return the distinct best.
 
-    Wide cells of the sparse candidates, by matrix products; then fine cells of the remaining poses.
+    The first scores wide cells of the sparse candidates, by matrix products, the second fine cells of the best
+    poses.
     """
     m = query.scan_map
     settings = query.settings
