@@ -311,8 +311,8 @@ def best_poses(
 def search_poses(query: Query, gravity: Gravity) -> Starts:
     """Search all candidates with all rotations in two stages; return the distinct best.
 
-    The first scores wide cells of the sparse candidates, by matrix products, the second fine cells of the best
-    poses.
+    The first scores wide cells of the sparse candidates, by matrix products, the second scores fine cells of
+    the best poses.
     """
     m = query.scan_map
     settings = query.settings

@@ -31,7 +31,7 @@ PAPER_WEIGHTS = (6.37, 2.51)
 
 @dataclass(frozen=True)
 class PaperMap(LocalCloud):
-    """What the paper's method prepares once per cloud."""
+    """The paper's map, prepared once per cloud."""
 
     positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
