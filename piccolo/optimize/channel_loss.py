@@ -62,7 +62,7 @@ def geman_mcclure(square: Scalar, inverse_scale2: Scalar) -> tuple[Scalar, Scala
 
 @inline_kernel
 def beyond_chance(correlation: float) -> float:
-    """Return how far a block's correlation exceeds that of wrong poses, in [0, 1]."""
+    """Return the part of a block's correlation that exceeds those of wrong poses, in [0, 1]."""
     return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
 
 
