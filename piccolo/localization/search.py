@@ -233,7 +233,9 @@ def best_poses_wide(
     panorama = weigh_by_area(wide_samples, wide_validity, area, 255)
     num_views = views_at_once(len(samples))
     least = LOWEST
-    sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
+    sparse = np.empty(0, np.int64)
+    rotation = np.empty(0, np.int64)
+    scores = np.empty(0, np.float32)
     for lo in range(0, len(scan_map.sparse), num_views):
         part = slice(lo, lo + num_views)
         features = scan_map.wide_features[part]
@@ -244,7 +246,9 @@ def best_poses_wide(
         rotation = np.concatenate([rotation, turn])
         scores = np.concatenate([scores, values])
         best = np.lexsort((rotation, sparse, -scores))[:pool]
-        sparse, rotation, scores = sparse[best], rotation[best], scores[best]
+        sparse = sparse[best]
+        rotation = rotation[best]
+        scores = scores[best]
         least = scores[-1] if len(best) == pool else LOWEST
     return sparse, rotation, scores
 
@@ -330,7 +334,8 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     num_starts = min(num_starts, settings.max_starts)
     sparse, turn, _ = best_poses_wide(m, samples, validity, num_starts * POSES_PER_START, query.workers)
     candidate = m.sparse[sparse]
-    R, centers = rotations[turn], m.centers[candidate]
+    R = rotations[turn]
+    centers = m.centers[candidate]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
     candidate = candidate[kept]
     scores = np.empty(len(kept), np.float32)

@@ -127,7 +127,8 @@ def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:
 
 def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
     """Return the region of a picture centred on the horizon, with equal degrees a pixel both ways."""
-    wide, high = fov_deg / 360.0, fov_deg / 180.0 * height / width  # fractions of the sphere's picture
+    wide = fov_deg / 360.0  # fraction of the sphere's picture
+    high = fov_deg / 180.0 * height / width
     return CropRegion((1.0 - wide) / 2.0, (1.0 - high) / 2.0, wide, high)
 
 
@@ -138,7 +139,8 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
 
     Raises InputError if the region does not fit the picture, or the full sphere would be too large.
     """
-    width, height = size[0] / region.width, size[1] / region.height
+    width = size[0] / region.width
+    height = size[1] / region.height
     found = f"{path}: found {size[0]} x {size[1]}"
     if abs(width - 2.0 * height) > ASPECT_TOLERANCE * 2.0 * height:
         raise InputError(f"{found} of a sphere of {width:.0f} x {height:.0f}, wanted that width = 2 x height")
