@@ -1,4 +1,4 @@
-"""A walk through a scan, frame by frame, and its results: what `Scan.track` gives."""
+"""A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
 import json
 from dataclasses import dataclass, fields, replace
@@ -38,7 +38,7 @@ class WalkAbout:
 
 @dataclass(frozen=True)
 class Taken:
-    """A frame as it was given."""
+    """A frame as given by the user."""
 
     picture: Picture
     name: str
@@ -50,7 +50,7 @@ class Taken:
 
 
 class Prepared(NamedTuple):
-    """A frame that is ready to be followed."""
+    """A frame that is ready to be tracked."""
 
     taken: Taken
     panorama: Panorama | None  # None of one that can't be read
@@ -58,14 +58,14 @@ class Prepared(NamedTuple):
 
 
 def photo_facts(picture: Picture, rig: Calibration | None) -> PhotoFacts:
-    """Return what is known of a photo beside its pixels."""
+    """Return the facts of a photo besides its pixels: digest, size, time, place."""
     return (
         photo_of_array(picture) if isinstance(picture, np.ndarray) else read_photo_facts(Path(picture), rig)
     )
 
 
 class Walk:
-    """A camera followed through a scan: `add` frames in order; `finish` tells what all say together."""
+    """A camera tracked through a scan: `add` frames in order; `finish` uses all frames together."""
 
     def __init__(self, tracker: Tracker, read_options: ReadOptions, about: WalkAbout) -> None:
         self.tracker = tracker
@@ -74,15 +74,15 @@ class Walk:
         self.taken: list[Taken] = []
 
     def add(self, frame: Picture, time: float | None = None, name: str | None = None) -> Result:
-        """Find where the camera is now, by this frame and those before.
+        """Localize a frame, by it and the frames before.
 
-        A frame that can't be read is a result that says so. `time` [s] is that since any beginning, of all
-        frames or of none; `name` stands in the result in place of the path.
+        A frame that can't be read has a result that says so. `time` [s] counts from any beginning, and is
+        given for all frames or for none; `name` replaces the path in the result.
         """
         return self.follow(self.prepare(frame, name), time)
 
     def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
-        """Read a frame, and make all of it that does not depend on the others; another thread may do it."""
+        """Read a frame and prepare what does not depend on other frames; another thread may do it."""
         watch = Stopwatch()
         name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
         with reading_once():
@@ -103,7 +103,7 @@ class Walk:
         return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None) -> Result:
-        """Return the result of `add`, of a frame that was prepared."""
+        """Localize a prepared frame, as `add` does."""
         number = len(self.taken)
         taken, panorama, query = prepared
         when = float(number) if time is None else float(time)
@@ -121,12 +121,12 @@ class Walk:
         return self._now(self.tracker.frames[-1], number)
 
     def accept(self, taken: Taken, frame: Frame) -> None:
-        """Add a frame that was found earlier, or that can't be read."""
+        """Add a frame that was localized earlier, or that can't be read."""
         self.taken.append(taken)
         self.tracker.accept(frame)
 
     def last_to_json(self) -> str:
-        """Return the last frame and its pose on one line, from which `restore` goes on."""
+        """Return the last frame and its poses on one line, for `restore`."""
         taken = self.taken[-1]
         frame = self.tracker.frames[-1]
         alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
@@ -136,9 +136,12 @@ class Walk:
         return json.dumps({**about, **failure, "frame": frame.to_json(), "alone": alone})
 
     def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
-        """Take the next frame from a line of `last_to_json`, if it is of this picture as it is now."""
+        """Take the next frame from a line of `last_to_json`, if it is of this picture, unchanged."""
         document = json.loads(line)
-        failure = document["failure"] and Failure(*document["failure"])
+        failure = None
+        if document["failure"]:
+            text, is_passing = document["failure"]
+            failure = Failure(text, is_passing)
         digest = document["photo"][0] if document["photo"] else document["sha256"]
         is_same = document["pano"] == name and document["frame"]["time"] == time
         if not is_same or (failure and failure.is_passing):
@@ -156,7 +159,7 @@ class Walk:
         return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
-        """Return the result of each frame, by all of them."""
+        """Return the result of each frame, given all frames."""
         path = finish(self.tracker, self._panorama, show)
         found = make_localizations(self.tracker, path)
         return [
@@ -178,7 +181,7 @@ class Walk:
         return replace(read_photo(taken.picture, self.read_options), focal_prior=None)
 
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
-        """Return the result of a frame; one that can't be read keeps its place in the walk."""
+        """Return the result of a frame; a frame that can't be read keeps its place in the walk."""
         about = self.about
         photo = taken.photo
         digest = self.tracker.scan_map.scan_sha256 or None
@@ -199,6 +202,6 @@ class Walk:
 
 
 def localization_in(result: Result) -> Localization:
-    """Return the localization of which a result is made."""
+    """Return the localization in a result."""
     names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras"}
     return Localization(pose=result.best_pose, **{name: getattr(result, name) for name in names})

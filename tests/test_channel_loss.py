@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.optimize.channel_loss import CHANCE, NUM_BLOCKS, channel_equations, correlate, score
+from piccolo.optimize.channel_loss import (
+    CHANCE,
+    NUM_BLOCKS,
+    ChannelProblem,
+    channel_equations,
+    correlate,
+    score,
+)
 from piccolo.optimize.levenberg_marquardt import levenberg_marquardt, retract, solve_damped
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.panorama.texels import pack_texels
@@ -38,7 +45,7 @@ def _loss(problem, pose):
 def _sums(problem, pose, is_valid=None):
     points, levels, weights, rgb = problem
     sums, texels = np.empty(NUM_SUMS), pack_texels(rgb, is_valid)
-    arguments = points, levels, weights, texels.rgbx, texels.width, SCALE
+    arguments = ChannelProblem(points, levels, weights, texels.rgbx, texels.width, SCALE)
     channel_equations(arguments, pose.R_cam_from_world, pose.center_world, sums)
     return sums
 

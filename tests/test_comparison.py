@@ -69,8 +69,8 @@ def test_a_photo_is_sampled_as_its_twin():
     offsets, texels = rng.normal(size=(3, 900)).astype(np.float32), pack_texels(rgb, is_valid)
     weights = rng.uniform(0.5, 1.5, 900).astype(np.float32)
     colors, shared, rays = (np.empty(shape, np.float32) for shape in ((3, 900), 900, (3, 900)))
-    photo, center = (texels.rgbx, texels.width), np.array([0.01, -0.02, 0.03])
-    sample_photo(offsets, weights, photo, TILTED, center, colors, shared, rays)
+    center = np.array([0.01, -0.02, 0.03])
+    sample_photo(offsets, weights, texels, TILTED, center, colors, shared, rays)
     pixels = naive.project(offsets.T, TILTED, center, 256)
     r, g, b = naive.sample(rgb, pixels).T / 255
     np.testing.assert_allclose(colors, [(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], atol=2e-3)

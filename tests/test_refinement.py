@@ -17,7 +17,7 @@ from piccolo.jobs.threads import Once, Workers
 from piccolo.localization import last_descent, refinement
 from piccolo.localization import query as query_module
 from piccolo.localization.query import Cache, Images, prepare_query
-from piccolo.localization.refinement import Fit, best_and_alternatives, narrow
+from piccolo.localization.refinement import Fit, Limits, best_and_alternatives, narrow
 from piccolo.localization.search import Starts
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.views.view import Cells
@@ -114,9 +114,9 @@ def test_the_beam_narrows_from_stage_to_stage(monkeypatch):
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
 
-    def around(cells, blocks, images, pose, size, workers):
+    def around(cells, blocks, wide_image, narrow_image, pose, size, workers):
         sizes.append(size)
-        assert images == ("middle", "fine")
+        assert (wide_image, narrow_image) == ("middle", "fine")
         return Fit(pose, score[0])
 
     def fine(query, pose):
@@ -238,11 +238,11 @@ def _fine():
 def test_descent_finds_the_true_pose_again():
     (cells, true_pose), image = _fine(), _query(1).photo.images.fine()
     off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
-    pose = refinement.descend(cells, image, off, (1.0, 30, 1e-5))
+    pose = refinement.descend(cells, image, off, Limits(1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
     before, after = (refinement.score_on_cells(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
     assert after > max(0.6, before)
-    assert rooms.errors(refinement.descend(cells, image, off, (1.0, 1, 1e-5)), true_pose)[0] > 0.01
+    assert rooms.errors(refinement.descend(cells, image, off, Limits(1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
 
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
@@ -250,7 +250,7 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     off = step(true_pose, refinement.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
-    problem = cells, FINE_BLOCKS, (images.search(), images.middle()), off, 1.0
+    problem = cells, FINE_BLOCKS, images.search(), images.middle(), off, 1.0
     found, by_two = (refinement.descend_around(*problem, Workers(n)) for n in (1, 2))
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
@@ -272,7 +272,7 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     channels = views.features[row].astype(np.float32) / np.float32(63.75)
     weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
     cells, center = Cells(offsets, channels, weights, scan_map.centers[k]), scan_map.centers[k]
-    alone = refinement.descend(cells, image, Pose(R, center), (1.2, 12, 2e-3))
+    alone = refinement.descend(cells, image, Pose(R, center), Limits(1.2, 12, 2e-3))
     np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
     np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)
     assert rooms.errors(alone, true_pose)[0] < 0.1

@@ -1,1 +1,1 @@
-"""The default method: where in a prepared scan a panorama was taken."""
+"""The default method: it localizes a panorama in a prepared scan."""

@@ -143,8 +143,8 @@ def brief_query(query: Query) -> Query:
 def tilt_query(query: Query) -> Query:
     """Return a brief query with any tilt, for a whole photo that was searched as upright.
 
-    It searches every other cell of the grid, with few rotations. That finds tilted photos without
-    occluders; features find the others.
+    It searches every other cell of the grid, with few rotations. That finds tilted photos without occluders;
+    features find the others.
     """
     brief = brief_query(query)
     cells = np.floor(query.scan_map.centers[query.scan_map.sparse] / COARSE_SPACING).astype(np.int64)
@@ -168,7 +168,7 @@ def score_starts(query: Query, starts: Starts) -> float:
 
 
 def mirror_query(query: Query) -> Query:
-    """Return the query of the photo mirrored left to right, without the heading prior, for a first score."""
+    """Return the query of the photo mirrored left to right, without the prior's heading."""
     search = query.photo.images.search()
     rgbx = np.ascontiguousarray(search.rgbx.reshape(-1, search.width + 2)[:, ::-1]).reshape(-1)
     images = query.photo.images._replace(search=Once(lambda: Texels(rgbx, search.width)))

@@ -1,4 +1,4 @@
-"""Comparison of the scan at a pose with the photo, in blocks of the sphere, over what both show.
+"""Compares the scan at a pose with the photo, in blocks of the sphere, over the area that both show.
 
 An occluder costs the blocks that it hides and no more: a right pose explains some blocks well and others not
 at all, a wrong one explains all of them a little.
@@ -12,20 +12,31 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.alternatives import Hypothesis
-from ..geometry.pose import Pose
+from ..geometry.pose import Array, Pose
 from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import CHUNK, bilinear_weights, blend, gather, is_valid, make_projected, project
+from ..panorama.texels import (
+    CHUNK,
+    Texels,
+    bilinear_weights,
+    blend,
+    gather,
+    is_valid,
+    make_projected,
+    project,
+)
 from ..views.points_around import round_position
-from ..views.view import average_colors, cell_statistics, empty_cells, locate
+from ..views.view import ViewArrays, average_colors, cell_statistics, empty_cells, locate
 from .query import Query
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
 LEAST_SHARED = 0.3  # fraction of what the poorer view shows
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
+
+Array32 = NDArray[np.float32]
 
 
 class Comparison(NamedTuple):
@@ -43,7 +54,7 @@ class Comparison(NamedTuple):
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
     def compute_ratio(self, other: "Comparison") -> float:
-        """Return what this pose explains divided by what another does, over blocks that both views show.
+        """Return the ratio of the area explained by this pose to another's, over blocks that both views show.
 
         Over all blocks, a pose from which more was scanned would gain by that alone. 0 if hardly any block
         is shared.
@@ -56,12 +67,22 @@ class Comparison(NamedTuple):
 
 
 @kernel
-def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared, rays):
+def sample_photo(
+    offsets: Array32,
+    weights: Array32,
+    photo: Texels,
+    R_cam_from_map: Array,
+    center: Array,
+    colors: Array32,
+    shared: Array32,
+    rays: Array32,
+) -> None:
     """Write the photo's opponent channels (3, N) at cells (3, N), weights of what both show, rays (3, N).
 
-    `center` (3,) [m] of the camera counts from where the offsets of the cells do.
+    The camera's `center` (3,) [m] is relative to the point from which the offsets of the cells are measured.
     """
-    texels, width = photo
+    texels = photo.rgbx
+    width = photo.width
     p = make_projected()
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
@@ -87,8 +108,8 @@ def sample_photo(offsets, weights, photo, R_cam_from_map, center, colors, shared
 
 
 @kernel
-def normalize(colors, shared, view, normalized):
-    """Write channels (3, N) less their local mean, by their local deviation, over the shared cells."""
+def normalize(colors: Array32, shared: Array32, view: ViewArrays, normalized: Array32) -> None:
+    """Write channels (3, N) minus local mean, divided by local deviation, over the shared cells."""
     moments = np.zeros((view.num_stats, 8), np.float32)
     stats = np.empty((6, len(shared)), np.float32)
     for n in range(len(shared)):
@@ -105,7 +126,14 @@ def normalize(colors, shared, view, normalized):
 
 
 @kernel
-def correlate_blocks(first, second, shared, blocks, correlation, area):
+def correlate_blocks(
+    first: Array32,
+    second: Array32,
+    shared: Array32,
+    blocks: NDArray[np.int32],
+    correlation: Array,
+    area: Array,
+) -> None:
     """Write the correlation and the area (blocks,) of two sets of channels (3, N) over the shared cells."""
     energy = np.zeros((len(area), 2))
     correlation[:] = 0.0
@@ -124,12 +152,24 @@ def correlate_blocks(first, second, shared, blocks, correlation, area):
 
 @kernel
 def compare_cells(
-    offsets, colors, weights, photo, R_cam_from_map, center, view, grid, correlation, area, visible_area
-):
+    offsets: Array32,
+    colors: Array32,
+    weights: Array32,
+    photo: Texels,
+    R_cam_from_map: Array,
+    center: Array,
+    view: ViewArrays,
+    num_columns: NDArray[np.int32],
+    first_cell: NDArray[np.int32],
+    correlation: Array,
+    area: Array,
+    visible_area: Array,
+) -> None:
     """Write the correlation and the shared area (blocks,) of cells (3, N) around a camera with its photo.
 
-    Blocks are cells of a grid of `num_columns`, `first` in the camera's frame. Those that contradict are left
-    out of the local means and deviations, and all is compared once more.
+    Blocks are cells of a grid in the camera's frame, whose rings have `num_columns` cells and begin with
+    `first_cell`. Cells are compared twice: blocks that contradict are left out of the local means and
+    deviations of the second comparison.
     """
     n = len(weights)
     of_photo = np.empty_like(colors)
@@ -139,7 +179,7 @@ def compare_cells(
     blocks = np.empty(n, np.int32)
     ranges = np.empty(n, np.float32)
     turns = np.empty(n, np.float32)
-    locate(rays[0], rays[1], rays[2], grid[0], grid[1], blocks, ranges, turns)
+    locate(rays[0], rays[1], rays[2], num_columns, first_cell, blocks, ranges, turns)
     first = np.empty_like(colors)
     second = np.empty_like(colors)
     kept = shared.copy()
@@ -172,11 +212,12 @@ def compare(query: Query, pose: Pose) -> Comparison:
             offsets,
             colors,
             weights,
-            (photo.rgbx, photo.width),
+            photo,
             pose.R_cam_from_world,
             pose.center_world - center,
             view,
-            (grid.num_columns, grid.first),
+            grid.num_columns,
+            grid.first,
             by_block[0],
             by_block[1],
             by_block[2],
@@ -187,7 +228,7 @@ def compare(query: Query, pose: Pose) -> Comparison:
 
 
 def score_pose(query: Query, pose: Pose) -> Hypothesis:
-    """Score a pose as poses are selected."""
+    """Score a pose by comparing the scan with the photo, as for selection."""
     return Hypothesis(pose, compare(query, pose).score)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, step
 from ..geometry.sphere import find_cell
-from ..optimize.channel_loss import channel_equations, equations_by_part
+from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
@@ -47,7 +47,8 @@ def compute_gradient(image: Texels, points: Cells, pose: Pose) -> Array:
     """Return the gradient (6,) of the robust loss, in the camera's frame."""
     sums = np.empty(NUM_SUMS)
     center = pose.center_world - points.center_map
-    channel_equations((*points[:3], image.rgbx, image.width, SCALE), pose.R_cam_from_world, center, sums)
+    problem = ChannelProblem(points.offsets, points.channels, points.weights, image.rgbx, image.width, SCALE)
+    channel_equations(problem, pose.R_cam_from_world, center, sums)
     return sums[GRADIENT:MATRIX].copy()
 
 
@@ -71,8 +72,7 @@ def remove_poles(points: Cells, pose: Pose) -> Cells:
 def compute_hessian(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
-    The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too
-    small.
+    The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
     """
     rows = []
     for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
@@ -90,7 +90,7 @@ def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[
     offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
     begins = np.concatenate([[0], np.cumsum(counts)])
     sums = np.empty((len(counts), NUM_SUMS))
-    problem = offsets, levels, weights, image.rgbx, image.width, SCALE
+    problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
     return sums
 
@@ -111,7 +111,7 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
     """Return gradients (B, 6) as at a pose found without each block, by matrices (B, 6, 6).
 
     The more information one block holds, the more the pose has followed its errors, and the less of them its
-    gradient shows: g <- (I - A_b A^-1)^-1 g, of the block's part A_b of the Gauss-Newton matrix A
+    gradient shows: g <- (I - A_b A^-1)^-1 g, with the block's part A_b of the Gauss-Newton matrix A
     (the estimate CR3 of Bell and McCaffrey, 2002).
     """
     shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
@@ -121,8 +121,8 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, for errors correlated within blocks.
 
-    The sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the points
-    do not fix the pose.
+    It is the sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the
+    points do not fix the pose.
     """
     variances, axes = np.linalg.eigh(hessian)
     if len(gradients) <= 12 or variances[0] <= 1e-9 * variances[-1]:

@@ -1,9 +1,9 @@
-"""The focal length of a photo, fitted with its pose: by the scan and by prior knowledge.
+"""The focal length of a photo, fitted with its pose to the scan and to prior knowledge.
 
-The photo is projected again for each of several focal lengths (and of k1, if a guessed camera has it),
-and the pose refined with each. The losses at the ends are the profile of the loss. Its crest is the focal
-length on which photo and scan agree; the slopes of the blocks' losses at the crest give its covariance. The
-covariance of the pose is marginal: it includes the error by the focal length.
+The photo is projected again with each of several focal lengths (and k1, if a guessed camera has it), and the
+pose refined with each. The losses at the ends are the profile of the loss. Its crest is the focal length on
+which photo and scan agree; the slopes of the blocks' losses at the crest give its covariance. The covariance
+of the pose is marginal: it includes the error of the focal length.
 """
 
 import itertools
@@ -30,7 +30,7 @@ from .comparison import mask_occluders, score_pose
 from .covariance import assign_blocks, equations_by_block, remove_poles
 from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
-from .refinement import FINE_LOSS, FULL_LOSS, descend, to_levels
+from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
 from .selection import Selection
 
 FOCALS = "f", "fx", "fy"
@@ -51,8 +51,8 @@ AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 5  # [px] within the picture's edge that no point may come near
-NEARBY = (FINE_LOSS, 12, 1e-4)
-CLOSE = (FULL_LOSS, 30, 1e-6)
+NEARBY = Limits(FINE_LOSS, 12, 1e-4)
+CLOSE = Limits(FULL_LOSS, 30, 1e-6)
 
 
 class FocalFit(NamedTuple):
@@ -70,17 +70,17 @@ class FocalFit(NamedTuple):
 
     @property
     def is_at_rest(self) -> bool:
-        """True if the remaining change is too small to put the photo on the sphere again."""
+        """True if the remaining change is too small to project the photo again."""
         deviations = np.sqrt(np.diag(self.covariance))
         return bool(np.all(np.abs(self.change) <= np.maximum(AT_REST * deviations, LEAST_CHANGE)))
 
     @property
     def pose_covariance(self) -> Array:
-        """Covariance (6, 6) of a pose by that of the calibration: rotation, then centre in the map."""
+        """Covariance (6, 6) that the calibration adds to a pose: rotation, then centre in the map."""
         return np.asarray(self.motion @ self.covariance @ self.motion.T)
 
     def move(self, pose: Pose) -> Pose:
-        """Move a pose in the map with the change."""
+        """Move a pose in the map by the change of the calibration."""
         delta = self.motion @ self.change
         return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:])
 
@@ -146,7 +146,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     """Search the crest of the profile about a pose in ever narrower designs, moved if they miss it.
 
-    Its information is 0 if no design has a crest: the picture does not determine the calibration.
+    Its information is 0 if no design has a crest: then the picture does not determine the calibration.
     """
     middle = np.zeros(num)
     found: Crest | None = None
@@ -169,7 +169,7 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
 
 
 def make_design(num: int, reach: float) -> Array:
-    """Return changes (K, num) of a camera on a grid within a reach on either side."""
+    """Return changes (K, num) of a camera, on a grid with a reach to either side."""
     values = np.linspace(-reach, reach, NUM_VALUES if num == 1 else NUM_VALUES_OF_TWO)
     scales = [values, values * K1_PER_FOCAL]
     return np.array(list(itertools.product(*scales[:num])))
@@ -178,7 +178,7 @@ def make_design(num: int, reach: float) -> Array:
 def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[Pose]]:
     """Descend from a pose with each of several calibrations (K, p) of the photo's camera.
 
-    Returns the losses (K, B) of each block of the sphere at the ends, and the ends.
+    Return the losses (K, B) of each block of the sphere at the ends, and the ends.
     """
     given = query.photo.given
     shown = mask_occluders(query, pose)
@@ -221,7 +221,7 @@ def mask_edge(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
 def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Crest:
     """Find the crest of a profile by a quadratic function (least squares), and how poses follow the camera.
 
-    The changes (K, p) of the camera have losses (K, B) by block and poses; `pose` is that of none.
+    The changes (K, p) of the camera have losses (K, B) by block, and poses; `pose` is that without a change.
     The covariance of the crest is H^-1 (sum g g^T) H^-1, with the slope g of each block's loss there.
     """
     middle = changes.mean(axis=0)
@@ -279,7 +279,7 @@ def recalibrate(query: Query, change: Array) -> Query:
 
 
 def _turn_features(half: Once[Features], before: Mount, after: Mount) -> Features:
-    """Turn the rays of features to those that another calibration gives their pixels."""
+    """Give the features the rays that another calibration gives to their pixels."""
     found = half()
     keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
     return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))

@@ -1,4 +1,4 @@
-"""The last descent: mask occluders, descend on the points of the scan, repeat until the pose rests."""
+"""The last descent: mask occluders, descend on the points of the scan, repeat until the pose converges."""
 
 import math
 from collections.abc import Sequence
@@ -30,8 +30,8 @@ NEAR_MATCHES = 0.5  # and so is one with this fraction of its matches
 MAX_REFINED = 4  # alternatives
 MAX_UNOCCLUDED = 2  # rounds that mask occluders
 NUM_ROUNDS = 2  # of the descent at full resolution
-FULL_LIMITS = (FULL_LOSS, 10, 1e-4)
-LAST_LIMITS = (FULL_LOSS, 30, 1e-7)
+FULL_LIMITS = Limits(FULL_LOSS, 10, 1e-4)
+LAST_LIMITS = Limits(FULL_LOSS, 30, 1e-7)
 NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
 MAX_LAST_ROUNDS = 6
 SETTLED = 1e-4  # [m] a smaller move ends the last rounds
@@ -41,7 +41,7 @@ MIN_SCORE_LEFT = 0.94  # fraction of the score that a descent on points must kee
 def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
     """Refine the best hypothesis and the alternatives that come near it, and select the best.
 
-    If all are faint, only the best is refined first, on fine cells; if it stays faint, that is all.
+    If all are faint, only the best is refined first, on fine cells; if it stays faint, refinement ends.
     """
     found = rank(hypotheses)
     if found.best.score < HOPELESS_SCORE:
@@ -99,7 +99,7 @@ def refine_full_resolution(query: Query, pose: Pose) -> Hypothesis:
 
 
 def settle(query: Query, h: Hypothesis) -> Hypothesis:
-    """Descend until the pose rests, so that it does not depend on where the search began."""
+    """Descend until the pose converges, so that it does not depend on where the search began."""
     shown = mask_occluders(query, h.pose)
     return descend_on_points(query, shown, h, LAST_LIMITS, MAX_LAST_ROUNDS, SETTLED)
 

@@ -61,7 +61,8 @@ def localize(
             found = refine_to_the_end(query, hypotheses)
             if panorama.focal_prior is None or found.best.score < HOPELESS_SCORE:
                 return judge(query, found)
-            return judge(*calibrate(query, found))
+            query, found, fit = calibrate(query, found)
+            return judge(query, found, fit)
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:

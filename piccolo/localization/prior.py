@@ -1,4 +1,4 @@
-"""What the user knows beforehand, as fewer positions and fewer rotations."""
+"""Prior knowledge of the user: it leaves fewer positions and rotations to search."""
 
 import math
 
@@ -15,7 +15,7 @@ STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no
 
 
 def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
-    """Which candidates (N,) each option allows, by half a grid spacing more than it says."""
+    """Return the candidates (N,) that each option allows, with a margin of half a grid spacing."""
     allowed: dict[str, NDArray[np.bool_]] = {}
     if prior.near_world is not None and prior.radius is not None:
         allowed["`near_world`"] = (
@@ -32,7 +32,7 @@ def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_
 
 
 def distances_to(scan_map: ScanMap, near_world: tuple[float, float, float | None]) -> NDArray[np.float64]:
-    """Distance (N,) [m] of each candidate from a place; without its z, along the ground."""
+    """Return the distance (N,) [m] of each candidate from a place; along the ground if it has no z."""
     x, y, z = near_world
     centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
     offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
@@ -55,7 +55,7 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
 
 
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
-    """The map, of which those cells of the coarse grid are searched in which the prior allows a candidate."""
+    """Return the map with only those cells of the coarse grid in which the prior allows a candidate."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
     for mask in check_options(scan_map, prior).values():
         is_allowed &= mask
@@ -65,7 +65,7 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
 
 
 def allow_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
-    """The rotations (N, 3, 3) whose image centre looks where the prior says; else the nearest."""
+    """Return the rotations (N, 3, 3) of which the prior allows the heading, or else the nearest."""
     if prior.heading_deg is None:
         return R_cam_from_world
     off = heading_errors(R_cam_from_world, prior.heading_deg)
@@ -73,7 +73,7 @@ def allow_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDAr
 
 
 def heading_errors(R_cam_from_world: NDArray[np.float64], heading_deg: float) -> NDArray[np.float64]:
-    """Angles (N,) [rad] between a heading and where the image centre of rotations (N, 3, 3) looks."""
+    """Return the angles (N,) [rad] between a heading and the image centres of rotations (N, 3, 3)."""
     forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
     heading = np.arctan2(forward[:, 0], forward[:, 1])
     return np.asarray(np.abs((heading - np.radians(heading_deg) + np.pi) % (2.0 * np.pi) - np.pi))
@@ -102,7 +102,7 @@ def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ..
 
 
 def find_contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
-    """Say how a pose contradicts a heading; nothing of a camera that looks steeply up or down."""
+    """Say how a pose contradicts a heading; cameras looking steeply up or down have none."""
     forward = pose_world.R_cam_from_world[0]
     if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:
         return []

@@ -44,17 +44,17 @@ class Images(NamedTuple):
 
 
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:
-    """Return the images of a panorama, each resized from the one before."""
-    images = []
-    for scale in scales:
+    """Make the images of a panorama, each resized from the one before."""
+    images = {}
+    for name, scale in scales._asdict().items():
         panorama = resize(panorama, scale.width)
-        images.append(Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg)))
-    return Images(*images)
+        images[name] = Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg))
+    return Images(**images)
 
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo at the sizes at which it is compared. Nothing of it changes, so threads share it."""
+    """A photo at the sizes at which it is compared; immutable, as threads share it."""
 
     given: Panorama
     panorama: Panorama  # at the width of its features
@@ -74,7 +74,7 @@ class Photo:
 
 
 class Features(NamedTuple):
-    """Keypoints of a photo, and the features of the map that look alike."""
+    """Keypoints of a photo, and the similar features of the map."""
 
     keypoints: Keypoints
     matches: Matches
@@ -82,17 +82,19 @@ class Features(NamedTuple):
 
 @dataclass(frozen=True)
 class Cache:
-    """Results that are computed once for one photo in one map; copies of a query share it, and threads."""
+    """Results computed once for one photo in one map, shared by threads and copies of a query."""
 
     views: RecentViews  # of the map
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # `comparison.compare`, by the pose's key
-    unoccluded: dict[bytes, "Query"] = field(default_factory=dict)  # `without_occluders`, by blocks left out
-    ends: set[bytes] = field(default_factory=set)  # keys of poses which no perturbation improves any more
+    unoccluded: dict[bytes, "Query"] = field(
+        default_factory=dict
+    )  # `comparison.mask_occluders`, by the blocks masked
+    ends: set[bytes] = field(default_factory=set)  # keys of poses that no perturbation improves
 
 
 @dataclass(frozen=True)
 class Query:
-    """A photo, and how it is searched in a map."""
+    """A photo, the map that it is searched in, and the settings of the search."""
 
     photo: Photo
     scan_map: ScanMap
@@ -101,16 +103,16 @@ class Query:
     method: MethodConfig
     features: tuple[Once[Features], ...]  # of half of the photo's views each
     cache: Cache
-    num_halves: int = len(HALVES)  # of the features, that are asked; none where whole views alone are
+    num_halves: int = len(HALVES)  # of the features that are matched; 0 with whole views alone
 
     @cached_property
     def keypoints(self) -> Keypoints:
-        """The photo's keypoints."""
+        """Keypoints of the photo."""
         return join_keypoints([half().keypoints for half in self.features[: self.num_halves]])
 
     @cached_property
     def matches(self) -> Matches:
-        """The photo's keypoints and the features of the map that look alike."""
+        """Keypoints of the photo matched with features of the map."""
         halves = [half() for half in self.features[: self.num_halves]]
         return join_matches([h.matches for h in halves], [len(h.keypoints.rays) for h in halves])
 
@@ -125,7 +127,7 @@ class Query:
         return replace(self, photo=photo, cache=Cache(self.cache.views))
 
     def view_at(self, pose: Pose, config: ViewConfig) -> Cells:
-        """Return the cells seen from near a pose that the photo shows."""
+        """Return the cells seen from a position near a pose, without those that the photo does not show."""
         place = round_position(pose)
         shown = self.photo.find_shown_cells(config.num_rings, pose)
         return normalize_view(self.cache.views.averages(place, config), place, config, shown)

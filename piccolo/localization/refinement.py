@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +16,17 @@ from ..confidence.alternatives import (
     sort_by_score,
     suppress_near,
 )
-from ..geometry.pose import Pose, orthonormal
+from ..geometry.pose import Array, Pose, orthonormal
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel
-from ..optimize.channel_loss import descend_channels, score
+from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
-from ..views.candidate_views import SEARCH_VIEW
-from ..views.view import Cells, ViewConfig
+from ..views.candidate_views import SEARCH_VIEW, Views
+from ..views.view import Cells, ViewArrays, ViewConfig
 from .comparison import compare, score_pose
 from .query import Query
 from .search import Starts
@@ -44,8 +45,6 @@ BATCH = 16  # starts that a thread takes at a time
 PERTURBED_BATCH = 3  # perturbed poses that a thread takes
 FIRST_ITERATIONS = 5  # of the first descents on prepared views
 SECOND_ITERATIONS = 12
-MIDDLE_LIMITS = (COARSE_LOSS, 12, 1e-3)
-FINE_LIMITS = (FINE_LOSS, 12, 1e-4)
 PERTURBATION = 0.4  # size of the perturbations on fine cells, relative to middle ones
 MAX_PERTURBATIONS = 5  # rounds
 MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the last
@@ -56,9 +55,20 @@ SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
 SAME_ANGLE = math.radians(5.0)  # and this are one
 CLOSE_DISTANCE = 0.1  # [m] SAME_DISTANCE after the descent on middle cells
 
-Limits = tuple[float, int, float]  # scale of the loss [standard deviations], iterations, least step [rad + m]
-
+Array32 = NDArray[np.float32]
 Fit = Hypothesis  # during descent: its score is `channel_loss.score` on the cells of its last view
+
+
+class Limits(NamedTuple):
+    """The loss of a descent, and its end."""
+
+    loss_scale: float  # [standard deviations]
+    num_iterations: int  # at most
+    tolerance: float  # [rad + m] a shorter step ends the descent
+
+
+MIDDLE_LIMITS = Limits(COARSE_LOSS, 12, 1e-3)
+FINE_LIMITS = Limits(FINE_LOSS, 12, 1e-4)
 
 
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
@@ -114,22 +124,29 @@ def descend_view(query: Query, config: ViewConfig, image: Texels, pose: Pose, li
 def perturb_middle(query: Query, pose: Pose) -> Fit:
     """Perturb a pose and descend again on middle cells."""
     config = query.method.middle_view
-    images = query.photo.images.search(), query.photo.images.middle()
+    wide_image = query.photo.images.search()
+    narrow_image = query.photo.images.middle()
     cells = query.view_at(pose, config)
-    return descend_around(cells, config.arrays.blocks, images, pose, 1.0, query.workers)
+    return descend_around(cells, config.arrays.blocks, wide_image, narrow_image, pose, 1.0, query.workers)
 
 
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
-    """Perturb and refine for as long as the score rises. Poses already converged are returned unchanged."""
+    """Perturb and refine a pose for as long as its score rises.
+
+    A pose that has converged before is returned unchanged.
+    """
     if fit.pose.key in query.cache.ends:
         return fit
     config = query.method.fine_view
     blocks = config.arrays.blocks
-    images = query.photo.images.middle(), query.photo.images.fine()
+    wide_image = query.photo.images.middle()
+    narrow_image = query.photo.images.fine()
     cells = query.view_at(fit.pose, config)
-    fit = score_on_cells(cells, blocks, images[1], fit.pose)
+    fit = score_on_cells(cells, blocks, narrow_image, fit.pose)
     for _ in range(MAX_PERTURBATIONS):
-        around = descend_around(cells, blocks, images, fit.pose, PERTURBATION, query.workers)
+        around = descend_around(
+            cells, blocks, wide_image, narrow_image, fit.pose, PERTURBATION, query.workers
+        )
         refined = descend_fine(query, around.pose)
         gain = refined.score - fit.score
         fit = refined if gain > 0.0 else fit
@@ -143,7 +160,7 @@ def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
 def best_and_alternatives(
     rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, min_distance: float
 ) -> NDArray[np.int64]:
-    """Return indices of `count` of the poses (n, 3, 3), (n, 3), which come best first, in rising order.
+    """Return the indices of `count` of the ranked poses (n, 3, 3), (n, 3), best first, in ascending order.
 
     Three quarters are the best poses that differ a little, a quarter the best that lie far apart.
     """
@@ -174,11 +191,23 @@ def keep_comparable(ranked: Sequence[Fit]) -> list[Fit]:
 
 
 @kernel
-def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_map, center_map, scores):
-    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of a row (n,) of views."""
+def descend_starts(
+    views: Views,
+    view: ViewArrays,
+    image: Texels,
+    scale: float,
+    num_iterations: int,
+    row: NDArray[np.int64],
+    R_cam_from_map: Array,
+    center_map: Array,
+    scores: Array,
+) -> None:
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its row (n,) of the views."""
     centers, offsets, unit, features, is_seen = views
-    solid_angle, blocks = cells
-    texels, width = image
+    solid_angle = view.solid_angle
+    blocks = view.blocks
+    texels = image.rgbx
+    width = image.width
     R = R_cam_from_map
     t = center_map
     n = len(solid_angle)
@@ -195,7 +224,7 @@ def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_m
             weights[j] = solid_angle[j] if is_seen[c, j] else F0
         for i in range(3):
             t[k, i] -= centers[c, i]
-        problem = points, levels, weights, texels, width, scale
+        problem = ChannelProblem(points, levels, weights, texels, width, scale)
         descend_channels(problem, num_iterations, START_TOLERANCE, R[k], t[k])
         scores[k] = score(points, levels, weights, blocks, texels, width, R[k], t[k])
         for i in range(3):
@@ -204,11 +233,21 @@ def descend_starts(views, cells, image, scale, num_iterations, row, R_cam_from_m
 
 @kernel
 def descend_perturbed(
-    points, levels, weights, blocks, wide, narrow, scale, steps, R_cam_from_map, center, scores
-):
-    """Descend from each step (n, 6) away from (n, 3, 3), (n, 3): on the wide image, then on the narrow.
+    points: Array32,
+    levels: Array32,
+    weights: Array32,
+    blocks: NDArray[np.int32],
+    wide: Texels,
+    narrow: Texels,
+    scale: float,
+    steps: Array,
+    R_cam_from_map: Array,
+    center: Array,
+    scores: Array,
+) -> None:
+    """Perturb poses (n, 3, 3), (n, 3) by steps (n, 6) and descend in place, on the wide then narrow image.
 
-    The zero step skips the wide image.
+    A pose with the zero step skips the wide image.
     """
     R = R_cam_from_map
     t = center
@@ -218,11 +257,12 @@ def descend_perturbed(
         for i in range(6):
             first = 0 if steps[k, i] != 0.0 else first
         for image in range(first, 2):
-            texels, width = wide if image == 0 else narrow
+            texels = wide.rgbx if image == 0 else narrow.rgbx
+            width = wide.width if image == 0 else narrow.width
             num_iterations = WIDE_ITERATIONS if image == 0 else NARROW_ITERATIONS
-            problem = points, levels, weights, texels, width, scale
+            problem = ChannelProblem(points, levels, weights, texels, width, scale)
             descend_channels(problem, num_iterations, PERTURBED_TOLERANCE, R[k], t[k])
-        scores[k] = score(points, levels, weights, blocks, narrow[0], narrow[1], R[k], t[k])
+        scores[k] = score(points, levels, weights, blocks, narrow.rgbx, narrow.width, R[k], t[k])
 
 
 def to_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -245,13 +285,12 @@ def descend_all(
     t = starts.center_map.copy()
     scores = np.empty(len(t))
     row, views = scan_map.views.at(starts.candidate, workers)
-    cells = SEARCH_VIEW.arrays.solid_angle, SEARCH_VIEW.arrays.blocks
+    view = SEARCH_VIEW.arrays
     scale = COARSE_LOSS * LEVELS_PER_UNIT
 
     def run(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        texels = (image.rgbx, image.width)
-        descend_starts(views, cells, texels, scale, num_iterations, row[part], R[part], t[part], scores[part])
+        descend_starts(views, view, image, scale, num_iterations, row[part], R[part], t[part], scores[part])
 
     workers.map(run, range(0, len(t), BATCH), "descend")
     order = np.argsort(-scores, kind="stable")
@@ -260,17 +299,17 @@ def descend_all(
 
 def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
     """Descend on cells; coordinates relative to the cells' centre keep float32 exact."""
-    loss_scale, num_iterations, tolerance = limits
     R = pose.R_cam_from_world.copy()
     t = pose.center_world - cells.center_map
-    scale = loss_scale * LEVELS_PER_UNIT
-    problem = cells.offsets, to_levels(cells.channels), cells.weights, image.rgbx, image.width, scale
-    descend_channels(problem, num_iterations, tolerance, R, t)
+    scale = limits.loss_scale * LEVELS_PER_UNIT
+    levels = to_levels(cells.channels)
+    problem = ChannelProblem(cells.offsets, levels, cells.weights, image.rgbx, image.width, scale)
+    descend_channels(problem, limits.num_iterations, limits.tolerance, R, t)
     return Pose(orthonormal(R), t + cells.center_map)
 
 
 def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Fit:
-    """Score a pose on cells, each in its block of the sphere."""
+    """Score a pose on cells, each of which lies in a block of the sphere."""
     t = pose.center_world - cells.center_map
     levels = to_levels(cells.channels)
     R = pose.R_cam_from_world
@@ -282,19 +321,18 @@ def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose:
 def descend_around(
     cells: Cells,
     blocks: NDArray[np.int32],
-    images: tuple[Texels, Texels],
+    wide_image: Texels,
+    narrow_image: Texels,
     pose: Pose,
     size: float,
     workers: Workers,
 ) -> Fit:
-    """Return the best end of descents from a pose and around it, on the wider image first."""
+    """Return the best end of descents from a pose and around it, on the wide image first."""
     steps = perturbations(size)
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
     t = np.repeat((pose.center_world - cells.center_map)[None], len(steps), axis=0)
     scores = np.empty(len(steps))
     levels = to_levels(cells.channels)
-    wide = (images[0].rgbx, images[0].width)
-    narrow = (images[1].rgbx, images[1].width)
     scale = COARSE_LOSS * LEVELS_PER_UNIT
 
     def run(lo: int) -> None:
@@ -304,8 +342,8 @@ def descend_around(
             levels,
             cells.weights,
             blocks,
-            wide,
-            narrow,
+            wide_image,
+            narrow_image,
             scale,
             steps[part],
             R[part],

@@ -1,7 +1,7 @@
 """Score every candidate position with every rotation, and keep the distinct best.
 
-All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products
-come out the same whatever the processor and its BLAS.
+All sums are of whole numbers that stay below 2^24: exact in float32 in any order, so that matrix products are
+equal on all processors and BLAS libraries.
 """
 
 import math
@@ -54,7 +54,7 @@ def to_whole_numbers(values: Samples, most: float, most_other: int, num_terms: i
 
 
 def whole_scale(most: float, most_other: int, num_terms: int) -> np.float32:
-    """Return the factor of `to_whole_numbers`."""
+    """Return the factor by which `to_whole_numbers` multiplies."""
     return np.float32(EXACT // (most_other * num_terms) / most)
 
 
@@ -81,11 +81,19 @@ def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Sampl
 
 
 @kernel
-def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validity):
+def widen(
+    samples: Samples,
+    validity: Samples,
+    cells: NDArray[np.int32],
+    cell_areas: Samples,
+    areas: Samples,
+    wide_samples: Samples,
+    wide_validity: Samples,
+) -> None:
     """Write the averages of rounded channels (n, 3, cells) and of validity by area, over wider cells.
 
-    `cells` and `cell_areas` (cells,) are the wider cell of each and its part of that cell's area in `areas`.
-    Validity is rounded.
+    Each cell lies in the wider cell of index `cells` (cells,) and has the area `cell_areas` (cells,); `areas`
+    (wider cells,) are the sums of these. Validity is rounded.
     """
     for k in range(len(samples)):
         channels = wide_samples[k]
@@ -107,13 +115,13 @@ def widen(samples, validity, cells, cell_areas, areas, wide_samples, wide_validi
 def widen_samples(samples: Samples, validity: Samples, workers: Workers) -> tuple[Samples, Samples]:
     """Average channels of the search grid to (rotations, 3, wide cells) [levels], and validity."""
     cells, areas = wider_cells(WIDE_RINGS)
-    parts = cells, whole_areas(SEARCH_RINGS), areas
+    cell_areas = whole_areas(SEARCH_RINGS)
     wide = np.empty((len(samples), 3, len(areas)), np.float32)
     is_valid = np.empty((len(samples), len(areas)), np.float32)
 
     def average(lo: int) -> None:
         part = slice(lo, lo + ROTATIONS_AT_ONCE)
-        widen(samples[part], validity[part], *parts, wide[part], is_valid[part])
+        widen(samples[part], validity[part], cells, cell_areas, areas, wide[part], is_valid[part])
 
     workers.map(average, range(0, len(samples), ROTATIONS_AT_ONCE), "search")
     return wide, is_valid
@@ -129,7 +137,7 @@ class Starts:
 
     def take(self, indices: NDArray[np.int64]) -> "Starts":
         """Select the starts at `indices`, in that order."""
-        return Starts(*(values[indices] for values in vars(self).values()))
+        return Starts(self.R_cam_from_map[indices], self.center_map[indices], self.candidate[indices])
 
     def poses(self) -> list[Pose]:
         """Return the poses as objects."""
@@ -137,10 +145,19 @@ class Starts:
 
 
 @kernel
-def unpack_views(features, seen, area, values, fractions, energy, total):
-    """Write views' 8-bit channels (n, 3 * cells) and what is seen (n, cells) as float32, and their energies.
+def unpack_views(
+    features: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+    area: Samples,
+    values: Samples,
+    fractions: Samples,
+    energy: Samples,
+    total: Samples,
+) -> None:
+    """Write views' 8-bit channels (n, 3 * cells) and fractions seen (n, cells) as float32, and energies.
 
-    Energies (n, cells) are squared channels by the area (cells,), in whole numbers; (n,) their totals.
+    Energies (n, cells) are squared channels times the area (cells,), in whole numbers; `total` (n,) their
+    sums.
     """
     num_cells = len(area)
     for i in range(len(features)):
@@ -162,7 +179,7 @@ _local = threading.local()
 
 
 def thread_block(num_views: int, num_cells: int) -> list[Samples]:
-    """Return room for `unpack_views`, the thread's own: fresh memory costs as much as the products."""
+    """Return the calling thread's own arrays for `unpack_views`: allocation costs as much as products."""
     kept: list[Samples] = getattr(_local, "block", [])
     if not kept or len(kept[0]) < num_views or kept[1].shape[1] != num_cells:
         num_rows = max(BLOCK, num_views)
@@ -206,24 +223,32 @@ def masked_correlation(
 def best_poses_wide(
     scan_map: ScanMap, samples: Samples, validity: Samples, pool: int, workers: Workers
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
-    """Return `best_poses` by the masked correlation of wide views with the averaged panorama.
+    """Return the best `pool` poses by the masked correlation of wide views with the averaged panorama.
 
-    In parts of the candidates: a campus in all rotations would have a gigabyte of scores.
+    The result is as of `best_poses`. Candidates are scored in parts: the scores of a campus in all rotations
+    would take a gigabyte.
     """
     area = wider_cells(WIDE_RINGS)[1]
-    panorama = weigh_by_area(*widen_samples(samples, validity, workers), area, 255)
+    wide_samples, wide_validity = widen_samples(samples, validity, workers)
+    panorama = weigh_by_area(wide_samples, wide_validity, area, 255)
     num_views = views_at_once(len(samples))
     least = LOWEST
-    sparse, rotation, scores = np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0, np.float32)
+    sparse = np.empty(0, np.int64)
+    rotation = np.empty(0, np.int64)
+    scores = np.empty(0, np.float32)
     for lo in range(0, len(scan_map.sparse), num_views):
         part = slice(lo, lo + num_views)
-        views = scan_map.wide_features[part], scan_map.wide_seen[part]
-        row, turn, values = best_poses(masked_correlation(*views, area, panorama, workers), pool, least)
+        features = scan_map.wide_features[part]
+        seen = scan_map.wide_seen[part]
+        correlation = masked_correlation(features, seen, area, panorama, workers)
+        row, turn, values = best_poses(correlation, pool, least)
         sparse = np.concatenate([sparse, row + lo])
         rotation = np.concatenate([rotation, turn])
         scores = np.concatenate([scores, values])
         best = np.lexsort((rotation, sparse, -scores))[:pool]
-        sparse, rotation, scores = sparse[best], rotation[best], scores[best]
+        sparse = sparse[best]
+        rotation = rotation[best]
+        scores = scores[best]
         least = scores[-1] if len(best) == pool else LOWEST
     return sparse, rotation, scores
 
@@ -234,10 +259,18 @@ def views_at_once(num_rotations: int) -> int:
 
 
 @kernel
-def correlate_pairs(features, is_seen, area, panorama, row, rotation, scores):
+def correlate_pairs(
+    features: NDArray[np.int8],
+    is_seen: NDArray[np.bool_],
+    area: Samples,
+    panorama: TurnedPanorama,
+    row: NDArray[np.int64],
+    rotation: NDArray[np.int64],
+    scores: Samples,
+) -> None:
     """Write the masked correlation, up to a factor, of each pair of a view's row and a turned panorama.
 
-    Whole numbers in float64, exact in any order. The area (cells,) is in whole numbers too.
+    Products of whole numbers are summed in float64, exact in any order; the area (cells,) is whole too.
     """
     for k in range(len(scores)):
         f = features[row[k]]
@@ -260,7 +293,7 @@ def best_poses(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
     """Return candidates, rotations and scores of the best `pool` poses above `least`, best first.
 
-    Of equal scores, the first. A threshold from a sample of the scores keeps the sorted part small.
+    Of equal scores, the first is taken. A threshold from a sample of the scores keeps the sorted part small.
     """
     flat = scores.ravel()
     pool = min(pool, flat.size)
@@ -275,13 +308,15 @@ def best_poses(
         alike = np.flatnonzero(flat == threshold)[: pool - len(top)]
         top = np.concatenate([top, alike])
     top = top[np.lexsort((top, -flat[top]))][:pool]
-    return *np.divmod(top, scores.shape[1]), flat[top]
+    row, column = np.divmod(top, scores.shape[1])
+    return row, column, flat[top]
 
 
 def search_poses(query: Query, gravity: Gravity) -> Starts:
     """Search all candidates with all rotations in two stages; return the distinct best.
 
-    Wide cells of the sparse candidates, by matrix products; then fine cells of the remaining poses.
+    The first scores wide cells of the sparse candidates, by matrix products, the second scores fine cells of
+    the best poses.
     """
     m = query.scan_map
     settings = query.settings
@@ -299,7 +334,8 @@ def search_poses(query: Query, gravity: Gravity) -> Starts:
     num_starts = min(num_starts, settings.max_starts)
     sparse, turn, _ = best_poses_wide(m, samples, validity, num_starts * POSES_PER_START, query.workers)
     candidate = m.sparse[sparse]
-    R, centers = rotations[turn], m.centers[candidate]
+    R = rotations[turn]
+    centers = m.centers[candidate]
     kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, START_ANGLE)
     candidate = candidate[kept]
     scores = np.empty(len(kept), np.float32)

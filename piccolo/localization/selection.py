@@ -58,8 +58,8 @@ def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
 def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
     """Return the evidence for each of several poses by itself.
 
-    Poses that contradict the prior divide the odds that it is wrong among them. Without features, each pose
-    counts as having CLEAR_MATCHES matches.
+    Poses that contradict the prior share the odds that the prior is wrong. Without features, each pose counts
+    as having CLEAR_MATCHES matches.
     """
     is_wrong = [bool(contradictions(query.scan_map, h.pose, query.settings.prior)) for h in hypotheses]
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))

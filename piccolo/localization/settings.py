@@ -1,4 +1,4 @@
-"""Settings of the default method, and the parts that it is made of."""
+"""Settings of the default method."""
 
 from dataclasses import asdict, dataclass
 from typing import NamedTuple, get_args
@@ -39,7 +39,7 @@ class CoarseToFineSettings:
         check_confidence(self.min_confidence)
 
     def to_json(self) -> dict[str, object]:
-        """The settings as they took effect."""
+        """Return the settings as they took effect."""
         return {"preset": "default", **asdict(self)}
 
 

@@ -1,4 +1,4 @@
-"""The evidence for and against the pose that was found, and the status that follows."""
+"""The evidence for and against the pose that was found, and the resulting status."""
 
 import math
 import operator
@@ -116,8 +116,8 @@ def collect_evidence(
 def is_mirrored(query: Query, evidence: Evidence) -> bool:
     """Return True if the mirrored photo's features agree with a pose better than the photo's.
 
-    Symmetric things match in a mirror too, but no better. A pose that explains nearly all of the photo is
-    not asked, nor one of the first look, which has compared the mirrored photo itself.
+    Symmetric scenes match in a mirror too, but no better. The test is skipped for a pose that explains nearly
+    all of the photo, and after a first look, which has compared the mirrored photo itself.
     """
     if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
         return False

@@ -1,1 +1,1 @@
-"""The sampling loss and the ways to descend on it."""
+"""The losses, and the ways to descend on them."""

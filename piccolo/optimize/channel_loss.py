@@ -1,15 +1,18 @@
 """The loss of the default method: locally normalised channels of points against those of the panorama.
 
-A residual's loss is that of Geman and McClure (1985), 1/2 e^2 / (1 + e^2 / s^2): what differs by much more
-than the scale s [8-bit levels] pulls no more. A point on masked pixels costs half of the most it could.
+A residual's loss is that of Geman and McClure (1985), 1/2 e^2 / (1 + e^2 / s^2): residuals far above the
+scale s [8-bit levels] have no influence. A point on masked pixels costs half of the largest loss.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..geometry.pose import Array
 from ..geometry.sphere import BLOCK_RINGS, make_grid
-from ..kernels.jit import F1, HALF, inline_kernel, kernel
+from ..kernels.jit import F1, HALF, Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
 from ..panorama.texels import (
     CHUNK,
@@ -28,23 +31,38 @@ NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
 CHANCE = 0.35  # a block's correlation that wrong poses reach
 ZERO = np.float32(ZERO_LEVEL)
 
+Array32 = NDArray[np.float32]
+
+
+class ChannelProblem(NamedTuple):
+    """Points with channels, and the image that they are compared with."""
+
+    points: Array32  # (3, N) [m]
+    channels: Array32  # (3, N) [8-bit levels]
+    weights: Array32  # (N,)
+    texels: NDArray[np.int32]  # of the panorama's channels
+    width: int  # [px] of the panorama
+    scale: float  # of the loss [levels]
+
 
 @inline_kernel
-def read_channels(colors, i):
-    """Channels [levels] and weight of a point, of four arrays."""
+def read_channels(
+    colors: tuple[Array32, Array32, Array32, Array32], i: np.uintp
+) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Return channels [levels] and weight of a point, read from four arrays."""
     return colors[0][i], colors[1][i], colors[2][i], colors[3][i]
 
 
 @inline_kernel
-def geman_mcclure(square, inverse_scale2):
-    """Loss of a residual of this squared length, and its weight."""
+def geman_mcclure(square: Scalar, inverse_scale2: Scalar) -> tuple[Scalar, Scalar]:
+    """Return the loss of a residual of this squared length, and its weight."""
     s = F1 / (F1 + square * inverse_scale2)
     return HALF * square * s, s * s
 
 
 @inline_kernel
-def beyond_chance(correlation):
-    """A block's correlation beyond what those of wrong poses reach, in [0, 1]."""
+def beyond_chance(correlation: float) -> float:
+    """Return the part of a block's correlation that exceeds those of wrong poses, in [0, 1]."""
     return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
 
 
@@ -52,12 +70,10 @@ add_channels = block_adder(read_channels, geman_mcclure)
 
 
 @kernel
-def channel_equations(problem, R_cam_from_world, center_world, sums):
-    """Write loss, count, gradient and matrix (29,) of a problem at a pose.
-
-    A problem is: points (3, N) [m], channels (3, N) [levels], weights (N,), texels and width of the
-    panorama's channels, scale of the loss [levels].
-    """
+def channel_equations(
+    problem: ChannelProblem, R_cam_from_world: Array, center_world: Array, sums: Array
+) -> None:
+    """Write loss, count, gradient and matrix (29,) of a problem at a pose."""
     points, channels, weights, texels, width, scale = problem
     R, t = R_cam_from_world, center_world
     colors = (channels[0], channels[1], channels[2], weights)
@@ -71,10 +87,16 @@ def channel_equations(problem, R_cam_from_world, center_world, sums):
 
 
 @kernel
-def equations_by_part(problem, R_cam_from_world, center_world, begins, sums):
-    """Write gradient and matrix, as `channel_equations` does (parts, 29), of each part of a problem's points.
+def equations_by_part(
+    problem: ChannelProblem,
+    R_cam_from_world: Array,
+    center_world: Array,
+    begins: NDArray[np.int64],
+    sums: Array,
+) -> None:
+    """Write the sums (parts, 29) of `channel_equations` for each part of a problem's points.
 
-    A part ends where the next begins (parts + 1,).
+    Part k is the points from begins[k] to begins[k + 1]. Points on masked pixels add nothing to the loss.
     """
     points, channels, weights, texels, width, scale = problem
     R, t = R_cam_from_world, center_world
@@ -91,8 +113,18 @@ descend_channels = kernel(levenberg_marquardt(channel_equations))
 
 
 @kernel
-def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums):
-    """Write, block by block (B, 4), product, energies and shared weight of points' and image's channels."""
+def correlate(
+    points: Array32,
+    channels: Array32,
+    weights: Array32,
+    blocks: NDArray[np.int32],
+    texels: NDArray[np.int32],
+    width: int,
+    R_cam_from_world: Array,
+    center_world: Array,
+    sums: Array,
+) -> None:
+    """Write product, energies and shared weight (B, 4) of the points' and the image's channels by block."""
     sums[:] = 0.0
     p = make_projected()
     found = np.empty((4, CHUNK), np.float32)
@@ -126,11 +158,20 @@ def correlate(points, channels, weights, blocks, texels, width, R_cam_from_world
 
 
 @kernel
-def score(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world):
-    """The score of a pose: what blocks of the sphere correlate beyond chance, times what both show of them.
+def score(
+    points: Array32,
+    channels: Array32,
+    weights: Array32,
+    blocks: NDArray[np.int32],
+    texels: NDArray[np.int32],
+    width: int,
+    R_cam_from_world: Array,
+    center_world: Array,
+) -> float:
+    """Score a pose: sum each block's correlation beyond chance, times the area that points and image share.
 
     The weights are solid angles as fractions of the sphere, `blocks` (N,) the block of each point. An
-    occluder costs what it hides and no more.
+    occluder costs the area that it hides and no more.
     """
     sums = np.empty((NUM_BLOCKS, 4))
     correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums)

@@ -1,4 +1,4 @@
-"""A descent as an animation: panorama, cloud at each pose on the way, checkerboard of both."""
+"""An animation of a descent: a checkerboard of the panorama and the cloud at each pose on the way."""
 
 from collections.abc import Sequence
 from io import BytesIO
@@ -21,9 +21,9 @@ from .refine import DescentSettings, Refined, make_sampling_loss, refine
 FRAME_WIDTH = 512
 TEXT_HEIGHT = 24
 MAX_SURFELS = 150_000  # about one a pixel
-MAX_FRAMES = 60  # of more poses, this many are drawn, evenly spaced
+MAX_FRAMES = 60  # if there are more poses, this many are drawn, evenly spaced
 FRAMES_PER_S = 8
-NUM_LAST = 12  # times that the last frame is repeated
+NUM_LAST = 12  # repetitions of the last frame
 
 Image = NDArray[np.uint8]  # (H, W, 3) RGB
 
@@ -37,7 +37,7 @@ class Iterate(NamedTuple):
 
 
 def perturb_pose(pose: Pose, distance: float, angle_deg: float) -> Pose:
-    """`pose` moved by `distance` [m] and turned by `angle_deg`, each in a direction drawn at random."""
+    """Move a pose by `distance` [m] and turn it by `angle_deg`, each in a random direction (fixed seed)."""
     rng = np.random.default_rng(0)
     turn, move = (v / np.linalg.norm(v) for v in rng.normal(size=(2, 3)))
     return step(pose, np.concatenate([np.radians(angle_deg) * turn, distance * move]))
@@ -46,7 +46,7 @@ def perturb_pose(pose: Pose, distance: float, angle_deg: float) -> Pose:
 def refine_with_history(
     points: PackedPoints, texels: Texels, start: Pose, settings: DescentSettings
 ) -> tuple[Refined, list[Iterate]]:
-    """The result of `refine`, and its iterates without those that a line search or the damping rejected."""
+    """Return the result of `refine`, and its iterates except those that line search or damping rejected."""
     tried: list[tuple[int, Iterate]] = []
 
     def watch(part: int, pose: Pose, loss: float) -> None:
@@ -65,9 +65,10 @@ def refine_with_history(
 def frames_of(
     points: PackedPoints, panorama: Panorama, history: Sequence[Iterate], width: int, workers: Workers
 ) -> list[Image]:
-    """One image for each pose, with iteration and loss written on top; the last one stays for a while."""
-    ends = [visible_indices(points, p.pose.center_world) for p in (history[0], history[-1])]
-    surfels = make_surfels(points.take(np.union1d(*ends)).subsample(MAX_SURFELS), workers)
+    """Draw an image for each pose, with iteration and loss on top; the last one is repeated."""
+    at_start = visible_indices(points, history[0].pose.center_world)
+    at_end = visible_indices(points, history[-1].pose.center_world)
+    surfels = make_surfels(points.take(np.union1d(at_start, at_end)).subsample(MAX_SURFELS), workers)
     photo = resize_rgb(panorama, width)
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
@@ -83,7 +84,7 @@ def frames_of(
 
 
 def encode_gif(frames: Sequence[Image]) -> bytes:
-    """An animated GIF of frames."""
+    """Encode frames as an animated GIF."""
     file = BytesIO()
     first, *others = map(PIL.Image.fromarray, frames)
     duration = 1000 // FRAMES_PER_S

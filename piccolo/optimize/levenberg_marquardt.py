@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 
+from ..geometry.pose import Array
 from ..kernels.jit import copy_to, kernel
 from .normal_equations import GRADIENT, LOSS, MATRIX, NUM_SUMS
 
@@ -16,16 +17,20 @@ LEAST_DAMPING = 1e-6
 MOST_DAMPING = 1e4
 FALL = 0.2  # of the damping after a step that was taken
 RISE = 8.0  # and one that was not
-# Float32 sums differ by this share from one pose to the next: what rises by less has not risen. Without it a
-# descent ends where rounding says, some hundredths of a millimetre from the minimum.
+# Float32 sums differ by this fraction from one pose to the next: a smaller rise counts as none. Without it
+# rounding ends a descent, some hundredths of a millimetre from the minimum.
 ROUNDING = 1e-7
+
+Problem = TypeVar("Problem")
 
 
 @kernel
-def retract(R_cam_from_world, center_world, step, R_new, center_new):
-    """Write R <- exp([w]x) R and t <- t + R^T d; returns how far the step went, limited, in rad + m.
+def retract(
+    R_cam_from_world: Array, center_world: Array, step: Array, R_new: Array, center_new: Array
+) -> float:
+    """Write R <- exp([w]x) R and t <- t + R^T d for a limited step; return its length [rad + m].
 
-    The exponential by its series, as `pose.exp_so3` is none for kernels: exact in float64 below MAX_TURN.
+    The exponential is a series, exact in float64 below MAX_TURN: kernels can't call `pose.exp_so3`.
     """
     R = R_cam_from_world
     turn = math.sqrt(step[0] ** 2 + step[1] ** 2 + step[2] ** 2)
@@ -55,8 +60,10 @@ def retract(R_cam_from_world, center_world, step, R_new, center_new):
 
 
 @kernel
-def solve_damped(sums, damping, step):  # noqa: C901, PLR0912  # Cholesky by hand: LAPACK costs more for 6 x 6
-    """Write the damped Gauss-Newton step (6,), by Cholesky; False if the matrix is not positive."""
+def solve_damped(  # noqa: C901, PLR0912  # Cholesky by hand: LAPACK costs more for 6 x 6
+    sums: Array, damping: float, step: Array
+) -> bool:
+    """Write the damped Gauss-Newton step (6,), by Cholesky; return False if the matrix is not positive."""
     A = np.empty((6, 6))
     m = MATRIX
     for a in range(6):
@@ -88,14 +95,23 @@ def solve_damped(sums, damping, step):  # noqa: C901, PLR0912  # Cholesky by han
     return True
 
 
-def levenberg_marquardt(equations: Any) -> Callable[..., float]:
-    """A descent for `equations(problem, R, t, sums)`, which writes the sums (29,) of normal_equations.
+def levenberg_marquardt(
+    equations: Callable[[Problem, Array, Array, Array], None],
+) -> Callable[[Problem, int, float, Array, Array], float]:
+    """Make a descent for `equations(problem, R, t, sums)`, which writes the sums (29,) of normal_equations.
 
-    The descent takes a problem, the most iterations, a tolerance [rad + m], and R (3, 3), t (3,), which end
-    at the best pose found; it returns the loss there. Compile it with `kernel` if `equations` is one.
+    The descent takes a problem, the number of iterations at most, a tolerance [rad + m], and R (3, 3) and
+    t (3,), in which it leaves the best pose found; it returns the loss there. Compile it with `kernel` if
+    `equations` is one.
     """
 
-    def descend(problem, num_iterations, tolerance, R_cam_from_world, center_world):
+    def descend(
+        problem: Problem,
+        num_iterations: int,
+        tolerance: float,
+        R_cam_from_world: Array,
+        center_world: Array,
+    ) -> float:
         R = R_cam_from_world
         t = center_world
         sums = np.empty(NUM_SUMS)
@@ -108,7 +124,7 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
         sums[LOSS] = np.inf
         damping = FIRST_DAMPING / FALL
         length = np.inf
-        # The equations stand in one place, as they are compiled into it; the start is accepted first.
+        # There is one call of the equations, as each would be compiled in; the first accepts the start.
         for left in range(num_iterations, -1, -1):
             equations(problem, R_new, t_new, new_sums)
             if new_sums[LOSS] <= sums[LOSS] * (1.0 + ROUNDING):
@@ -118,12 +134,13 @@ def levenberg_marquardt(equations: Any) -> Callable[..., float]:
                 damping = max(damping * FALL, LEAST_DAMPING)
             else:
                 damping *= RISE
-            # infinite: the start has no loss, and the sums nothing to take a step by
+            # infinite: the start has no loss, and the sums give no step
             if length < tolerance or damping > MOST_DAMPING or left == 0 or math.isinf(sums[LOSS]):
                 break
             if not solve_damped(sums, damping, step):
                 break
             length = retract(R, t, step, R_new, t_new)
-        return sums[LOSS]
+        loss: float = sums[LOSS]
+        return loss
 
     return descend

@@ -4,7 +4,7 @@ Kim et al. (ICCV 2021) show such a surface to argue that their loss has a deep, 
 
     S(x, y) = min over z in heights, R in rotations of L(R, (x, y, z)),    L the sampling loss, Eq. 2,
 
-with L over the points that a camera at (x, y, z) sees. Rotations are the same at each place.
+with L over the points that a camera at (x, y, z) sees, and the same rotations at each place.
 """
 
 import math
@@ -23,13 +23,13 @@ from ..panorama.texels import Texels
 from ..views.zbuffer import is_free_space, visible_points
 from .sampling_loss import sampling_loss
 
-POOL_PER_POINT = 8  # points that may be visible, for one that is used
+POOL_PER_POINT = 8  # points of which visible ones are taken, for one that is used
 FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space
 MIN_CLEARANCE = 0.2  # [m] to the nearest point
 WALL_POINTS = 200_000  # of the cloud that are drawn
 MARKS = {"true": ("*", "white", 260), "found": ("X", "red", 110), "lowest": ("o", "none", 130)}
 
-KnownPoses = dict[str, Pose]  # in the frame of the points, by "true" and "found", as far as they are known
+KnownPoses = dict[str, Pose]  # those known of "true" and "found", in the frame of the points
 
 
 class PoseGrid(NamedTuple):
@@ -42,7 +42,7 @@ class PoseGrid(NamedTuple):
 
     @property
     def num_poses(self) -> int:
-        """The number of poses."""
+        """Number of poses."""
         return len(self.x) * len(self.y) * len(self.heights) * len(self.R_cam_from_local)
 
 
@@ -55,9 +55,9 @@ class LossSurface(NamedTuple):
     is_free: NDArray[np.bool_]  # (ny, nx) false too near to a point, or outside of the cloud
 
     def lowest(self) -> tuple[int, int]:
-        """Row and column of the least loss in free space; anywhere if none is free.
+        """Return row and column of the least loss in free space; of all places if none is free.
 
-        From outside a cloud few points are seen, and a plain wall has little loss in a plain panorama.
+        From outside a cloud few points are visible, and a plain wall has a low loss in a plain panorama.
         """
         is_free = self.is_free & np.isfinite(self.loss)
         loss = np.where(is_free, self.loss, np.inf) if is_free.any() else self.loss
@@ -65,7 +65,7 @@ class LossSurface(NamedTuple):
         return int(row), int(column)
 
     def num_minima(self) -> int:
-        """Places in free space that are lower than their eight neighbours."""
+        """Count the places in free space whose loss is lower than at their eight neighbours."""
         others = np.arange(9).reshape(3, 3) != 4
         lowest_around = minimum_filter(self.loss, footprint=others, mode="constant", cval=np.inf)
         return int(((self.loss < lowest_around) & self.is_free).sum())
@@ -74,7 +74,7 @@ class LossSurface(NamedTuple):
 def loss_surface(
     points: PackedPoints, texels: Texels, grid: PoseGrid, max_points: int, workers: Workers
 ) -> LossSurface:
-    """The least loss over heights and rotations at each place, from at most `max_points` seen from it."""
+    """Find the least loss over heights and rotations at each place, over `max_points` visible from it."""
     pool = points.subsample(POOL_PER_POINT * max_points)
 
     def best(cell: int) -> tuple[float, float, int, bool]:
@@ -92,18 +92,19 @@ def loss_surface(
 
     shape = (len(grid.y), len(grid.x))
     cells = workers.map(best, range(math.prod(shape)), "loss surface")
-    return LossSurface(*(np.array(column).reshape(shape) for column in zip(*cells, strict=True)))
+    loss, height, rotation, is_free = (np.array(column).reshape(shape) for column in zip(*cells, strict=True))
+    return LossSurface(loss=loss, height=height, rotation=rotation, is_free=is_free)
 
 
 def plan_shift(cloud: LocalCloud) -> Array:
-    """Offset (3,) [m] from the frame of the points to that of the plan, which has the world's origin."""
+    """Return the offset (3,) [m] from the frame of the points to the plan's, which has the world's origin."""
     return np.asarray(cloud.R_local_from_world @ cloud.origin_world)
 
 
 def surface_png(
     surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
 ) -> bytes:
-    """PNG of the surface over the plan, with the known poses marked."""
+    """Draw the surface over the plan, with the known poses marked, and return the PNG."""
     shift = plan_shift(cloud)
     x = grid.x + shift[0]
     y = grid.y + shift[1]
@@ -124,11 +125,14 @@ def surface_png(
     marks = {"lowest": (x[column], y[row])}
     for name in ("found", "true"):
         if name in known:
-            marks[name] = tuple(known[name].center_world[:2] + shift[:2])
-    for name, place in marks.items():
+            x_known, y_known = known[name].center_world[:2] + shift[:2]
+            marks[name] = (x_known, y_known)
+    for name, (x_mark, y_mark) in marks.items():
         symbol, color, size = MARKS[name]
         edge = "red" if color == "none" else "black"
-        axes.scatter(*place, s=size, marker=symbol, facecolor=color, edgecolor=edge, zorder=3, label=name)
+        axes.scatter(
+            x_mark, y_mark, s=size, marker=symbol, facecolor=color, edgecolor=edge, zorder=3, label=name
+        )
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=title)
     axes.legend(loc="upper right")
     figure.colorbar(mesh, ax=axes, label="least sampling loss over height and rotation", shrink=0.8)

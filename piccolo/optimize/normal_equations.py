@@ -6,14 +6,18 @@ the derivatives of the pixel (u, v) by the step, and G (2, 2) the weighted sum o
 products of the image gradients, a point adds [Ju Jv] G [Ju Jv]^T to the matrix: no row is ever stored.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..geometry.pose import Array
 from ..geometry.sphere import pixel_jacobian
-from ..kernels.jit import F0, inline_kernel, kernel
+from ..kernels.jit import F0, Scalar, inline_kernel, kernel
 from ..panorama.texels import (
     CHUNK,
+    Projected,
     blend_with_gradient,
     gather,
     is_valid,
@@ -28,16 +32,33 @@ COUNT = 1
 GRADIENT = 2
 MATRIX = 8
 
+Colors = TypeVar("Colors")
+Coordinates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]  # x, y, z (N,)
+Adder = Callable[[Coordinates, Colors, NDArray[np.int32], int, Array, Array, Scalar, Array], None]
 
-def block_adder(read_point: Any, robust: Any) -> Any:
-    """A kernel that adds points to the sums (29,) of the normal equations: in float32 within chunks.
 
-    read_point(colors, i) gives three channels [8-bit levels] and a weight; robust(square, scale) gives, for a
-    residual's squared length, its loss and its weight, which is the loss' derivative by half the square.
+def block_adder(
+    read_point: Callable[[Colors, np.uintp], tuple[Scalar, Scalar, Scalar, Scalar]],
+    robust: Callable[[Scalar, Scalar], tuple[Scalar, Scalar]],
+) -> Adder[Colors]:
+    """Make a kernel that adds points to the sums (29,) of the normal equations, in float32 within chunks.
+
+    read_point(colors, i) returns three channels [8-bit levels] and a weight; robust(square, scale) returns,
+    for a residual's squared length, its loss and its weight: the derivative of the loss by half the square.
+    The kernel takes coordinates, colours, texels and width of the image, rotation and centre of the pose, the
+    scale of `robust`, and the sums.
     """
 
     @inline_kernel
-    def add_chunk(points, count, colors, first, width, scale, sums):
+    def add_chunk(
+        points: Projected,
+        count: int,
+        colors: Colors,
+        first: int,
+        width: Scalar,
+        scale: Scalar,
+        sums: Array,
+    ) -> None:
         a00 = a01 = a02 = a03 = a04 = a05 = a11 = a12 = a13 = a14 = a15 = a22 = a23 = a24 = a25 = F0
         a33 = a34 = a35 = a44 = a45 = a55 = g0 = g1 = g2 = g3 = g4 = g5 = total = loaded = F0
         for n in range(count):
@@ -124,7 +145,16 @@ def block_adder(read_point: Any, robust: Any) -> Any:
             sums[m] += block[m]
 
     @kernel
-    def add_points(xyz, colors, texels, width, R_cam_from_world, center_world, scale, sums):
+    def add_points(
+        xyz: Coordinates,
+        colors: Colors,
+        texels: NDArray[np.int32],
+        width: int,
+        R_cam_from_world: Array,
+        center_world: Array,
+        scale: Scalar,
+        sums: Array,
+    ) -> None:
         points = make_projected()
         X, Y, Z = xyz
         for lo in range(0, len(X), CHUNK):

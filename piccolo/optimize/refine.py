@@ -19,7 +19,7 @@ LEAST_STEP = 1e-7  # [rad + m] of Gauss-Newton: a shorter one ends the descent
 
 Equations = tuple[float, Array, Array]  # loss, its gradient (6,) by a step, normal matrix (6, 6)
 Objective = Callable[[Pose], Equations]
-# is told the part of the descent, a pose tried, and the loss there
+# called with the part of the descent, a pose tried, and the loss there
 Watch = Callable[[int, Pose, float], None]
 Solver = Literal["gauss-newton", "lbfgs", "adam"]
 
@@ -34,19 +34,19 @@ class DescentSettings:
     step_decay: float = 0.8  # factor on the step whenever the loss has not fallen for `patience` iterations
     patience: int = 5
     use_visibility: bool = True  # leave out the points that the camera can't see
-    num_culls: int = 4  # times during the descent at which hidden points are left out anew
+    num_culls: int = 4  # times during the descent at which hidden points are found and left out
 
 
 @dataclass(frozen=True)
 class Loss:
-    """A loss of poses: functions of the points that count and of the pose; small is good."""
+    """A loss of poses, to be minimised: functions of the points that count and of the pose."""
 
     value: Callable[[PackedPoints, Pose], float]
     equations: Callable[[PackedPoints, Pose], Equations]
 
 
 def make_sampling_loss(texels: Texels) -> Loss:
-    """The paper's sampling loss of a panorama."""
+    """Make the paper's sampling loss of a panorama."""
     return Loss(
         lambda points, pose: sampling_loss(points, texels, pose),
         lambda points, pose: sampling_equations(points, texels, pose),
@@ -55,7 +55,7 @@ def make_sampling_loss(texels: Texels) -> Loss:
 
 @dataclass
 class Refined:
-    """The best pose that a descent has passed; of `refine`, its loss over the points seen from there."""
+    """The best pose of a descent; its loss in a result of `refine` is over the points visible from it."""
 
     pose: Pose
     loss: float = np.inf
@@ -81,7 +81,7 @@ class Adam:
     num_stalled: int = 0
 
     def update(self, loss: float, gradient: Array) -> Array:
-        """The step (6,) to take at a place with this loss and gradient (6,)."""
+        """Return the step (6,) from a pose with this loss and gradient (6,)."""
         self.num_stalled = 0 if loss < self.best_loss else self.num_stalled + 1
         self.best_loss = min(self.best_loss, loss)
         if self.num_stalled == self.patience:
@@ -96,7 +96,7 @@ class Adam:
 
 
 def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: int) -> Refined:
-    """The best pose of `num_iterations` steps of `adam`, which is left ready to go on."""
+    """Take `num_iterations` steps of `adam`, whose state goes on; return the best pose."""
     best = Refined(pose)
     for _ in range(num_iterations):
         loss, gradient, _ = objective(pose)
@@ -108,9 +108,9 @@ def descend_adam(objective: Objective, pose: Pose, adam: Adam, num_iterations: i
 
 
 def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Refined:
-    """The best pose of at most `num_iterations` of SciPy's L-BFGS-B.
+    """Run at most `num_iterations` of SciPy's L-BFGS-B; return the best pose.
 
-    Parameters are the rotation vector of a turn of the start, R = exp([w]x) R_start, and the camera's shift.
+    Its parameters are a rotation vector w, R = exp([w]x) R_start, and the displacement of the camera.
     """
     from scipy.optimize import minimize  # noqa: PLC0415  # Adam need not wait for it: 0.25 s
 
@@ -131,7 +131,10 @@ def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Ref
 
 
 def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int) -> Refined:
-    """The best pose of at most `num_iterations` Levenberg-Marquardt steps on the reweighted least squares."""
+    """Take at most `num_iterations` Levenberg-Marquardt steps; return the best pose.
+
+    They minimise reweighted least squares.
+    """
     best = Refined(start)
 
     def equations(_: None, R_cam_from_world: Array, center_world: Array, sums: Array) -> None:
@@ -148,10 +151,10 @@ def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int)
 def refine(
     points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings, watch: Watch = lambda *_: None
 ) -> Refined:
-    """Descend from `start`; the points that the camera does not see are left out anew `num_culls` times.
+    """Descend from `start`, leaving out the points hidden from the camera; these are found `num_culls` times.
 
-    A cull changes the function, so that losses before and after it do not compare: the best pose of the last
-    part is what counts.
+    That changes the function, so losses before and after it are not comparable: the result is the best pose
+    of the last part.
     """
     adam = Adam(settings.step_size, settings.step_decay, settings.patience)
     bounds = np.linspace(0, settings.num_iterations, settings.num_culls + 1).astype(int)

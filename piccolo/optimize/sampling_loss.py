@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from ..cloud.soa import FARTHEST, PackedPoints
 from ..geometry.pose import Array, Pose
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, F1, inline_kernel, kernel
+from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import (
     CHUNK,
     Texels,
@@ -34,15 +34,26 @@ from ..panorama.texels import (
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
 
 BLOCK = 4096
-# A pose that hides more of the cloud behind masked pixels has no loss. Of a panorama valid in part, the least
-# fraction of points that must show goes with the square of that part: a crop may face the nearer wall.
+# A pose at which masked pixels hide more of the cloud has no loss. If only a part of the panorama is valid,
+# this fraction is multiplied by the square of that part: a crop may face the nearer wall.
 MIN_SHOWN_SHARE = 0.5
 HALF_LEVEL = np.float32(0.5)  # a residual below half an 8-bit level has the weight of half a level
 TO_UNIT = 1.0 / 255.0
 
 
 @kernel
-def loss_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, first_block, sums):
+def loss_blocks(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
+    rgbx: NDArray[np.int32],
+    R_cam_from_world: Array,
+    center_world: Array,
+    texels: NDArray[np.int32],
+    width: int,
+    first_block: int,
+    sums: Array,
+) -> None:
     """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
     points = make_projected()
     for block in range(len(sums)):
@@ -70,15 +81,18 @@ def loss_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, fi
 
 
 @inline_kernel
-def read_packed(rgbx, i):
-    """Channels [8-bit levels] and weight of a point, packed."""
+def read_packed(rgbx: NDArray[np.int32], i: np.uintp) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Return channels [8-bit levels] and weight of a point of packed colour."""
     c = rgbx[i]
     return channel(c, 0), channel(c, 8), channel(c, 16), F1
 
 
 @inline_kernel
-def norm(square, least):
-    """The residual's length, and its weight 1 / length: iteratively reweighted least squares."""
+def norm(square: Scalar, least: Scalar) -> tuple[Scalar, Scalar]:
+    """Return a residual's length, and its weight 1 / length, for iteratively reweighted least squares.
+
+    A residual shorter than `least` has the weight 1 / `least`.
+    """
     length = math.sqrt(square)
     return length, F1 / max(length, least)
 
@@ -87,7 +101,18 @@ add_packed = block_adder(read_packed, norm)
 
 
 @kernel
-def normal_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, first_block, sums):
+def normal_blocks(
+    x: NDArray[np.float32],
+    y: NDArray[np.float32],
+    z: NDArray[np.float32],
+    rgbx: NDArray[np.int32],
+    R_cam_from_world: Array,
+    center_world: Array,
+    texels: NDArray[np.int32],
+    width: int,
+    first_block: int,
+    sums: Array,
+) -> None:
     """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum J^T J / norm."""
     R, t = R_cam_from_world, center_world
     for block in range(len(sums)):
@@ -101,7 +126,7 @@ def normal_blocks(x, y, z, rgbx, R_cam_from_world, center_world, texels, width, 
 def _sum_blocks(
     blocks: Callable[..., None], points: PackedPoints, texels: Texels, pose: Pose, num_threads: int
 ) -> Array:
-    """Sums over all points, float64, by a kernel that fills one row a block."""
+    """Sum over all points, in float64, the rows that a kernel writes, one a block."""
     if not np.abs(pose.center_world).max() < FARTHEST:  # NaN included: a kernel must not gather there
         return np.zeros(NUM_SUMS)
     num_blocks = -(-len(points) // BLOCK)
@@ -118,12 +143,12 @@ def _sum_blocks(
 
 
 def _is_hidden(count: float, points: PackedPoints, texels: Texels) -> bool:
-    """True if masked pixels hide too many of the points for a loss."""
+    """Return True if masked pixels hide so many points that a pose has no loss."""
     return bool(count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points))
 
 
 def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1) -> float:
-    """The paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf where masked pixels hide too many of the points."""
+    """Compute the paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf if masked pixels hide too many points."""
     total, count = _sum_blocks(loss_blocks, points, texels, pose, num_threads)[:2]
     if _is_hidden(count, points, texels):
         return math.inf
@@ -133,7 +158,7 @@ def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads:
 def sampling_equations(
     points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1
 ) -> tuple[float, Array, NDArray[np.float64]]:
-    """Loss, its gradient (6,) and the matrix (6, 6) of iteratively reweighted least squares at `pose`.
+    """Compute loss, gradient (6,) and matrix (6, 6) of iteratively reweighted least squares at `pose`.
 
     The matrix is (1 / N') sum_i J_i^T J_i / ||e_i||; -inverse(matrix) @ gradient is the Gauss-Newton step.
     """

@@ -1,4 +1,4 @@
-"""Which camera took a picture: by the options, or of a plain photo by EXIF; and the part that each shows."""
+"""Cameras of a picture, by the options or, for a plain photo, by EXIF; and the part that each shows."""
 
 import math
 from dataclasses import replace
@@ -45,7 +45,7 @@ class Cameras(NamedTuple):
 def cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
     """Return the cameras of a picture, by the options or by EXIF.
 
-    Raises InputError if a calibration does not fit, or a pinhole is asked for and nothing tells its field.
+    Raises InputError if a calibration does not fit, or a pinhole is asked for and its field is unknown.
     """
     found = _cameras_of(path, picture, options, has_gpano)
     if not options.refine_focal:
@@ -88,14 +88,15 @@ def _is_sphere(mounts: tuple[Mount, ...]) -> bool:
 
 
 def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
-    """Return the calibration at the picture's size; of the stored picture, if only that has its shape."""
+    """Return the calibration at the picture's size, or turned to it if it fits the picture as stored."""
+    width, height = picture.size
     try:
-        return calibration.for_picture(*picture.size)
+        return calibration.for_picture(width, height)
     except InputError as error:
         if picture.orientation not in TURNED:
             raise InputError(f"{path}: {error}") from error
     try:
-        mounts = calibration.for_picture(*picture.size[::-1])
+        mounts = calibration.for_picture(height, width)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     R_stored_from_shown, _ = TURNED[picture.orientation]
@@ -105,9 +106,9 @@ def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[
 def read_views(
     path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: NDArray[np.bool_]
 ) -> tuple[list[View], tuple[str, ...]]:
-    """Each camera with its part of a picture, black borders masked, and what the user should know.
+    """Return each camera with its part of a picture, black borders masked, and notes for the user.
 
-    `is_valid` (H, W) tells the pixels that count so far.
+    `is_valid` (H, W) are the pixels that count so far.
     """
     pixels = face_pixels(picture.rgb, is_valid)
     whole = compute_extent(mounts)

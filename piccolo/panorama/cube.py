@@ -1,10 +1,10 @@
 """Six faces of a cube, files of a folder or cells of one picture, resampled to an equirectangular picture.
 
-Every face is a pinhole picture of 90 x 90 degrees seen from inside. Up hangs over front: its lower edge is
-front's upper edge. Down's upper edge is front's lower edge. This is OpenGL's cube (px right, nx left, py up,
-ny down, pz front, nz back), Matterport's skybox and FFmpeg's v360 alike.
+Every face is a pinhole picture of 90 x 90 degrees seen from inside. The lower edge of up is the upper edge of
+front, the upper edge of down the lower edge of front, as in OpenGL's cube (px right, nx left, py up, ny down,
+pz front, nz back), Matterport's skybox and FFmpeg's v360.
 
-Not by py360convert 1.0.4: it samples half a pixel off, leaves the pixels of its rim in a face's corners
+py360convert 1.0.4 is not used: it samples half a pixel off, leaves the rim's pixels in a face's corners
 uninitialised, and takes four times the memory.
 """
 
@@ -55,16 +55,14 @@ WANTED = "wanted six faces of a cube named as skybox0..5, px nx py ny pz nz or r
 
 
 def face_pixels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Return a face (size, size, 4) as it is resampled."""
+    """Return a face (size, size, 4) with its validity as alpha, to be resampled."""
     return np.dstack([rgb, is_valid.astype(np.uint8) * 255])
 
 
 def equirectangular(faces: Faces) -> Pixels:
     """Return the picture of the full sphere, four times as wide as a face.
 
-    Bilinear, also across the cube's edges.
-
-    A pixel is valid if all four that go into it are.
+    Interpolation is bilinear, also across the cube's edges. A pixel is valid if all four source pixels are.
     """
     size = len(faces["f"])
     padded = {letter: _pad_face(faces, letter) for letter in faces}
@@ -96,7 +94,10 @@ def _pad_face(faces: Faces, letter: str) -> NDArray[np.uint8]:
 
 
 def _sample_faces(faces: Faces, directions: NDArray[np.float32], rim: int) -> NDArray[np.uint8]:
-    """Pixels (H, W, 4) along directions (H, W, 3), each from the face it meets; faces have a rim of `rim`."""
+    """Sample pixels (H, W, 4) along directions (H, W, 3), each from the face that it meets.
+
+    The faces have a rim of `rim` pixels.
+    """
     pixels = np.empty((*directions.shape[:2], 4), dtype=np.uint8)
     largest = np.abs(directions).max(axis=2)
     for letter, R in R_FACE_FROM_CAM.items():
@@ -124,7 +125,7 @@ def read_cube_folder(folder: Path) -> Picture:
 
 
 def is_cube(folder: Path) -> bool:
-    """Return True for a folder of few pictures among which are the six faces of one cube."""
+    """Return True if a folder holds few pictures, and among them the six faces of one cube."""
     if sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) > MAX_CUBE_FILES:
         return False
     try:
@@ -136,7 +137,7 @@ def is_cube(folder: Path) -> bool:
 def face_paths(folder: Path) -> dict[str, Path]:
     """Return the files of a folder's one complete cube, by the letters of their faces.
 
-    Each scheme's files are told apart by the rest of their names.
+    Files belong to one cube if the rest of their names is the same.
     """
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
@@ -158,12 +159,10 @@ def face_paths(folder: Path) -> dict[str, Path]:
 
 
 def cube_of_cells(path: Path, picture: Picture, order: str | None) -> Picture | None:
-    """Return the panorama of a picture that is a cross, or by `order` a grid of six faces.
+    """Return the panorama of a picture that is a cross, or by `order` a grid, of six faces; else None.
 
-    None if it is neither.
-
-    A cross, 4:3 or 3:4, is known by its empty cells. A grid, 6:1, 1:6, 3:2 or 2:3, is known by `order` alone,
-    the letters of its faces from left to right, then downwards.
+    A cross, 4:3 or 3:4, is recognised by its empty cells. A grid, 6:1, 1:6, 3:2 or 2:3, needs `order`: the
+    letters of its faces from left to right, then downwards.
 
     Raises InputError if an order is given, and the picture is no grid of six squares.
     """
@@ -181,12 +180,12 @@ def _grid(path: Path, picture: Picture, order: str) -> Faces:
     for num_columns, num_rows in ((6, 1), (1, 6), (3, 2), (2, 3)):
         if width * num_rows == height * num_columns and width % num_columns == 0:
             size = width // num_columns
-            return {order[k]: _cell(picture, size, *divmod(k, num_columns)) for k in range(6)}
+            return {order[k]: _cell(picture, size, k // num_columns, k % num_columns) for k in range(6)}
     raise InputError(f"{path}: found {width} x {height}, wanted six equal squares as cube_order says")
 
 
 def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
-    """Faces of a cross; None for another shape, or if the cells around it are not empty."""
+    """Return the faces of a cross; None for another shape, or if the cells around it are not empty."""
     width, height = picture.size
     size = width // len(layout[0])
     if width != size * len(layout[0]) or height != size * len(layout):
@@ -203,7 +202,7 @@ def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
 
 
 def _cell(picture: Picture, size: int, row: int, column: int) -> NDArray[np.uint8]:
-    """Return the square (size, size, 4) in a row and column of such."""
+    """Return the square cell (size, size, 4) in a row and column of a picture."""
     place = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
     return face_pixels(picture.rgb[place], picture.is_valid[place])
 
@@ -211,7 +210,7 @@ def _cell(picture: Picture, size: int, row: int, column: int) -> NDArray[np.uint
 def _is_empty(pixels: NDArray[np.uint8]) -> bool:
     """Return True for a cell of one colour or of alpha 0 only.
 
-    Its rim may have a little of the neighbours.
+    A thin rim is ignored, as it may show a little of the neighbours.
     """
     rim = max(len(pixels) // 32, 1)
     inner = pixels[rim:-rim, rim:-rim].reshape(-1, 4)

@@ -1,8 +1,8 @@
-"""Google's Photo Sphere XMP: which part of the sphere a picture shows, and how the camera was held.
+"""Google's Photo Sphere XMP: the part of the sphere that a picture shows, and the camera's attitude.
 
-https://developers.google.com/streetview/spherical-metadata. The few fields are searched in the text, once as
-attributes and once as elements, without an XML parser: there are no entities that could be expanded, and
-damaged XML costs nothing but its damaged fields. A crop is embedded in the full sphere here.
+https://developers.google.com/streetview/spherical-metadata. The few fields are searched in the text, as
+attributes and as elements, without an XML parser: there are no entities to expand, and damaged XML costs only
+its damaged fields. Crops are embedded in the full sphere here.
 """
 
 import math
@@ -48,7 +48,7 @@ class CropRegion:
 
 
 def gpano_fields(xmp: bytes) -> dict[str, str]:
-    """Names and texts of the Photo Sphere fields in an XMP packet, without the namespace."""
+    """Return names and texts of the Photo Sphere fields in an XMP packet, without the namespace."""
     fields: dict[str, str] = {}
     for prefix in list(dict.fromkeys(PREFIX.findall(xmp)))[:MAX_PREFIXES]:
         for name, attribute, element in re.findall(FIELD % re.escape(prefix), xmp):
@@ -67,17 +67,16 @@ def _number(fields: dict[str, str], name: str, largest: float = MAX_NUMBER) -> f
 
 
 def attitude(fields: dict[str, str]) -> GPano:
-    """Pitch and roll; what is out of range counts as not said."""
+    """Return pitch and roll; a value out of range counts as missing."""
     return GPano(_number(fields, "PosePitchDegrees", 90.0), _number(fields, "PoseRollDegrees", 180.0))
 
 
 def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
-    """Return the part of the sphere that a picture of `aspect` (width by height) shows.
+    """Return the part of the sphere that a picture of `aspect` (width / height) shows.
 
-    Full if nothing is said.
-
-    The fields count pixels of the picture as it was made: only their ratios are used, so that a picture made
-    smaller since is placed right. None if the fields make no sense or are of a picture of another shape.
+    All of it if there are no fields. These count pixels of the picture as it was made: only their ratios are
+    used, so that a picture made smaller later is placed right. None if the fields make no sense or are of a
+    picture of another shape.
     """
     if not fields.keys() & set(CROP_FIELDS):
         return CropRegion()
@@ -94,7 +93,7 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
 
 
 def rotation_to_level(gpano: GPano) -> Array | None:
-    """R_level_from_cam (3, 3) from pitch and roll, None if neither is known; one alone counts with 0.
+    """Return R_level_from_cam (3, 3) from pitch and roll; None if both are missing, else a missing one is 0.
 
     `x_level = R_level_from_cam @ x_cam`; both frames have +x towards the image centre, +y left, +z up, level
     with z against gravity and x at the heading. Google's reference: pitch is the image centre's elevation
@@ -115,9 +114,10 @@ def rotation_to_level(gpano: GPano) -> Array | None:
 
 
 def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:
-    """Pitch and roll of a camera in whose axes, +x image centre, +y left, +z up, gravity is `down_cam` (3,).
+    """Return pitch and roll of a camera from the direction of gravity (3,) in its axes.
 
-    Up is the third row of R_level_from_cam: (sin pitch, cos pitch sin roll, cos pitch cos roll).
+    The axes are +x image centre, +y left, +z up. Up is the third row of R_level_from_cam:
+    (sin pitch, cos pitch sin roll, cos pitch cos roll).
     """
     x, y, z = (-value for value in down_cam)
     across = math.hypot(y, z)
@@ -126,19 +126,21 @@ def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:
 
 
 def region_of_fov(fov_deg: float, width: int, height: int) -> CropRegion:
-    """Return a picture with as many pixels a degree in both directions, centred on the horizon."""
-    wide, high = fov_deg / 360.0, fov_deg / 180.0 * height / width  # fractions of the sphere's picture
+    """Return the region of a picture centred on the horizon, with equal degrees a pixel both ways."""
+    wide = fov_deg / 360.0  # fraction of the sphere's picture
+    high = fov_deg / 180.0 * height / width
     return CropRegion((1.0 - wide) / 2.0, (1.0 - high) / 2.0, wide, high)
 
 
 def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[int, int]:
-    """Width and height [px], 2:1, of the sphere's picture in which one of `size` keeps its pixels.
+    """Return width and height [px], 2:1, of the full sphere at the resolution of a picture of `size`.
 
-    Within 1 % of 2:1 the direction that has more pixels a degree is shrunk.
+    Where the sphere is within 1 % of 2:1, the direction with more pixels a degree is shrunk.
 
-    Raises InputError if the region does not fit the picture, or the sphere's picture would be too large.
+    Raises InputError if the region does not fit the picture, or the full sphere would be too large.
     """
-    width, height = size[0] / region.width, size[1] / region.height
+    width = size[0] / region.width
+    height = size[1] / region.height
     found = f"{path}: found {size[0]} x {size[1]}"
     if abs(width - 2.0 * height) > ASPECT_TOLERANCE * 2.0 * height:
         raise InputError(f"{found} of a sphere of {width:.0f} x {height:.0f}, wanted that width = 2 x height")
@@ -156,9 +158,8 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
 def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], region: CropRegion) -> Pixels:
     """Return the picture at its place in the full sphere, the rest not valid.
 
-    Itself if it is the full sphere.
-
-    Its edges come to whole pixels: it is moved by half a pixel at most. Over the seam it is continued.
+    Edges are rounded to whole pixels, so the picture moves by half a pixel at most. It may cross the seam.
+    A full sphere is returned itself.
     """
     height, width = is_valid.shape
     full_width, full_height = full_size(path, region, (width, height))

@@ -1,4 +1,4 @@
-"""Local normalisation on the sphere: opponent channels less their local mean, by their local deviation."""
+"""Local normalisation on the sphere: opponent channels minus local mean, divided by local deviation."""
 
 import math
 from functools import lru_cache
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ..geometry.sphere import pixel_rays, solid_angles
 from ..geometry.vectors import row
-from ..kernels.jit import F0, F1, HALF, copy_to, inline_kernel, kernel
+from ..kernels.jit import F0, F1, HALF, Scalar, copy_to, inline_kernel, kernel
 from . import Panorama
 from .texels import (
     CHUNK,
@@ -36,27 +36,30 @@ LEAST_WEIGHT = np.float32(1e-9)  # of neighbours that count, where hardly any do
 
 
 @inline_kernel
-def opponent(r, g, b):
-    """Luminance, (R - B) / 2 and (2 G - R - B) / 4: OPPONENT times the colour."""
+def opponent(r: Scalar, g: Scalar, b: Scalar) -> tuple[Scalar, Scalar, Scalar]:
+    """Return luminance, (R - B) / 2 and (2 G - R - B) / 4: OPPONENT times the colour."""
     return (r + g + b) / np.float32(3.0), HALF * (r - b), HALF * g - np.float32(0.25) * (r + b)
 
 
 @inline_kernel
-def zscore(value, mean, inverse_std):
-    """(value - mean) / standard deviation, clipped."""
+def zscore(value: Scalar, mean: Scalar, inverse_std: Scalar) -> Scalar:
+    """Return (value - mean) / standard deviation, clipped."""
     return min(max((value - mean) * inverse_std, -_CLIP), _CLIP)
 
 
 @inline_kernel
-def mean_and_inverse_std(total, squares, per):
-    """Mean and 1 / standard deviation of weighted sums, `per` weight; bounded where nothing varies."""
+def mean_and_inverse_std(total: Scalar, squares: Scalar, per: Scalar) -> tuple[Scalar, Scalar]:
+    """Return mean and 1 / standard deviation from weighted sums; bounded where nothing varies.
+
+    `per` is 1 / the sum of the weights.
+    """
     mean = total * per
     return mean, F1 / math.sqrt(max(squares * per - mean * mean, F0) + _MIN_VARIANCE)
 
 
 @lru_cache(maxsize=8)
 def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float64]:
-    """Spectra over the azimuth (W / 2 + 1, H, H) of the Gaussian weights between rows, times solid angle."""
+    """Compute spectra over azimuth (W / 2 + 1, H, H) of Gaussian weights between rows, times solid angle."""
     rays = pixel_rays(width)
     sigma = np.radians(sigma_deg)
     weight = np.empty((width // 2, width // 2, width))
@@ -66,9 +69,9 @@ def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float64]:
 
 
 def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.float32]:
-    """Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C).
+    """Return the Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C).
 
-    In float64: what BLAS rounds one way or the other is then rounded away.
+    It computes in float64, so that rounding to float32 removes the differences between BLAS libraries.
     """
     spectrum = np.fft.rfft(image.astype(np.float64), axis=1).transpose(1, 0, 2)
     gains = sphere_gaussian(image.shape[1], sigma_deg)
@@ -78,7 +81,9 @@ def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.floa
 
 
 @kernel
-def block_moments(channels, weight, moments):
+def block_moments(
+    channels: NDArray[np.float32], weight: NDArray[np.float32], moments: NDArray[np.float32]
+) -> None:
     """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
     step = channels.shape[0] // moments.shape[0]
     for i in range(moments.shape[0]):
@@ -101,8 +106,10 @@ def block_moments(channels, weight, moments):
 
 
 @inline_kernel
-def interpolation_along(num, num_wider):
-    """Places of `num` pixels among fewer, wider ones around a row: indices (num,) and fractions."""
+def interpolation_along(
+    num: int, num_wider: int
+) -> tuple[NDArray[np.uintp], NDArray[np.uintp], NDArray[np.float32]]:
+    """Locate a row's `num` pixels between wider ones: left and right neighbours (num,), and fractions."""
     left = np.empty(num, np.uintp)
     right = np.empty(num, np.uintp)
     fraction = np.empty(num, np.float32)
@@ -117,18 +124,23 @@ def interpolation_along(num, num_wider):
 
 
 @inline_kernel
-def as_texel_channel(value, mean, gain, shift):
-    """A channel's bits of a texel: its normalised value in levels."""
+def as_texel_channel(value: Scalar, mean: Scalar, gain: Scalar, shift: int) -> np.int32:
+    """Return the bits of a texel that hold a channel's normalised value in levels."""
     level = np.int32(zscore(value, mean, gain) * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL + 0.5))
     return np.int32(min(level, np.int32(255)) << np.int32(shift))
 
 
 @kernel
-def pack_normalized(channels, weight, stats, texels):
+def pack_normalized(
+    channels: NDArray[np.float32],
+    weight: NDArray[np.float32],
+    stats: NDArray[np.float32],
+    texels: NDArray[np.int32],
+) -> None:
     """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
 
-    `stats` (h, w, 6) are means and 1 / standard deviations, read bilinearly; a column of texels is wrapped
-    and a row clamped on each side.
+    Means and 1 / standard deviations are interpolated bilinearly in `stats` (h, w, 6). On each side a column
+    of texels is wrapped and a row clamped.
     """
     height, width = weight.shape
     num_rows, num_columns, _ = stats.shape
@@ -161,7 +173,7 @@ def pack_normalized(channels, weight, stats, texels):
 
 
 @kernel
-def finish_statistics(sums):
+def finish_statistics(sums: NDArray[np.float32]) -> None:
     """Turn weighted sums (h, w, 7) of 1, channels, squares into means and 1 / deviations (h, w, 1:7)."""
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
@@ -172,16 +184,17 @@ def finish_statistics(sums):
 
 
 def opponent_channels(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Luminance and two opponent colours (H, W, 3) of an image (H, W, 3)."""
+    """Convert an image (H, W, 3) to luminance and two opponent colours (H, W, 3)."""
     return np.asarray(cv2.transform(rgb, OPPONENT))
 
 
 def local_statistics(
     channels: NDArray[np.float32], weight: NDArray[np.float32], width: int, sigma_deg: float
 ) -> NDArray[np.float32]:
-    """Local means and 1 / standard deviations (width / 2, width, 6) of channels (H, W, 3).
+    """Compute local means and 1 / standard deviations (width / 2, width, 6) of channels (H, W, 3).
 
-    Over a Gaussian on the sphere, weighted by (H, W) and the solid angle; W is a multiple of the width.
+    They are taken over a Gaussian on the sphere, weighted by `weight` (H, W) and the solid angle; W is a
+    multiple of `width`.
     """
     moments = np.empty((width // 2, width, 7), np.float32)
     block_moments(channels, weight, moments)
@@ -193,7 +206,7 @@ def local_statistics(
 def normalize_locally(
     rgb: NDArray[np.float32], counts: NDArray[np.bool_], sigma_deg: float
 ) -> NDArray[np.float32]:
-    """Opponent channels (H, W, 3) of an image, locally normalised over what `counts`; elsewhere 0."""
+    """Return opponent channels (H, W, 3), locally normalised over the pixels that count; elsewhere 0."""
     channels = opponent_channels(rgb)
     weight = counts.astype(np.float32)
     statistics = local_statistics(channels, weight, rgb.shape[1], sigma_deg)
@@ -202,7 +215,7 @@ def normalize_locally(
 
 
 def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
-    """Opponent channels averaged over `cell_deg`, less the local mean, by the local deviation (`sigma_deg`).
+    """Average opponent channels over `cell_deg` and normalise them locally, over `sigma_deg`.
 
     The width of the panorama is a multiple of STATS_WIDTH.
     """
@@ -219,8 +232,15 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
 
 
 @kernel
-def sample_channels(texels, width, directions, rotations, samples, validity):
-    """Write channels (rotations, 3, cells), less the zero level, and validity along each turned direction."""
+def sample_channels(
+    texels: NDArray[np.int32],
+    width: int,
+    directions: NDArray[np.float32],
+    rotations: NDArray[np.float32],
+    samples: NDArray[np.float32],
+    validity: NDArray[np.float32],
+) -> None:
+    """Write channels (rotations, 3, cells), minus the zero level, and validity in turned directions."""
     p = make_projected()
     center = np.zeros(3)
     zero = np.float32(ZERO_LEVEL)

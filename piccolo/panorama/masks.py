@@ -1,8 +1,8 @@
-"""Masks: a picture, the cap around a pole; and what a picture tells by itself, that it is two fisheyes too.
+"""Masks: from a picture file, of the cap around a pole, and of what is recognised in the picture itself.
 
-Black borders and patches over the nadir or zenith are found. Each rule is narrow: what is masked wrongly is
-lost. The thresholds were set by hand, apart from both sides: tests/test_panorama_masks.py has the rooms that
-they must leave alone and the patches that they find.
+Black borders and patches over the nadir or zenith are masked, pictures of two fisheyes recognised. Each rule
+is narrow, as wrongly masked pixels are lost. The thresholds were set by hand, apart from both sides:
+tests/test_panorama_masks.py has the rooms that they must not change and the patches that they find.
 """
 
 from collections.abc import Callable
@@ -53,11 +53,11 @@ WHITE = 128  # and above is to be ignored
 def black_borders(
     rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], is_full: bool
 ) -> NDArray[np.bool_] | None:
-    """Where (H, W) the picture is unfilled but valid so far, None if nowhere.
+    """Return a mask (H, W) of unfilled pixels that are valid so far; None if there are none.
 
-    From each edge inwards, pixels up to the first that is not near black, if the edge is near black: of a
-    full sphere as a whole (a pole is one point, the seam one line), of a crop in part. 95 % of them, save
-    for a rim of 8 pixels, must be black to two levels; shadows carry noise.
+    From each edge that is near black it takes the pixels inwards up to the first that is not near black. In a
+    full sphere the edge must be black as a whole (a pole is one point, the seam one line), in a crop in part.
+    95 % of the pixels, except a rim of 8 pixels, must be black to two levels; shadows carry noise.
     """
     if rgb[0].max() <= BLACK and rgb.max() <= BLACK:
         return np.ones(is_valid.shape, dtype=np.bool_)
@@ -85,7 +85,7 @@ def _filter_depths(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArr
 
 
 def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Return the number of near black pixels from the edge (row 0) inwards, of columns black there."""
+    """Return the number of near black pixels from the edge (row 0) inwards, in columns black there."""
     depth = np.zeros(len(is_black), dtype=np.int64)
     for begin in range(0, len(inwards), BAND):
         band = np.ascontiguousarray(inwards[begin : begin + BAND])
@@ -99,7 +99,7 @@ def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> 
 
 
 def _black_fraction(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> float:
-    """Fraction of BLACK pixels among those within `depth` (columns,) of the edge."""
+    """Return the fraction of BLACK pixels among those within `depth` (columns,) of the edge."""
     num_black = 0
     for begin in range(0, int(depth.max()), BAND):
         band = np.ascontiguousarray(inwards[begin : begin + BAND])
@@ -109,11 +109,12 @@ def _black_fraction(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> flo
 
 
 def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -> float:
-    """Half angle [deg] of a disc put over the `pole`, zenith or nadir, of a full sphere; 0 if there is none.
+    """Return the half angle [deg] of a disc over the `pole` of a full sphere; 0 if there is none.
 
-    It is bounded by a circle of latitude, which is an edge in 90 % of all directions while the rows near it
-    are not (a logo, a plain colour), or at which all detail ends in every direction (a blur). Scenes have no
-    such circles, save for round things right over or under the camera, such as its own stand.
+    The pole is zenith or nadir. The border is a circle of latitude that is an edge in 90 % of all directions
+    while the rows near it are not (a logo, a plain colour), or at which all detail ends in every direction (a
+    blur). Scenes have no such circles, except for round things directly over or under the camera, such as its
+    own stand.
     """
     num_rows = round(NUM_ROWS / DISC_WIDTH * rgb.shape[1])
     rows = slice(num_rows) if pole == "zenith" else slice(-num_rows, None)
@@ -139,7 +140,7 @@ def _edge_circle(cap: NDArray[np.float32]) -> int:
 
 @lru_cache(maxsize=1)
 def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Flat indices (NUM_ROWS, DISC_WIDTH) of the pixels DETAIL_DEG east and west of each."""
+    """Return flat indices (NUM_ROWS, DISC_WIDTH) of the pixels DETAIL_DEG east and west of each."""
     around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
     spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
     rows = np.arange(NUM_ROWS)[:, None]
@@ -167,7 +168,7 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
 
 
 def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
-    """Return True if all is black outside of the two circles inscribed in the halves, but not within them.
+    """Return True if a picture is black outside the two circles inscribed in its halves, but not in them.
 
     A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
     around. Circles down to 0.9 of the halves' height are found.
@@ -190,14 +191,14 @@ def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
 
 
 def find_mask(mask: Path, pano: Path) -> Path | None:
-    """Return mask's file: `mask` itself, or in the folder `mask` the one named as the panorama, or None."""
+    """Return the file of a mask: `mask`, or in that folder the file named as the panorama, or None."""
     if not mask.is_dir():
         return mask
     return next((file for suffix in SUFFIXES if (file := mask / (pano.stem + suffix)).is_file()), None)
 
 
 def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np.bool_]]:
-    """Which of the sizes (width, height) a mask has the shape of, and where it counts at this size.
+    """Return the index of the size (width, height) whose shape a mask has, and its pixels that count (H, W).
 
     A larger mask masks a pixel if any of its own pixels there is white, a smaller one is enlarged.
 
@@ -216,7 +217,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
 
 
 def mask_pole(is_valid: NDArray[np.bool_], pole: str, half_angle_deg: float) -> NDArray[np.bool_]:
-    """Return validity (H, W) without the rows whose centre is nearer than `rows` to the `pole`."""
+    """Return validity (H, W) without the rows whose centre is within `half_angle_deg` of the `pole`."""
     height = len(is_valid)
     from_zenith = (np.arange(height) + 0.5) * 180.0 / height
     from_pole = from_zenith if pole == "zenith" else from_zenith[::-1]

@@ -1,4 +1,4 @@
-"""A panorama at any size, what is known of it, and how it is to be read."""
+"""A panorama at any size, with its metadata, and the options with which it is read."""
 
 import math
 from dataclasses import dataclass, replace
@@ -21,7 +21,7 @@ Projection = Literal["equirectangular", "pinhole", "fisheye"]
 
 @dataclass(frozen=True)
 class GPano:
-    """How the camera was held, by the file's Photo Sphere XMP; None where the file does not say."""
+    """Attitude of the camera by the file's Photo Sphere XMP; None for a missing field."""
 
     pitch_deg: float | None = None  # of the image centre above the horizon, [-90, 90]
     roll_deg: float | None = None  # about the view axis, the camera's right side down, [-180, 180]
@@ -51,7 +51,7 @@ class Panorama:
     def resample(self, camera: Camera, width: int) -> "Panorama":
         """Return the panorama, `width` x width / 2, by another calibration of its camera.
 
-        It has a focal_prior.
+        The panorama must have a focal_prior.
         """
         assert self.focal_prior is not None
         mount = self.cameras[0].with_camera(camera)
@@ -65,7 +65,7 @@ class Panorama:
 
 @dataclass(frozen=True)
 class ReadOptions:
-    """What a picture can't say of itself."""
+    """Options for reading a picture that its file can't give."""
 
     fov_deg: float | None = None  # horizontal; goes before metadata
     mask: Path | None = None  # picture, white where the panorama is to be ignored, or a folder of such
@@ -98,11 +98,11 @@ class ReadOptions:
 
     @property
     def rig(self) -> Calibration | None:
-        """The rig whose pictures a panorama is made of; None for pictures that stand alone."""
+        """Rig whose pictures make a panorama; None for single pictures."""
         return self.calibration if self.calibration is not None and self.calibration.is_rig else None
 
     def with_refined_camera(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
-        """Return the options with the camera that a result refined as a calibration of the stored picture."""
+        """Return the options with the refined camera of a result as calibration of the stored picture."""
         if len(cameras) != 1:
             return self
         given = self.calibration
@@ -112,7 +112,7 @@ class ReadOptions:
         return replace(self, calibration=camera, focal_px=None, fov_deg=None, projection=None)
 
     def _check_together(self) -> None:
-        """Refuse options that say the same thing twice, or of different pictures."""
+        """Refuse options that give one thing twice, or belong to different pictures."""
         given = {
             "`camera` or `rig`": self.calibration is not None,
             "`focal_px`": self.focal_px is not None,
@@ -144,7 +144,7 @@ def shrink(panorama: Panorama, width: int) -> Panorama:
 
 
 def resize(panorama: Panorama, width: int) -> Panorama:
-    """Return panorama at `width` x width / 2: area-averaged where that is smaller, interpolated where larger.
+    """Return the panorama at `width` x width / 2: area-averaged if that is smaller, else interpolated.
 
     Pixels that do not count stay out of the averages; a pixel counts if half of its area does.
     """

@@ -1,6 +1,6 @@
-"""What a photo's file says of itself beside its pixels: digest, size, time, place, focal length, elevation.
+"""Facts in a photo's file besides its pixels: digest, size, time, place, focal length, elevation.
 
-What is damaged counts as not said. The focal length in pixels is the more exact of two:
+Damaged fields count as missing. The focal length in pixels is the more exact of two:
 - FocalLength with FocalPlaneXResolution and its unit, at the size at which the picture was taken;
 - FocalLengthIn35mmFilm, the focal length that shows the same angle over the diagonal of 36 x 24 mm, 43.27 mm,
   as CIPA DCG-001 defines it: a phone's 4:3 picture is compared with film of 3:2, so widths can't be.
@@ -38,7 +38,7 @@ CAMERA_ELEVATION = 0x9405  # CameraElevationAngle of EXIF 2.31 [deg]
 
 
 class GpsPosition(NamedTuple):
-    """Where a receiver in the camera was, on the WGS 84 ellipsoid."""
+    """Position of a receiver in the camera, on the WGS 84 ellipsoid."""
 
     latitude_deg: float
     longitude_deg: float
@@ -46,7 +46,7 @@ class GpsPosition(NamedTuple):
 
 
 class PhotoFacts(NamedTuple):
-    """A photo's file without its pixels."""
+    """Facts of a photo's file other than its pixels."""
 
     sha256: str  # of the file; of several, of their digests in the order of FACE_LETTERS or rig, one a line
     image_size: tuple[int, int]  # width and height [px], as stored; of several the first
@@ -55,7 +55,7 @@ class PhotoFacts(NamedTuple):
 
 
 def sha256_of(path: Path, rig: Calibration | None = None) -> str | None:
-    """Digest of a photo's file or files, whether they are pictures or not; None where they can't be read."""
+    """Return the digest of a photo's file or files, pictures or not; None if they can't be read."""
     try:
         return _digest(_files_of(path, rig))
     except (OSError, InputError):
@@ -108,13 +108,13 @@ def _exif_chunk(content: bytes) -> bytes:
 
 
 def photo_of_array(rgb: NDArray[np.uint8]) -> PhotoFacts:
-    """Return the same of pixels (H, W, 3): their digest and size."""
+    """Return the facts of pixels (H, W, 3): their digest and size."""
     height, width = rgb.shape[:2]
     return PhotoFacts(sha256_of_arrays(rgb), (width, height), None, None)
 
 
 def _capture_time(exif: Mapping[int, Any]) -> str | None:
-    """When the picture was taken, by the camera's clock."""
+    """Return the time at which the picture was taken, by the camera's clock; None if it is missing."""
     found = TIME.fullmatch(str(exif.get(Base.DateTimeOriginal, "")).strip("\0 "))
     if not found:
         return None
@@ -125,7 +125,7 @@ def _capture_time(exif: Mapping[int, Any]) -> str | None:
 
 
 def _gps_position(gps: Mapping[int, Any]) -> GpsPosition | None:
-    """Where the picture was taken; None if the file does not say, or says what can't be."""
+    """Return the position at which the picture was taken; None if it is missing or impossible."""
     try:
         latitude = _degrees(gps[GPS.GPSLatitude], gps[GPS.GPSLatitudeRef], "NS")
         longitude = _degrees(gps[GPS.GPSLongitude], gps[GPS.GPSLongitudeRef], "EW")
@@ -139,13 +139,13 @@ def _gps_position(gps: Mapping[int, Any]) -> GpsPosition | None:
 
 
 def _degrees(parts: Any, reference: str, letters: str) -> float:
-    """Degrees from degrees, minutes and seconds, positive for the first letter."""
+    """Convert degrees, minutes and seconds to degrees, positive for the first of two letters."""
     sign = {letters[0]: 1.0, letters[1]: -1.0}[str(reference).strip("\0 ").upper()]
     return sign * sum(float(part) / unit for part, unit in zip(parts, DEGREE_PARTS, strict=False))
 
 
 class ExifFocal(NamedTuple):
-    """A focal length, and where it comes from."""
+    """A focal length, and its source."""
 
     focal: float  # [px]
     deviation: float  # standard deviation of its logarithm
@@ -153,8 +153,8 @@ class ExifFocal(NamedTuple):
 
 
 def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> ExifFocal | None:
-    """Return the focal length of a picture of this size [px]; None if EXIF does not say, or what can't be."""
-    diagonal = math.hypot(*size)
+    """Return the focal length of a picture of this size [px]; None if it is missing or impossible."""
+    diagonal = math.hypot(size[0], size[1])
     film = _number(exif, Base.FocalLengthIn35mmFilm)
     film = film if film and MIN_FILM <= film <= MAX_FILM else None
     plane = _focal_by_plane(exif, size)
@@ -180,7 +180,7 @@ def _is_zoom(exif: Mapping[int, object]) -> bool:
 
 
 def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:
-    """Focal length [px] by the pixels of the sensor, of which the picture may be a smaller copy."""
+    """Return the focal length [px] by the sensor's resolution; the picture may be a smaller copy."""
     focal = _number(exif, Base.FocalLength)
     per_unit = _number(exif, Base.FocalPlaneXResolution)
     unit = MM_PER_UNIT.get(int(_number(exif, Base.FocalPlaneResolutionUnit) or 2))
@@ -192,7 +192,7 @@ def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float 
 
 
 def elevation_deg(exif: Mapping[int, object]) -> float | None:
-    """Elevation of the image centre above the horizon [deg]; None if EXIF does not say."""
+    """Return the elevation of the image centre above the horizon [deg]; None if EXIF has none."""
     value = _number(exif, CAMERA_ELEVATION, least=-90.0)
     return value if value is None or value <= 90.0 else None
 

@@ -1,7 +1,7 @@
-"""The pixels in a JPEG, PNG, TIFF, WebP or HEIC file, 8 bits a channel, turned as EXIF says, by Pillow.
+"""The pixels in a JPEG, PNG, TIFF, WebP or HEIC file, 8 bits a channel, oriented by EXIF, read with Pillow.
 
-Sizes are checked before anything is decoded. Each format's class is called by itself, as the limit of
-Image.open, which large panoramas exceed, can be lifted for the whole process only.
+Sizes are checked before anything is decoded. Each format's class is called directly, as Image.open has a
+limit that large panoramas exceed and that can be lifted for the whole process only.
 """
 
 import subprocess
@@ -115,8 +115,14 @@ def read_picture(path: Path, min_size: tuple[int, int] = (MIN_WIDTH, MIN_HEIGHT)
             pixels = np.ascontiguousarray(pixels[..., :3])
         else:
             is_valid = np.ones(pixels.shape[:2], dtype=np.bool_)
-        more = _xmp(image), _warnings(image), read_exif(image), _orientation(image)
-        return Picture(np.asarray(pixels, np.uint8), is_valid, *more)
+        return Picture(
+            np.asarray(pixels, np.uint8),
+            is_valid,
+            xmp=_xmp(image),
+            warnings=_warnings(image),
+            exif=read_exif(image),
+            orientation=_orientation(image),
+        )
 
 
 def read_labels(path: Path, labels: Labels) -> Picture:
@@ -138,13 +144,13 @@ def read_labels(path: Path, labels: Labels) -> Picture:
 
 
 def picture_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] of the picture in a file, without decoding it."""
+    """Return width and height [px] of the picture in a file, without decoding it."""
     with open_picture(path, read_bytes(path, WANTED)) as image:
         return image.size
 
 
 def picture_orientation(path: Path) -> object:
-    """EXIF's number of how the picture in a file is to be turned, without decoding it; None without."""
+    """Return EXIF's orientation number of the picture in a file, without decoding it; else None."""
     with open_picture(path, read_bytes(path, WANTED)) as image:
         return _orientation(image)
 
@@ -153,7 +159,7 @@ def picture_orientation(path: Path) -> object:
 def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
     """Yield the picture in `data` as Pillow opens it, not decoded.
 
-    What Pillow raises becomes an InputError.
+    Any exception of Pillow becomes an InputError.
     """
     if not data:
         raise InputError(f"{path}: the file is empty, {WANTED}")
@@ -173,7 +179,7 @@ def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
 
 
 def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, int]) -> None:
-    """Refuse what would be read wrongly, and sizes out of range, before memory is taken for them."""
+    """Refuse kinds that would be read wrongly, and sizes out of range, before memory is allocated."""
     longer = max(image.size)
     shorter = min(image.size)
     found = f"{path}: found {image.width} x {image.height}"
@@ -210,9 +216,9 @@ def _decode(path: Path, data: bytes, image: ImageFile, mode: str) -> Image.Image
 
 
 def _orientation(image: ImageFile) -> object:
-    """EXIF's number of how the picture is to be turned; None where EXIF says nothing or is damaged.
+    """Return EXIF's orientation number; None where EXIF has none or is damaged.
 
-    ImageOps.exif_transpose writes EXIF anew as well, and raises where it is odd.
+    ImageOps.exif_transpose is not used: it also rewrites EXIF, and raises where EXIF is odd.
     """
     try:
         return image.getexif().get(Base.Orientation)
@@ -221,7 +227,7 @@ def _orientation(image: ImageFile) -> object:
 
 
 def read_exif(image: ImageFile) -> dict[int, object]:
-    """Return what EXIF says of camera and exposure, by tag; empty where it is missing or damaged."""
+    """Return EXIF's fields of camera and exposure, by tag; empty where EXIF is missing or damaged."""
     try:
         return dict(image.getexif().get_ifd(IFD.Exif))
     except Exception:  # Pillow raises whatever damaged metadata bring
@@ -229,7 +235,7 @@ def read_exif(image: ImageFile) -> dict[int, object]:
 
 
 def _decode_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> Image.Image:
-    """Return the packed TIFF in `data`, decoded by a process of its own."""
+    """Decode the compressed TIFF in `data` in a process of its own."""
     command = [sys.executable, "-P", "-c", DECODE_TIFF, mode]
     done = subprocess.run(command, input=data, capture_output=True, check=False)
     if done.returncode < 0:
@@ -245,7 +251,7 @@ def _decode_apart(path: Path, data: bytes, mode: str, size: tuple[int, int]) -> 
 def _is_cut(data: bytes, image: JpegImageFile) -> bool:
     """Return True for a JPEG just opened that has no end mark, or has it before the picture ends.
 
-    Then libjpeg takes grey for what is missing, but something else if more bytes come before the mark.
+    libjpeg fills missing parts with grey, but with something else if more bytes come before the mark.
     """
     end = data.find(END_MARK, image.fp.tell() if image.fp else 0)
     width, height = image.size

@@ -1,4 +1,4 @@
-"""A picture file or a folder of cube faces read as a panorama: a full sphere, and the pixels that count."""
+"""Reads a picture file or a folder of cube faces as a panorama: a full sphere, and the pixels that count."""
 
 from dataclasses import replace
 from os import PathLike
@@ -44,11 +44,11 @@ def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
     """Return the full sphere of a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
-    valid are pixels of alpha 0, what a crop leaves open, masks, black borders and discs put over a pole.
-    Labels become colours, and only masks and ignored labels are not valid.
+    valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Labels
+    become colours, and only masks and ignored labels are not valid.
 
     InputError if the file is missing or damaged, of another format or projection, its size is out of range,
-    or nothing tells which part of the sphere it shows.
+    or the part of the sphere that it shows is unknown.
     """
     path = Path(path)
     if options.labels:
@@ -78,7 +78,7 @@ def make_panorama(path: Path, picture: Picture, options: ReadOptions) -> Panoram
 
 
 def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
-    """Return panorama of an image (H, W, 3) of a camera that the options name, or else of a full sphere."""
+    """Return the panorama of an image (H, W, 3), of the camera in the options or a full sphere."""
     path = Path("array")
     picture = Picture(rgb, is_valid)
     cameras = cameras_of(path, picture, options, has_gpano=True)
@@ -106,7 +106,7 @@ def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
 def _on_sphere(
     path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None, deviation: float = 0.0
 ) -> Panorama:
-    """Return the pictures of one instant on one sphere, each with its file and cameras, masks taken out.
+    """Project the pictures of one instant, each with its file and cameras, to one sphere, and apply masks.
 
     `deviation` is that of the one camera's focal length.
     """
@@ -135,9 +135,9 @@ def _on_sphere(
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
-    """Width and height [px] of a panorama's file, or of the sphere of a folder of cube faces, not decoded.
+    """Return width and height [px] of a panorama's file, or of the sphere of a folder of faces, not decoded.
 
-    Raises InputError if EXIF says that it is to be turned, which many programs leave aside.
+    Raises InputError if EXIF rotates it, which many programs ignore.
     """
     if not path.is_dir():
         if (orientation := picture_orientation(path)) not in (None, 1):
@@ -149,7 +149,7 @@ def panorama_size(path: Path) -> tuple[int, int]:
 
 
 def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama:
-    """Return the panorama in a PNG file of labels. No automatic masks: a black border is a label too."""
+    """Read the panorama in a PNG of labels. No automatic masks: a black border is a label too."""
     picture = read_labels(path, labels)
     width, height = picture.size
     if width != 2 * height:
@@ -164,7 +164,7 @@ def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama
 def _region_of(
     path: Path, picture: Picture, fields: dict[str, str], options: ReadOptions
 ) -> tuple[CropRegion, list[str]]:
-    """Which part of the sphere a picture shows, by the user or its metadata, and warnings."""
+    """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
     width, height = picture.size
     if options.fov_deg is not None:
         return region_of_fov(options.fov_deg, width, height), []
@@ -189,7 +189,7 @@ def _region_of(
 def _embed_and_mask(
     path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
 ) -> Panorama:
-    """Return the picture at its place in the sphere, with everything masked that is not to be counted."""
+    """Embed the picture in the full sphere, and mask all pixels that do not count."""
     size = full_size(path, region, picture.size)
     notes = [*picture.warnings]
     masks = _user_masks(path, [size, picture.size], options, notes)
@@ -210,7 +210,7 @@ def _embed_and_mask(
 
 
 def _mask(path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions) -> Panorama:
-    """Return the panorama less what a mask of its size, or the option for the nadir, takes out."""
+    """Return the panorama without pixels removed by a mask of its size or the option for the nadir."""
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)
     if not is_valid.any():
@@ -223,7 +223,7 @@ def _mask(path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, opti
 def _user_masks(
     path: Path, sizes: list[tuple[int, int]], options: ReadOptions, notes: list[str]
 ) -> dict[int, NDArray[np.bool_]]:
-    """Return the user's mask, True where pixels count, by the index of the size that it has the shape of."""
+    """Return the user's mask, True where pixels count, by the index of the size whose shape it has."""
     if options.mask is None:
         return {}
     file = find_mask(options.mask, path)
@@ -235,7 +235,7 @@ def _user_masks(
 
 
 def _sphere_fraction(is_there: NDArray[np.bool_], region: CropRegion) -> float:
-    """Fraction of the sphere's area that a part (H, W) of a picture of `region` has."""
+    """Return the fraction of the sphere that a part (H, W) of a picture of `region` covers."""
     rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
     per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
     return float(per_row.mean() * region.width * region.height * np.pi / 2.0)
@@ -246,9 +246,9 @@ def read_photo(
     options: ReadOptions,
     is_masked: NDArray[np.bool_] | None = None,
 ) -> Panorama:
-    """Return the panorama in a file; or in an array (H, W, 3), with a mask (H, W) of what is to be ignored.
+    """Read the panorama in a file; or take that of an array (H, W, 3), with a mask (H, W) of ignored pixels.
 
-    An array that no camera is given for is a full sphere.
+    An array without a camera in the options is a full sphere.
     """
     if not isinstance(panorama, np.ndarray):
         if is_masked is not None:

@@ -1,8 +1,8 @@
-"""The panorama as texels, one int32 a pixel; and the points around a camera, a chunk at a time, on theirs.
+"""The panorama as texels, one int32 a pixel; points are projected to them a chunk at a time.
 
-In loops of their own: the arithmetic of `project` and of what follows `gather` is vectorised, the loads
-between them are not, on processors that gather slowly (AMD up to Zen 3: three times faster so), and need not
-be on others. What is kept of a chunk stays in the first cache.
+`project` and `gather` are separate loops: the arithmetic before and after the loads is vectorised, the loads
+are not. On processors that gather slowly that is three times faster (AMD up to Zen 3), and others lose
+nothing. The arrays of a chunk fit the first-level cache.
 """
 
 import math
@@ -13,10 +13,16 @@ from numpy.typing import NDArray
 
 from ..geometry.colors import pack_rgbx
 from ..geometry.sphere import direction_to_pixel, solid_angles
-from ..kernels.jit import F1, HALF, inline_kernel
+from ..kernels.jit import F1, HALF, Scalar, inline_kernel
 
 BYTE = np.int32(255)
 CHUNK = 512  # points
+Four = tuple[np.int32, np.int32, np.int32, np.int32]  # texels (0, 0), (1, 0), (0, 1), (1, 1)
+Weights = tuple[Scalar, Scalar, Scalar, Scalar]  # of four texels
+Pose32 = tuple[
+    np.float32, np.float32, np.float32, np.float32, np.float32, np.float32,
+    np.float32, np.float32, np.float32, np.float32, np.float32, np.float32,
+]  # fmt: skip
 
 
 class Texels(NamedTuple):
@@ -28,7 +34,7 @@ class Texels(NamedTuple):
 
 
 def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> Texels:
-    """Texels of an image (H, W, 3), W = 2 H, with the pixels that count (H, W), all if None."""
+    """Pack an image (H, W, 3), W = 2 H, into texels; those of `is_valid` (H, W) count, all if it is None."""
     height, width = rgb.shape[:2]
     padded = np.empty((height + 2, width + 2), np.int32)
     padded[1:-1, 1:-1] = pack_rgbx(rgb, is_valid)
@@ -39,17 +45,18 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
 
 
 @inline_kernel
-def channel(texel, shift):
-    """The 8-bit channel of a texel as float32; shift 0, 8 or 16."""
+def channel(texel: np.int32, shift: int) -> np.float32:
+    """Return the 8-bit channel of a texel as float32; shift 0, 8 or 16."""
     return np.float32((texel >> shift) & BYTE)
 
 
 @inline_kernel
-def locate_texel(x, y, z, rho, width):
-    """Index of the upper left of four texels around a camera direction, and the fraction (fu, fv) beyond it.
+def locate_texel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: int) -> tuple[np.int32, Scalar, Scalar]:
+    """Return the index of the upper left of four texels around a direction, and the fraction beyond it.
 
-    rho = hypot(x, y). Texel centres are at half-integers of the pixel coordinates, and a column and a row of
-    padding come before them. The other three are 1, stride and stride + 1 further.
+    The direction (x, y, z) is the camera's, rho = hypot(x, y), the fraction (fu, fv). Texel centres are at
+    half-integers of the pixel coordinates, and a column and a row of padding come before them. The indices of
+    the other three are 1, stride and stride + 1 higher.
     """
     u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
     u, v = u + HALF, v + HALF
@@ -59,14 +66,14 @@ def locate_texel(x, y, z, rho, width):
 
 
 @inline_kernel
-def is_valid(t00, t10, t01, t11):
-    """1 if all four texels count, 0 if one is masked; float32."""
+def is_valid(t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32) -> np.float32:
+    """Return 1 if all four texels count, 0 if one is masked."""
     return np.float32(((t00 & t10 & t01 & t11) >> 24) & 1)
 
 
 @inline_kernel
-def bilinear_weights(fu, fv):
-    """Weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fraction (fu, fv)."""
+def bilinear_weights(fu: Scalar, fv: Scalar) -> Weights:
+    """Return the weights of the texels (0, 0), (1, 0), (0, 1), (1, 1) at the fraction (fu, fv)."""
     w11 = fu * fv
     w10 = fu - w11
     w01 = fv - w11
@@ -74,15 +81,17 @@ def bilinear_weights(fu, fv):
 
 
 @inline_kernel
-def blend(t00, t10, t01, t11, weights, shift):
-    """Bilinear value of one channel of four texels."""
+def blend(t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32, weights: Weights, shift: int) -> Scalar:
+    """Interpolate one channel of four texels by their bilinear weights."""
     value = weights[0] * channel(t00, shift) + weights[1] * channel(t10, shift)
     return value + weights[2] * channel(t01, shift) + weights[3] * channel(t11, shift)
 
 
 @inline_kernel
-def blend_with_gradient(t00, t10, t01, t11, fu, fv, shift):
-    """Bilinear value of one channel of four texels and its derivatives by u and v."""
+def blend_with_gradient(
+    t00: np.int32, t10: np.int32, t01: np.int32, t11: np.int32, fu: Scalar, fv: Scalar, shift: int
+) -> tuple[Scalar, Scalar, Scalar]:
+    """Interpolate one channel of four texels at a fraction; return its derivatives by u and v too."""
     c00 = channel(t00, shift)
     c10 = channel(t10, shift) - c00
     c01 = channel(t01, shift)
@@ -93,31 +102,33 @@ def blend_with_gradient(t00, t10, t01, t11, fu, fv, shift):
 
 
 class Projected(NamedTuple):
-    """Of a chunk of points, arrays (CHUNK,)."""
+    """A chunk of projected points, and the texels around each; arrays (CHUNK,)."""
 
-    x: Any  # camera coordinates, float32
-    y: Any
-    z: Any
-    fu: Any  # fraction beyond the upper left of four texels, float32
-    fv: Any
-    index: Any  # of this texel, int32
-    t00: Any  # the four texels, int32
-    t10: Any
-    t01: Any
-    t11: Any
+    x: NDArray[np.float32]  # camera coordinates
+    y: NDArray[np.float32]
+    z: NDArray[np.float32]
+    fu: NDArray[np.float32]  # fraction beyond the upper left of four texels
+    fv: NDArray[np.float32]
+    texel: NDArray[np.int32]  # index of this texel
+    t00: NDArray[np.int32]  # the four texels
+    t10: NDArray[np.int32]
+    t01: NDArray[np.int32]
+    t11: NDArray[np.int32]
 
 
 @inline_kernel
-def make_projected():
-    """Room for a chunk."""
+def make_projected() -> Projected:
+    """Make the arrays of a chunk, not filled."""
     f = np.empty((5, CHUNK), np.float32)
     i = np.empty((5, CHUNK), np.int32)
     return Projected(f[0], f[1], f[2], f[3], f[4], i[0], i[1], i[2], i[3], i[4])
 
 
 @inline_kernel
-def pose_float32(R_cam_from_world, center_world):
-    """A pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 that registers hold."""
+def pose_float32(
+    R_cam_from_world: NDArray[np.floating[Any]], center_world: NDArray[np.floating[Any]]
+) -> Pose32:
+    """Return a pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 for registers."""
     f = np.float32
     R = R_cam_from_world
     t = center_world
@@ -128,8 +139,8 @@ def pose_float32(R_cam_from_world, center_world):
 
 
 @inline_kernel
-def in_camera(x, y, z, pose):
-    """Camera coordinates of a point, by a pose of `pose_float32`."""
+def in_camera(x: Scalar, y: Scalar, z: Scalar, pose: Pose32) -> tuple[Scalar, Scalar, Scalar]:
+    """Transform a point to camera coordinates, by a pose of `pose_float32`."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22, tx, ty, tz = pose
     dx, dy, dz = x - tx, y - ty, z - tz
     return (
@@ -140,26 +151,34 @@ def in_camera(x, y, z, pose):
 
 
 @inline_kernel
-def project(X, Y, Z, R_cam_from_world, center_world, width, projected):
-    """Write the camera coordinates, and the texels in an image of `width`, of at most CHUNK points (n,)."""
+def project(
+    X: NDArray[np.float32],
+    Y: NDArray[np.float32],
+    Z: NDArray[np.float32],
+    R_cam_from_world: NDArray[np.floating[Any]],
+    center_world: NDArray[np.floating[Any]],
+    width: int,
+    projected: Projected,
+) -> None:
+    """Write camera coordinates, and the place in an image of `width`, of at most CHUNK points (n,)."""
     p = projected
     pose = pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):
         x, y, z = in_camera(X[n], Y[n], Z[n], pose)
-        p.index[n], p.fu[n], p.fv[n] = locate_texel(x, y, z, math.sqrt(x * x + y * y), width)
+        p.texel[n], p.fu[n], p.fv[n] = locate_texel(x, y, z, math.sqrt(x * x + y * y), width)
         p.x[n] = x
         p.y[n] = y
         p.z[n] = z
 
 
 @inline_kernel
-def texels_around(projected, n):
-    """The four texels around a projected point that `gather` has written."""
+def texels_around(projected: Projected, n: int) -> Four:
+    """Return the four texels around a projected point; `gather` has written them."""
     return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
 
 
 @inline_kernel
-def gather(texels, width, projected, count):
+def gather(texels: NDArray[np.int32], width: int, projected: Projected, count: int) -> None:
     """Write the four texels around each of `count` projected points."""
     p = projected
     stride = np.int32(width + 2)
@@ -167,7 +186,7 @@ def gather(texels, width, projected, count):
     below = texels[stride:]
     below_right = texels[stride + 1 :]
     for n in range(count):
-        k = np.uintp(p.index[n])  # an unsigned index needs no test for being negative
+        k = np.uintp(p.texel[n])  # an unsigned index needs no test for being negative
         p.t00[n] = texels[k]
         p.t10[n] = right[k]
         p.t01[n] = below[k]

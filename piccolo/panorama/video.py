@@ -1,4 +1,4 @@
-"""Frames of a video as picture files: the sharpest at each step of time."""
+"""Frames of a video as picture files: the sharpest around each time step."""
 
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -20,14 +20,14 @@ WANTED = "wanted a video that PyAV reads, such as MP4"
 
 
 class VideoFrame(NamedTuple):
-    """A frame taken out of a video."""
+    """A frame of a video, written as a picture."""
 
     time: float  # [s] from its beginning
     path: Path  # of the picture
 
 
 def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
-    """Write a frame every so many seconds into a folder, the sharpest around each.
+    """Write a frame every `every` seconds into a folder, the sharpest around each time, and yield it.
 
     InputError if the file is no video or is damaged, or PyAV is not there.
     """
@@ -36,7 +36,7 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
     for time, frame in _decode(video):
         while time > (slot + NEIGHBORHOOD) * every:
             if best is not None:
-                yield _write_frame(video, folder, best)
+                yield _write_frame(video, folder, best[1], best[2])
             best = None
             slot += 1
         if time >= (slot - NEIGHBORHOOD) * every:
@@ -45,31 +45,35 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
             if best is None or sharpness > best[0]:
                 best = sharpness, time, rgb
     if best is not None:
-        yield _write_frame(video, folder, best)
+        yield _write_frame(video, folder, best[1], best[2])
 
 
 def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[VideoFrame]:
-    """Write the frames at some times [s], in whole milliseconds, into a folder; as of frames_of."""
+    """Write the frames at the given times [s], in whole milliseconds, into a folder, and yield them.
+
+    InputError as of `frames_of`.
+    """
     left = {round(1000.0 * time) for time in times}
     for time, frame in _decode(video) if left else ():
         if round(1000.0 * time) in left:
             left.remove(round(1000.0 * time))
-            yield _write_frame(
-                video, folder, (0.0, time, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8))
-            )
+            yield _write_frame(video, folder, time, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8))
         if not left:
             return
 
 
 def measure_sharpness(rgb: NDArray[np.uint8]) -> float:
-    """Variance of the Laplacian of an image (H, W, 3), made smaller (Pech-Pacheco et al., 2000)."""
+    """Measure the sharpness of an image (H, W, 3): the variance of the Laplacian of a small copy.
+
+    The measure is that of Pech-Pacheco et al. (2000).
+    """
     height = max(round(rgb.shape[0] * SHARPNESS_WIDTH / rgb.shape[1]), 1)
     small = cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
 
 
 def _decode(video: Path) -> Iterator[tuple[float, Any]]:
-    """Yield times [s] from the first frame, and the frames as PyAV has them."""
+    """Yield times [s] from the first frame, and the frames as PyAV returns them."""
     av = import_optional(video, "av", "video")
     begin: float | None = None
     try:
@@ -91,8 +95,7 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
         raise InputError(f"{video}: found {error.strerror}, {WANTED}") from error
 
 
-def _write_frame(video: Path, folder: Path, best: tuple[float, float, NDArray[np.uint8]]) -> VideoFrame:
-    _, time, rgb = best
+def _write_frame(video: Path, folder: Path, time: float, rgb: NDArray[np.uint8]) -> VideoFrame:
     path = folder / f"{video.stem}_{round(1000.0 * time):08d}.jpg"
     if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
         raise OSError(f"{path}: can't be written")

@@ -31,7 +31,7 @@ PAPER_WEIGHTS = (6.37, 2.51)
 
 @dataclass(frozen=True)
 class PaperMap(LocalCloud):
-    """What the paper's method prepares once per cloud."""
+    """The paper's map, prepared once per cloud."""
 
     positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
@@ -60,7 +60,7 @@ def localize(
     rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
     loss = make_loss(panorama, settings)
     with watch.stage("search"):
-        starts = search(points, panorama, loss, (paper_map.positions, rotations), settings, workers)
+        starts = search(points, panorama, loss, paper_map.positions, rotations, settings, workers)
     with watch.stage("refine"):
         refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)

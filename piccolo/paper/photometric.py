@@ -35,7 +35,7 @@ def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> fl
 
 
 def make_photometric_loss(panorama: Panorama) -> Loss:
-    """Return the photometric loss of a panorama, at its own size."""
+    """Make the photometric loss of a panorama, at its own size."""
     return Loss(
         lambda points, pose: photometric_loss(points, panorama, pose),
         lambda points, pose: photometric_equations(points, panorama, pose),

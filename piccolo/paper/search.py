@@ -19,7 +19,7 @@ PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
 
 def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
-    """Centres (M, 3) of near-cubic cells that fill a box, M near `num_cells`, at least one an axis."""
+    """Return centres (M, 3) of near-cubic cells that fill a box, M near `num_cells`, one an axis at least."""
     size = np.maximum(high - low, 1e-3)
     edge = (size.prod() / num_cells) ** (1.0 / 3.0)
     for _ in range(3):  # an axis shorter than the edge gets one cell: the others share the number
@@ -32,7 +32,10 @@ def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
 
 
 def farthest_point_sampling(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
-    """At most `count` of the positions (N, 3), each the farthest from those before it, in their old order."""
+    """Return at most `count` of the positions (N, 3), in their order.
+
+    Each is chosen farthest from those chosen before it.
+    """
     if len(positions) <= count:
         return positions
     chosen = [0]
@@ -44,10 +47,11 @@ def farthest_point_sampling(positions: NDArray[np.float64], count: int) -> NDArr
 
 
 def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDArray[np.float64]:
-    """Camera positions (M, 3), M <= num_translations, of a uniform grid over the box that lie in free space.
+    """Return camera positions (M, 3) in free space on a uniform grid over the box, M <= num_translations.
 
     The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined
-    until enough of its positions are free; what is over is thinned out evenly. Empty if nothing is free.
+    until enough of its positions are free, and thinned out evenly if they are too many. Empty if none is
+    free.
     """
     low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
     high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)
@@ -65,9 +69,9 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
 
 
 def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: int) -> NDArray[np.float64]:
-    """Share (bins ** 3,) of the solid angle in each colour, of an image (H, W, 3) in [0, 1].
+    """Return the fraction (bins ** 3,) of the solid angle in each colour, of an image (H, W, 3) in [0, 1].
 
-    Only pixels of `counts` (H, W) are counted; all zero if none is.
+    Only pixels of `counts` (H, W) are counted; all zero if there is none.
     """
     level = np.minimum((rgb * bins).astype(np.int64), bins - 1)
     index = (level[..., 0] * bins + level[..., 1]) * bins + level[..., 2]
@@ -77,9 +81,9 @@ def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: i
 
 
 def histogram_similarity(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
-    """Histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something.
+    """Return the histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something.
 
-    The overlap of two histograms that each sum to 1 (Swain and Ballard, 1991).
+    It is the overlap of two histograms that each sum to 1 (Swain and Ballard, 1991).
     """
     view = render_view(points, pose, panorama.rgb.shape[1])
     counts = view.is_seen & panorama.is_valid
@@ -92,13 +96,12 @@ def search(
     points: PackedPoints,
     panorama: Panorama,
     loss: Loss,
-    grid: tuple[NDArray[np.float64], NDArray[np.float64]],
+    positions: NDArray[np.float64],
+    rotations: NDArray[np.float64],
     settings: PaperSettings,
     workers: Workers,
 ) -> list[Hypothesis]:
-    """Select the K2 poses to descend from, of all positions (N_t, 3) and rotations (N_r, 3, 3) of `grid`."""
-    positions, rotations = grid
-    near = (settings.min_distance, np.radians(settings.min_angle_deg))
+    """Select the K2 poses to descend from, of all positions (N_t, 3) with all rotations (N_r, 3, 3)."""
 
     def losses(center_world: Array) -> list[Hypothesis]:
         seen = visible_points(points, center_world) if settings.use_visibility else points
@@ -107,13 +110,15 @@ def search(
         return [h for h in found if np.isfinite(h.score)]
 
     scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
+    distance = settings.min_distance
+    angle = np.radians(settings.min_angle_deg)
     if settings.initialization == "loss-only":
-        return best_distinct(scored, settings.num_by_histogram, *near)
-    by_loss = best_distinct(scored, settings.num_by_loss, *near)
+        return best_distinct(scored, settings.num_by_histogram, distance, angle)
+    by_loss = best_distinct(scored, settings.num_by_loss, distance, angle)
     small = shrink(panorama, settings.histogram_width)
 
     def rescore(h: Hypothesis) -> Hypothesis:
         return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
 
     by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
-    return best_distinct(by_histogram, settings.num_by_histogram, *near)
+    return best_distinct(by_histogram, settings.num_by_histogram, distance, angle)

@@ -15,7 +15,7 @@ Initialization = Literal["two-stage", "loss-only"]
 
 @dataclass(frozen=True)
 class PaperSettings(DescentSettings):
-    """Algorithm 1 of the paper. What it leaves open has the defaults given here."""
+    """Algorithm 1 of the paper; the defaults are ours where it gives none."""
 
     gravity: Gravity = "known"  # known: the camera is upright, only its yaw is searched
     num_translations: int = 50  # [N_t] positions on a uniform grid over the cloud's box, all in free space

@@ -1,1 +1,1 @@
-"""The prepared scan, its file, and lookups in it."""
+"""The prepared map of a scan, its file, and queries of it."""

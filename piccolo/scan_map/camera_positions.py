@@ -1,4 +1,4 @@
-"""Positions of a camera: free space at a camera's height above something that carries it."""
+"""Possible positions of a camera: free space at a camera's height above a surface."""
 
 import time
 from typing import Any, NamedTuple
@@ -32,12 +32,12 @@ ADVICE = (
     "(`near_world` and `radius`) or cut out a part"
 )
 BASES = 1 << 14  # cells on surfaces, around which others are supported, or centres, at a time
-LONG = 60.0  # [s] a warning tells how long the views take, if more
-COST_OF_VIEW = 4.0  # looking and rendering at a position, in the time of looking
+LONG = 60.0  # [s] a warning says how long the views take, if more
+COST_OF_VIEW = 4.0  # time of a position's coverage and view, relative to its coverage
 
 
 def top_surfaces(octree: Octree) -> NDArray[np.float32]:
-    """Voxel means (N, 3) above which the next two voxels are empty."""
+    """Return the voxel means (N, 3) above which the next two voxels are empty."""
     xyz = octree.level(SURFACE_VOXEL)[:, :3]
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
     ijk -= ijk.min(axis=0) - 1
@@ -48,32 +48,32 @@ def top_surfaces(octree: Octree) -> NDArray[np.float32]:
 
 
 class Ball(NamedTuple):
-    """All within a radius [m] of a place (3,)."""
+    """Points within a radius [m] of a place (3,)."""
 
     center: Array
     radius: float
 
     def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
-        """Mask (N,) of points (N, 3) or (N, 2) that lie in it, or at most a margin [m] beside it."""
+        """Return a mask (N,) of points (N, 3) or (N, 2) inside, or at most a margin [m] outside."""
         distance = np.linalg.norm(points - self.center[: points.shape[1]], axis=1)
         return np.asarray(distance <= self.radius + margin)
 
 
 class Box(NamedTuple):
-    """All between two corners (3,) [m]."""
+    """Points between two corners (3,) [m]."""
 
     low: Array
     high: Array
 
     def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
-        """Mask (N,) of points (N, 3) or (N, 2) that lie in it, or at most a margin [m] beside it."""
+        """Return a mask (N,) of points (N, 3) or (N, 2) inside, or at most a margin [m] outside."""
         k = points.shape[1]
         is_inside = (points >= self.low[:k] - margin) & (points <= self.high[:k] + margin)
         return np.asarray(is_inside.all(axis=1))
 
 
 class TooManyPositionsError(InputError):
-    """A scan of land, or in another unit: a camera could be at more places than are searched."""
+    """A scan of land, or in another unit: it has more camera positions than are searched."""
 
     def __init__(self, what: str) -> None:
         super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
@@ -82,10 +82,10 @@ class TooManyPositionsError(InputError):
 def find_supported_cells(
     surfaces: NDArray[np.float32], within: Ball | Box | None = None
 ) -> NDArray[np.int64]:
-    """Cells (N, 3) of the coarse grid whose centres are at a camera's height above a surface (M, 3).
+    """Return cells (N, 3) of the coarse grid with centres at a camera's height above a surface (M, 3).
 
-    Those `within` a part of the scan, by a spacing more than it says. TooManyPositionsError if they
-    are more than MAX_POSITIONS; no more memory than for these is taken.
+    Only cells `within` a part of the scan are returned, with a margin of a grid spacing.
+    TooManyPositionsError if they are more than MAX_POSITIONS; memory is allocated for no more.
     """
     s = COARSE_SPACING
     reach = int(np.ceil(SUPPORT_RADIUS / s))
@@ -118,7 +118,7 @@ def find_supported_cells(
 
 
 def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
-    """Fraction of the sphere (N,) around each centre (N, 3) that is not empty, seen at a low resolution."""
+    """Return the filled fraction of the sphere (N,) around each centre (N, 3), at a low resolution."""
     area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
 
     def glance(lo: int) -> NDArray[np.float64]:
@@ -130,9 +130,9 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
 
 
 def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
-    """Distance (N,) [m] of each centre (N, 3) from the nearest point of a cKDTree.
+    """Return the distance (N,) [m] of each centre (N, 3) from the nearest point of a cKDTree.
 
-    In threads of our own: the tree's are left running, in memory that is freed, where a signal ends the work.
+    It uses own threads: if a signal ends the work, the tree's threads would go on running in freed memory.
     """
     begins = range(0, len(centers), BASES)
     alone = Workers(workers.num_threads)  # too short a work to be shown
@@ -141,7 +141,7 @@ def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Wo
 
 
 def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
-    """Say about how many minutes the views from the centres (N, 3) take, by a sample of them."""
+    """Estimate from a sample the time to render views from the centres (N, 3); warn if it is long."""
     sample = centers[:: 1 + len(centers) // BLOCK]
     alone = Workers()
     coverage(octree, sample[:1], alone)  # compiled
@@ -156,22 +156,22 @@ def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Wo
 def candidate_centers(
     octree: Octree, workers: Workers, within: Ball | Box | None = None
 ) -> NDArray[np.float64]:
-    """Positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
+    """Find positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
 
-    `within` and the error as of supported_cells.
+    `within` and TooManyPositionsError are as of `find_supported_cells`.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     cells = find_supported_cells(top_surfaces(octree), within)
     points = octree.level(CLEARANCE_VOXEL)[:, :3]
     if within is not None:
-        points = points[within.holds(points, 3 * COARSE_SPACING)]  # of what is farther none is near
+        points = points[within.holds(points, 3 * COARSE_SPACING)]  # farther ones are not near
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
     middle = (cells + 0.5) * COARSE_SPACING
     warn_if_long(octree, middle, workers)
     clearance = nearest_distances(tree, middle, workers)
     is_free = clearance > MIN_CLEARANCE
-    fraction = np.zeros(len(middle))  # where it is not free, nobody asks
+    fraction = np.zeros(len(middle))  # not computed where there is no free space
     fraction[is_free] = coverage(octree, middle[is_free], workers)
     is_open = np.mean(fraction[is_free] > MIN_COVERAGE) < MIN_ENCLOSED if is_free.any() else False
     min_coverage = OPEN_COVERAGE if is_open else MIN_COVERAGE
@@ -193,9 +193,9 @@ def candidate_centers(
 
 
 def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Height (N,) [m] of each centre (N, 3) above the floor: the lowest surface below in its storey.
+    """Return heights (N,) [m] of centres (N, 3) above the floor: the lowest surface below in their storey.
 
-    inf where there is none within SUPPORT_RADIUS and STOREY.
+    inf if there is none within SUPPORT_RADIUS and STOREY.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 

@@ -1,9 +1,9 @@
-"""A prepared map on disk: a NumPy archive that is mapped into memory where nobody can cut it off meanwhile.
+"""A prepared map on disk: a NumPy archive, mapped into memory if no other process can truncate it meanwhile.
 
-A file of another format, or damaged in any byte (each member of an archive has a checksum), is never trusted;
-`map_validation.py` checks what is whole. Of a file that has been checked, its identity is remembered.
-FORMAT changes with what the arrays mean, so that a file outlives an update; the cache also knows the sources
-by which a map was made, and makes it anew when they have changed.
+A file of another format, or damaged in any byte (each member of an archive has a checksum), is refused;
+`map_validation.py` checks the contents of undamaged files. The identity of a checked file is remembered.
+FORMAT changes with the meaning of the arrays, so that a file outlives an update; the cache also knows the
+sources by which a map was made, and makes it again when they have changed.
 """
 
 import os
@@ -38,7 +38,7 @@ WANTED = "wanted a whole map by tools/prepare_map.py"
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
-    """Write a map to `path`, whole or not at all."""
+    """Write a map to `path` atomically."""
     members: dict[str, NDArray[Any]] = {
         "format": np.array(FORMAT),
         "scan_names": np.array(scan_map.scan_names, dtype=np.str_),
@@ -55,7 +55,7 @@ def save_map(scan_map: ScanMap, path: Path) -> None:
 def is_map_file(path: Path) -> bool:
     """Return True if the file begins as `save_map` writes it, in any version; clouds may be archives too.
 
-    The first member's name or its value is enough, so that a damaged map is still refused as a map.
+    The first member's name or value is enough, so that a damaged map is still refused as a map.
     """
     with path.open("rb") as file:
         head = file.read(512)
@@ -68,9 +68,9 @@ def is_map_file(path: Path) -> bool:
 def hold_unchanged(path: Path, is_copied: bool) -> Iterator[Path | None]:
     """Provide a map's file that may be mapped: itself, or a copy in the user's cache; else None.
 
-    A file of the cache, where nobody else may write, is only ever replaced whole. Any other may be cut off or
-    overwritten in place at any time, which would kill, or mislead, a process that has mapped it. A copy that
-    the caller finds damaged is removed.
+    A file in the cache, where only the user may write, is only ever replaced whole. Any other may be
+    truncated or overwritten in place at any time, which would kill, or mislead, a process that has mapped it.
+    A copy in which the caller finds damage is removed.
     """
     if NAME.fullmatch(path.name) and is_own(path.parent.stat(), WRITABLE):
         yield path
@@ -100,9 +100,9 @@ def copy_into(path: Path, folder: Path) -> Path | None:
 
 
 def load_map(path: Path, remembers: bool = False) -> ScanMap:
-    """Read or map into memory what `save_map` wrote; InputError for anything else.
+    """Read a map that `save_map` wrote, or map it into memory; InputError for any other file.
 
-    All of it is read and checked; with `remembers` only once, as long as the file stays as it is.
+    All of it is read and checked; with `remembers` only once, as long as the file is unchanged.
     """
     what = f"checked as {FORMAT} by {__version__}"
     with damage_named(path, WANTED), hold_unchanged(path, remembers) as place:
@@ -126,7 +126,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
     scan_map = ScanMap(
         octree=octree,
         views=CandidateViews(octree, arrays["centers"]),
-        local_features=FeatureMap(*(arrays[f"local_{name}"] for name in FeatureMap._fields)),
+        local_features=FeatureMap(**{name: arrays[f"local_{name}"] for name in FeatureMap._fields}),
         has_labels=bool(arrays["has_labels"]),
         scan_names=tuple(map(str, arrays["scan_names"])),
         warnings=warnings,

@@ -1,7 +1,7 @@
-"""Checks of a map file's arrays: they are what `save_map` writes, before a search takes them.
+"""Checks of a map file's arrays: a search uses them only if `save_map` could have written them.
 
-A map may come from anybody, and checksums are easily mended: every index that a kernel takes from a map is
-checked, every number bounded, and the octree compared with the grid that its voxels come from.
+A map may come from anybody, and checksums are easily recomputed: every index that a kernel takes from a map
+is checked, every number bounded, and the octree compared with the grid of its voxels.
 """
 
 import math
@@ -67,7 +67,7 @@ MAX_WARNING = 5000  # characters of a line
 
 
 @inline_kernel
-def is_in_range(node, reach):
+def is_in_range(node: NDArray[np.float32], reach: float) -> bool:
     """Return True if a node (6,) is within `reach` of zero along each axis and has a valid colour."""
     is_one = True
     for k in range(3):
@@ -76,10 +76,17 @@ def is_in_range(node, reach):
 
 
 @kernel
-def first_misplaced(nodes, first_child, level_start, origin, leaf_size, reach):
+def first_misplaced(
+    nodes: NDArray[np.float32],
+    first_child: NDArray[np.int32],
+    level_start: NDArray[np.int32],
+    origin: Array,
+    leaf_size: float,
+    reach: float,
+) -> int:
     """Return the first node outside its parent's voxel, beyond `reach` [m] or without valid colour, or -1.
 
-    The links must be right. `origin` (3,) leads from a corner of all levels' grids to zero [m].
+    The links must be valid. `origin` (3,) is the vector from a corner of all levels' grids to zero [m].
     """
     num_levels = len(level_start) - 1
     for node in range(len(nodes)):
@@ -99,7 +106,7 @@ def first_misplaced(nodes, first_child, level_start, origin, leaf_size, reach):
 
 
 def check_arrays(path: Path, arrays: Arrays) -> None:
-    """Refuse the arrays of a map file that `save_map` can't have written, all but its warnings."""
+    """Refuse arrays of a map file that `save_map` can't have written; the warnings are not checked."""
     sizes: dict[str, int] = {}
     for name, (dtype, shape) in LAYOUT.items():
         found = arrays[name]
@@ -126,7 +133,7 @@ def _refuse(path: Path, found: str) -> None:
 
 
 def _reach(arrays: Arrays) -> float:
-    """Return the largest distance [m] of anything in a map from the origin along an axis."""
+    """Return the largest distance [m] of points in a map from the origin along an axis."""
     return WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
 
 
@@ -143,7 +150,7 @@ def _check_frame(path: Path, arrays: Arrays) -> None:
 
 
 def _check_octree(path: Path, arrays: Arrays) -> None:
-    """Each level's children are the next level, one to eight a node, within its voxel of the grid."""
+    """Check that the children of each level are the next level, one to eight a node, within its voxel."""
     nodes = arrays["octree_nodes"]
     first_child = arrays["octree_first_child"]
     start = arrays["octree_level_start"]
@@ -165,9 +172,9 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
 
 
 def _check_views(path: Path, arrays: Arrays) -> None:
-    """Candidates and views are where the scan is, what they see is in range, each feature is of a view.
+    """Check that candidates and views are within the scan, with values in range, and features have a view.
 
-    The sparse candidates are those of the coarse grid.
+    The sparse candidates must be those of the coarse grid.
     """
     for what, centers in (("view", arrays["local_view_centers"]), ("candidate", arrays["centers"])):
         if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
@@ -184,7 +191,7 @@ def _check_views(path: Path, arrays: Arrays) -> None:
 
 
 def _check_features(path: Path, arrays: Arrays) -> None:
-    """Features lie where the scan is, and the lists hold each of them once."""
+    """Check that features are within the scan, and that the lists hold each of them once."""
     points = arrays["local_points"]
     sizes = arrays["local_sizes"]
     start = arrays["local_list_start"]
@@ -199,7 +206,7 @@ def _check_features(path: Path, arrays: Arrays) -> None:
 
 
 def _check_scans(path: Path, arrays: Arrays) -> None:
-    """Names are text, all different, and each candidate lies in the scan of one of them."""
+    """Check that names are text and distinct, and that each candidate lies in a named scan."""
     found = arrays["scan_names"]
     index = arrays["scan_of_candidate"]
     if found.dtype.kind != "U" or found.ndim != 1 or len(found) > MAX_SCANS:
@@ -212,7 +219,7 @@ def _check_scans(path: Path, arrays: Arrays) -> None:
 
 
 def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:
-    """Lines that can be printed: no control characters, not too many, not too long."""
+    """Return printable warnings: without control characters, limited in number and length."""
     if warnings.dtype.kind != "U" or warnings.ndim != 1:
         _refuse(path, f"warnings of type {warnings.dtype} and shape {warnings.shape}")
     lines = (str(line)[:MAX_WARNING] for line in warnings[:MAX_WARNINGS])

@@ -1,4 +1,4 @@
-"""Maps of several scans, buildings or storeys: their names, and in which of them a pose lies."""
+"""Maps of several scans, buildings or storeys: their names, and the one in which a pose lies."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -43,7 +43,7 @@ def _list_names(names: Sequence[str]) -> str:
 
 
 def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
-    """Refuse names that no scan of a map has."""
+    """Refuse names that are not names of the map's scans."""
     names = scan_map.scan_names
     if within and not names:
         raise InputError(

@@ -1,4 +1,4 @@
-"""The map of a cloud: prepared already, from the cache, or made now."""
+"""The map of a cloud: from a prepared file, from the cache, or built now."""
 
 import hashlib
 from collections.abc import Callable, Sequence
@@ -48,8 +48,8 @@ def open_map(
 ) -> ScanMap:
     """Return the map of a cloud's files: prepared already, from the cache, or built now.
 
-    A prepared map may stand in place of the files. The prior is asked where the scan is too large as a whole.
-    Local features come late, and into the cache then, unless `has_features`.
+    `paths` may be a prepared map instead of a cloud. The prior is used only if the scan is too large as a
+    whole. Local features are made when first needed, and cached then, unless `has_features`.
     """
     map_path = find_prepared_map(paths)
     if map_path:
@@ -85,7 +85,7 @@ def open_map(
 
 
 def write_map(scan_map: ScanMap, path: Path, workers: Workers) -> None:
-    """Write a map with its local features; InputError if it is of a part of a scan."""
+    """Write a map with its local features; InputError if it covers only a part of a scan."""
     if scan_map.is_partial:
         raise InputError(f"{path}: found a map prepared within `near_world` only, wanted a whole map")
     save_map(add_features(scan_map, workers), path)
@@ -99,7 +99,7 @@ def extend_map(
     workers: Workers,
     watch: Stopwatch,
 ) -> ScanMap:
-    """Return a prepared map with another scan under a name; a map without names gets its file's."""
+    """Return a prepared map with another scan added; a scan without a name is named after the map's file."""
     if not find_prepared_map([map_path]):
         found = "no prepared map" if map_path.exists() else "no such file"
         raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
@@ -123,19 +123,19 @@ def extend_map(
 
 
 def check_labels(map_path: Path, scan_map: ScanMap, cloud_settings: CloudSettings) -> None:
-    """Refuse a map of labels where colours are asked for, and the other way round."""
+    """Refuse a map of labels if colours are wanted, and the reverse."""
     if scan_map.has_labels != (cloud_settings.labels is not None):
         kind = "labels, wanted `labels` too" if scan_map.has_labels else "colours, wanted no `labels`"
         raise InputError(f"{map_path}: found a prepared map of {kind}")
 
 
 def find_prepared_map(paths: Sequence[Path]) -> Path | None:
-    """Return the first of some files that is a prepared map."""
+    """Return the first of some files that is a prepared map; None if there is none."""
     return next((path for path in paths if path.is_file() and is_map_file(path)), None)
 
 
 def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
-    """Return the digest of a scan's files, or of those that a prepared map was made from."""
+    """Return the digest of a scan's files; for a prepared map, of the files it was made from."""
     map_path = find_prepared_map(paths)
     if map_path:
         return load_map(map_path, cache.is_used).scan_sha256
@@ -143,7 +143,7 @@ def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
 
 
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
-    """Name for the map of a cloud's files: by what is in them and the settings, wherever they lie."""
+    """Return the cache's name for a map: it depends on the files' contents and the settings, not on paths."""
     parts = [FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), scan_sha256]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
@@ -151,10 +151,11 @@ def content_key(scan_sha256: str, settings: CloudSettings) -> str:
 def open_cached_map(
     folder: Path | None, key: str, scan_sha256: str, build: Callable[[], ScanMap], watch: Stopwatch
 ) -> tuple[ScanMap, str]:
-    """Return the map `key` of a cache within a folder, or build it there; the user's cache if None.
+    """Return a map from the cache, or build it and keep it there; and a warning of one line, or "".
 
-    Second what went wrong with the cache, in one line: the map is then as good, only not kept. Two processes
-    may build one map at once: each writes its own file whole, the last stays, both are equal.
+    The cache is in `folder`, or the user's if that is None. With a warning of a failing cache the map is
+    valid, but not kept. Two processes may build one map at once: each writes its own file whole, and both are
+    equal.
     """
     warning = ""
     try:
@@ -183,7 +184,7 @@ def open_cached_map(
 
 
 def keep_when_made(scan_map: ScanMap, path: Path) -> ScanMap:
-    """Return the map; once its local features are made, it is written again, by one process."""
+    """Return the map; when its local features are made, it is saved again with them."""
     late = scan_map.late
     if late is None:
         return scan_map
@@ -202,7 +203,7 @@ def keep_when_made(scan_map: ScanMap, path: Path) -> ScanMap:
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:
-    """All points of a cloud's files, or the voxels of the prepared map that stands in place of them."""
+    """Return all points of a cloud's files, or the voxels of a prepared map."""
     if find_prepared_map(paths):
         m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
         return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)

@@ -1,4 +1,4 @@
-"""Prior knowledge of a camera's position: by the user, or by a photo's GPS, which may be wrong indoors."""
+"""Prior knowledge of a camera's position: from the user, or a photo's GPS, which may be wrong indoors."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,7 +10,7 @@ from ..panorama.photo import GpsPosition
 
 @dataclass(frozen=True)
 class Prior:
-    """Prior knowledge by the user; each narrows the search."""
+    """Prior knowledge of the user; each field narrows the search."""
 
     near_world: tuple[float, float, float | None] | None = None  # [m] within `radius`; None: any height
     radius: float | None = None  # [m]
@@ -20,7 +20,7 @@ class Prior:
     within: tuple[str, ...] = ()  # names of the map's scans that the camera may be in; all if none
 
     def __post_init__(self) -> None:
-        """Refuse what contradicts itself, naming the option."""
+        """Refuse contradictory values, naming the option."""
         numbers = *(self.near_world or ()), *(self.height or ()), self.radius, self.heading_deg
         if not all(math.isfinite(number) for number in numbers if number is not None):
             raise InputError("`near_world`, `height`, `heading`: found nan or inf, wanted finite numbers")
@@ -46,12 +46,12 @@ class GpsPrior:
     is_used: bool = True  # the result lies there; else it was found, or not found, without it
 
     def apply_to(self, prior: Prior) -> Prior:
-        """Return the prior with this position in place of none."""
+        """Return the prior with this position in place of its own."""
         return replace(prior, near_world=(*self.center_world, None), radius=self.radius)
 
 
 def gps_prior(gps: GpsPosition, crs: str, metres_per_unit: float) -> GpsPrior | None:
-    """Return the prior of a position in a scan of this system; None where the system does not hold."""
+    """Return the GPS prior in a scan of this coordinate system; None outside the system's area."""
     place = from_wgs84(crs, gps.latitude_deg, gps.longitude_deg)
     if place is None:
         return None

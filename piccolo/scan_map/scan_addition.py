@@ -1,11 +1,11 @@
-"""Another scan in a map: only what it changes is prepared again.
+"""Addition of another scan to a map: only changed parts are prepared again.
 
-Candidates stay where they are. Views and local features are made again where the new scan is seen; all else
-keeps every bit.
+Candidates stay at their positions. Views and local features that show the new scan are made again; all others
+keep every bit.
 """
 
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,7 @@ COARSE_VOXEL = 2.56  # [m]
 
 
 class Candidates(NamedTuple):
-    """Candidates of a map and a new scan: those of the map that stay, and then new ones."""
+    """Candidates of a map and a new scan: the map's own that stay, then new ones."""
 
     rows: NDArray[np.int64]  # (S,) of the map's candidates, those that stay
     centers: NDArray[np.float64]  # (N, 3) [m]
@@ -45,7 +45,7 @@ class Candidates(NamedTuple):
 
     @property
     def changed(self) -> NDArray[np.int64]:
-        """Indices of those whose views are to be made anew."""
+        """Indices of the candidates whose views must be made again."""
         return np.flatnonzero(self.fraction > LEAST_CHANGED)
 
 
@@ -79,7 +79,7 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
 
 
 def read_added_scan(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]]:
-    """Read a scan into an octree of its own, in a map's frame; with warnings."""
+    """Read a scan into an octree of its own, in the map's frame; with warnings."""
     if old.octree.leaf_size != LEAF_SIZE:
         found = f"found a map of voxels of {old.octree.leaf_size} m"
         raise InputError(f"`add`: {found}, wanted {LEAF_SIZE} m; prepare it again")
@@ -120,9 +120,9 @@ def join_candidates(old: ScanMap, new: Octree, octree: Octree, workers: Workers)
 
 
 def bound_sphere_fraction(box: Box, centers: Array) -> Array:
-    """Bound the fraction (N,) of the sphere that a box takes around centres (N, 3), by a ball around it.
+    """Bound the fraction (N,) of the sphere that a box covers around centres (N, 3), by a ball around it.
 
-    Half within that ball, where it may be all.
+    The bound is half for a centre in the ball, where the fraction may be larger.
     """
     radius = 0.5 * float(np.linalg.norm(box.high - box.low))
     distance = np.linalg.norm(centers - 0.5 * (box.low + box.high), axis=1)
@@ -131,7 +131,7 @@ def bound_sphere_fraction(box: Box, centers: Array) -> Array:
 
 
 def compare_ranges(new: Octree, old: Octree, centers: Array, workers: Workers) -> tuple[Array, Array]:
-    """Return fractions (N,) of the sphere around centres (N, 3) with a new scan in front, and behind."""
+    """Return fractions (N,) of the sphere around centres (N, 3) where a new scan is in front, and behind."""
     area = whole_areas(SEARCH_VIEW.num_rings).astype(np.float64)
 
     def compare(lo: int) -> tuple[Array, Array]:
@@ -156,14 +156,15 @@ def join_views(
     place[: len(found.rows)] = known[found.rows]
     place[found.changed] = -1
     is_kept = place[sparse] >= 0
-    joined = []
     added = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
-    for own, more in zip((old.wide_features, old.wide_seen), added, strict=True):
+
+    def join(own: NDArray[Any], more: NDArray[Any]) -> NDArray[Any]:
         values = np.empty((len(sparse), own.shape[1]), own.dtype)
         values[is_kept] = own[place[sparse[is_kept]]]
         values[~is_kept] = more
-        joined.append(values)
-    return WideViews(*joined)
+        return values
+
+    return WideViews(join(old.wide_features, added.features), join(old.wide_seen, added.seen))
 
 
 def assign_scans(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
@@ -181,7 +182,7 @@ def assign_scans(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
 
 
 def join_features(old: ScanMap, octree: Octree, found: Candidates, workers: Workers) -> FeatureMap:
-    """Join features: extract them again in changed views, and in new views where they are needed."""
+    """Join features: extract them again in changed views, and in new views if they are needed."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     view_centers = old.local_features.view_centers

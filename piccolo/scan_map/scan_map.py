@@ -25,22 +25,22 @@ from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candi
 from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
 
-MAX_TILT = np.radians(5.0)  # of what seems to be up to what is taken for it, that goes without saying
+MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
 
 
 class Voxelized(Protocol):
-    """A cloud in memory, or in files that are read once more."""
+    """A cloud in memory, or in files that are read once again."""
 
     @property
     def up(self) -> UpAxis:
-        """The axis that points up by its file."""
+        """Upward axis, as the file declares it."""
 
     def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Average its points voxel by voxel, in axes turned by a rotation (3, 3)."""
+        """Average the points in each voxel, in axes rotated by a matrix (3, 3)."""
 
 
 class LateFeatures:
-    """Local features that are made once, when a photo first needs them; threads that ask meanwhile wait."""
+    """Local features that are made once, when a photo first needs them; other threads wait."""
 
     def __init__(self, make: Callable[[Workers], FeatureMap]) -> None:
         self._make = make
@@ -48,7 +48,7 @@ class LateFeatures:
         self._lock = threading.Lock()
 
     def get(self, workers: Workers) -> FeatureMap:
-        """Return the features, made now if they are not yet."""
+        """Return the features; make them on the first call."""
         with self._lock:
             self._made = self._made or self._make(workers)
             return self._made
@@ -79,23 +79,23 @@ class ScanMap:
 
     @cached_property
     def points(self) -> PackedPoints:
-        """The leaves of the octree as coloured points, in the map's frame."""
+        """Leaves of the octree as coloured points, in the map's frame."""
         leaves = self.octree.level(self.octree.leaf_size)
         return pack_points(leaves[:, :3], np.round(leaves[:, 3:] * 255.0).astype(np.uint8))
 
     @cached_property
     def storeys(self) -> Storeys:
-        """The storeys, in the map's frame."""
+        """Storeys of the building, in the map's frame."""
         return find_storeys(self.octree)
 
     @cached_property
     def searched_for(self) -> NDArray[np.int64]:
-        """The candidate (candidates,) of each one's cell of the coarse grid that is searched in its place."""
+        """Index (candidates,) of the candidate searched for each one, in its cell of the coarse grid."""
         first, cell = sparse_candidates(self.centers)
         return first[cell]
 
     def narrow(self, is_kept: NDArray[np.bool_]) -> "ScanMap":
-        """Return the map of which some (sparse,) of the candidates are searched."""
+        """Return the map with only some (sparse,) of the searched candidates."""
         return replace(
             self,
             sparse=self.sparse[is_kept],
@@ -105,11 +105,11 @@ class ScanMap:
 
     @property
     def lacks_features(self) -> bool:
-        """True if no view was looked at for local features, though there are some."""
+        """True if no view was searched for local features, though there are candidates."""
         return len(self.local_features.view_centers) == 0 < len(self.centers)
 
     def features_now(self, workers: Workers) -> FeatureMap:
-        """Return the local features, made now where they are late."""
+        """Return the local features, made now if they were deferred."""
         return self.late.get(workers) if self.late else self.local_features
 
     def to_world(self, pose: Pose) -> Pose:
@@ -127,7 +127,7 @@ class ScanMap:
 def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Return indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
 
-    And for each candidate (N,) the place among these of the one in its cell.
+    And for each candidate (N,) the index of its cell among these.
     """
     cells = np.floor(centers / COARSE_SPACING).astype(np.int64)
     cells -= cells.min(axis=0, initial=0)
@@ -137,18 +137,18 @@ def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], 
 
 
 def find_candidates(
-    octree: Octree, frame: tuple[Array, Array], prior: Prior, workers: Workers
+    octree: Octree, R_map_from_world: Array, origin_world: Array, prior: Prior, workers: Workers
 ) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """Find candidates (N, 3) [m]; in a scan too large as a whole, near the prior's place, with a warning.
+    """Find candidates (N, 3) [m]; in a scan too large as a whole only near the prior's place, with a warning.
 
-    The frame is R_map_from_world (3, 3) and origin_world (3,).
+    The map's frame is given by R_map_from_world (3, 3) and origin_world (3,) [m].
     """
     try:
         return candidate_centers(octree, workers), ()
     except TooManyPositionsError:
         if prior.near_world is None or prior.radius is None:
             raise
-    near = frame[0] @ (np.array(prior.near_world) - frame[1])
+    near = R_map_from_world @ (np.array(prior.near_world) - origin_world)
     part = f"prepared within {prior.radius:g} m of `near_world`, for this run only"
     text = f"the scan is too large as a whole: {part}"
     centers = candidate_centers(octree, workers, Ball(near, prior.radius))
@@ -165,10 +165,11 @@ def prepare_map(
     prior: Prior = NOTHING_KNOWN,
     has_features: bool = True,
 ) -> ScanMap:
-    """Prepare everything about a cloud that does not depend on the panorama; local features may come late.
+    """Prepare a map of a cloud, with local features, or without until a photo needs them.
 
     The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
-    whole, what is near the prior's place; TooManyPositionsError if it names none.
+    whole only the surroundings of the prior's place are prepared; TooManyPositionsError if the prior has no
+    place.
     """
     watch = watch or Stopwatch()
     R_map_from_world = R_z_from_axis(up, cloud.up) if isinstance(up, str) else up
@@ -182,8 +183,7 @@ def prepare_map(
     for warning in warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):
-        frame = (R_map_from_world, origin_world)
-        centers, notes = find_candidates(octree, frame, prior, workers)
+        centers, notes = find_candidates(octree, R_map_from_world, origin_world, prior, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], view, workers)
         scan_map = ScanMap(
@@ -220,22 +220,22 @@ def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[st
 
 
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
-    """Find local features in views from few of a map's candidates, chosen by what they see."""
+    """Find local features in views from a few candidates of a map, chosen by what is seen there."""
     centers = scan_map.centers
     chosen = view_positions(centers, make_range_lookup(scan_map.octree, centers), SEARCH_VIEW.num_rings)
     return make_feature_map(scan_map.octree, centers[chosen], workers)
 
 
 def make_range_lookup(octree: Octree, centers: NDArray[np.float64]) -> Look:
-    """Return a function that gives the ranges seen from a centre of (N, 3) by its index."""
+    """Return a function that maps an index of centres (N, 3) to the ranges seen from there."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 
 
 def add_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
-    """Add the local features to a map, made now if they are missing."""
+    """Return the map with its local features, made now if they are missing."""
     return replace(scan_map, local_features=scan_map.features_now(workers), late=None)
 
 
 def defer_features(scan_map: ScanMap) -> ScanMap:
-    """Let a map make its local features when they are first needed."""
+    """Return the map such that it makes its local features when they are first needed."""
     return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, workers)))

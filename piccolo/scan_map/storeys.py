@@ -1,4 +1,4 @@
-"""The storeys of a building: level surfaces that people can stand on, one above the other."""
+"""Storeys of a building: level surfaces on which people can stand, one above another."""
 
 from typing import NamedTuple
 
@@ -36,7 +36,7 @@ class Storey(NamedTuple):
     surfaces: NDArray[np.float32]  # (N, 3) [m] of its floor, in order of their x
 
     def nearest(self, center: Array, count: int) -> tuple[Array, Array]:
-        """Distances beside a place (3,) of the nearest surfaces, at most `count`, and their heights [m].
+        """Return horizontal distances to the nearest `count` surfaces of a place (3,), and their heights [m].
 
         SciPy's tree finds them no faster for the few places of a photo, and takes 0.2 s to import.
         """
@@ -53,14 +53,15 @@ class Storey(NamedTuple):
 
 
 class Storeys(NamedTuple):
-    """The storeys of a map, the lowest first; none where nothing is level."""
+    """Storeys of a map, lowest first; empty if nothing is level."""
 
     storeys: tuple[Storey, ...]
 
     def at(self, centers: Array) -> tuple[NDArray[np.int64], Array]:
-        """Index of the storey of each place (N, 3), and its height above the floor there (N,) [m].
+        """Return the index of the storey of each place (N, 3), and its height above the floor there (N,) [m].
 
-        The highest floor that is below a place and scanned around it; -1 and NaN where there is no storey.
+        It is the highest storey whose floor is below the place and scanned around it; -1 and NaN without
+        storeys.
         """
         storey = np.full(len(centers), -1)
         height = np.full(len(centers), np.nan)
@@ -98,7 +99,7 @@ def find_storeys(octree: Octree) -> Storeys:
 
 
 def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Mask (N,) of the voxels (N, 3) with room for a person above them."""
+    """Return a mask (N,) of the voxels (N, 3) with room for a person above them."""
     shape = ijk.max(axis=0, initial=0) + HEADROOM + 2
     code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
     order = np.argsort(code)
@@ -111,8 +112,8 @@ def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
 def _find_levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArray[np.bool_]]:
     """Find the floors by their height [voxels], ascending, with the cells (I, J) of each.
 
-    `ijk` (N, 3) are all voxels, `tops` those that have room above. The largest floor first, then what is
-    LEAST_APART from those found above or below it. None if nothing stands on any.
+    `ijk` (N, 3) are all voxels, `tops` those with room above. The largest floor is taken first, then those
+    that are LEAST_APART from others or overlap them little. Floors on which nothing stands are left out.
     """
     if not len(tops):
         return {}
@@ -136,7 +137,7 @@ def _find_levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, N
 
 
 def _open_level(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
-    """Cells (I, J) of a level on which a disc fits, small gaps closed."""
+    """Return the cells (I, J) of a level on which a disc fits, small gaps closed."""
     mask = np.zeros(ijk.max(axis=0)[:2] + 2, np.uint8)
     own = tops[np.abs(tops[:, 2] - level) <= THICKNESS]
     mask[own[:, 0], own[:, 1]] = 1
@@ -161,7 +162,7 @@ def _overlap(mask: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
 
 
 def _unite_levels(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
-    """Group levels to storeys: a level that is hardly above those before it joins them."""
+    """Group levels into storeys: a level that hardly overlaps those below it joins their storey."""
     groups: list[list[int]] = []
     for level, mask in masks.items():
         below = sum((masks[other] for other in groups[-1]), np.zeros_like(mask)) if groups else mask

@@ -1,4 +1,4 @@
-"""The frames of a walk: poses that each may have, and how likely each of them is."""
+"""The frames of a walk: the poses that each may have, and their odds."""
 
 import math
 from collections.abc import Sequence
@@ -16,9 +16,9 @@ from ..geometry.pose import Array, Pose
 from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
-MOST_ODDS = 8.0  # [log] that one frame may add: what is surer is not so of errors that no model has
-COPY_LOG_ODDS = 4.0  # copies of a place differ by as much where one of them was scanned better
-OTHER_LOG_ODDS = 6.0  # behind the best: no copy
+MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
+COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
+OTHER_LOG_ODDS = 6.0  # a pose that is worse than the best by this is no copy
 MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
 MAX_ACCELERATION = 2.0  # [m/s^2]
 MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
@@ -27,15 +27,15 @@ NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of a camera that is carried."""
+    """The motion of a carried camera."""
 
     max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
     max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
     is_timed: bool = True  # False if only the order of the frames is known
-    is_guess: bool = False  # True if nobody said how far from one to the next: the poses found will
+    is_guess: bool = False  # True if no distance between frames was given: the poses found will give it
 
     def __post_init__(self) -> None:
-        """Refuse what means nothing."""
+        """Refuse speeds and accelerations that are not above 0."""
         for name in ("max_speed", "max_acceleration"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
@@ -55,7 +55,7 @@ class State:
 
 @dataclass
 class Frame:
-    """A frame, and what has been found of it so far."""
+    """A frame, and the poses found for it so far."""
 
     time: float  # [s] from any beginning
     states: list[State] = field(default_factory=list)
@@ -63,23 +63,23 @@ class Frame:
     alone: Localization | None = None  # if it was searched without regard to the others
 
     def put(self, states: list[State], how: How) -> None:
-        """Set its poses, and where they come from."""
+        """Set the poses of the frame, and their origin."""
         self.states = states
         self.how = how
 
     @property
     def is_credible(self) -> bool:
-        """True if its poses are more likely than that it has none."""
+        """True if the frame more likely has one of its poses than none."""
         return self.log_odds > 0.0
 
     @property
     def log_odds(self) -> float:
-        """Log odds of its poses together against that it has none."""
+        """Log odds that any of the frame's poses is right."""
         return float(np.logaddexp.reduce([state.log_odds for state in self.states]))
 
     @property
     def is_telling(self) -> bool:
-        """True if the whole scan was searched, and the list of poses does not end in a copy."""
+        """True if the whole scan was searched, and all copies of the best pose are listed."""
         if self.how != "alone" or not self.states:
             return False
         odds = [state.log_odds for state in self.states]
@@ -87,23 +87,23 @@ class Frame:
 
     @property
     def likely(self) -> list[State]:
-        """Its best pose, and those that may be copies."""
+        """Best pose of the frame, and those that may be copies of it."""
         best = max((state.log_odds for state in self.states), default=0.0)
         return [state for state in self.states if state.log_odds > best - COPY_LOG_ODDS]
 
     def to_json(self) -> dict[str, Any]:
-        """All but what it was alone."""
+        """Return the frame for JSON, without its result alone."""
         return {"time": self.time, "how": self.how, "states": [_state_json(state) for state in self.states]}
 
     @classmethod
     def from_json(cls, document: dict[str, Any], alone: Localization | None) -> "Frame":
-        """Read back what `to_json` wrote."""
+        """Make a frame from the output of `to_json` and its result alone."""
         states = [_state_from_json(state) for state in document["states"]]
         return cls(float(document["time"]), states, document["how"], alone)
 
 
 def check_times(times: Sequence[float]) -> None:
-    """Refuse times that do not rise."""
+    """Refuse times that are not finite or do not rise."""
     if not all(math.isfinite(time) for time in times):
         raise InputError("times: found one that is no finite number, wanted seconds")
     for k, (before, after) in enumerate(pairwise(times)):
@@ -112,7 +112,7 @@ def check_times(times: Sequence[float]) -> None:
 
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
-    """List the poses that a frame has alone, with its own probabilities."""
+    """List a frame's poses from its own localization, with the probabilities of that."""
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     none = max(found.probability_none, 1e-9)
@@ -128,7 +128,7 @@ def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
 
 
 def log_ratio(probability: float, other: float) -> float:
-    """Logarithm of the odds of two probabilities, within what one frame may add."""
+    """Return the log odds of two probabilities, limited to the evidence of one frame."""
     ratio = math.log(max(probability, 1e-12) / max(other, 1e-12))
     return min(max(ratio, -2.0 * MOST_ODDS), MOST_ODDS)
 
@@ -152,7 +152,7 @@ def _state_json(state: State) -> dict[str, Any]:
 
 
 def _state_from_json(document: dict[str, Any]) -> State:
-    """Read back what `Frame.to_json` wrote of a state."""
+    """Make a state from the output of `_state_json`."""
     pose = Pose(np.array(document["R_cam_from_map"]), np.array(document["center_map"]))
     covariance = None
     if document["covariance"] is not None:

@@ -1,4 +1,4 @@
-"""Distances to walk from place to place: through free space, never through a wall."""
+"""Walking distances from place to place, through free space and never through a wall."""
 
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -21,7 +21,7 @@ ENDS = 0.6  # [m] to its nodes
 
 
 class _Reached(NamedTuple):
-    """All within a limit [m] of a node: other nodes, rising, and the lengths of the ways there."""
+    """Nodes within a limit [m] of a node, in ascending order, and the lengths of the paths to them."""
 
     limit: float
     nodes: NDArray[np.int64]
@@ -29,7 +29,7 @@ class _Reached(NamedTuple):
 
 
 class FreeSpace:
-    """A map's candidates as a graph, with an edge where neighbours see each other."""
+    """A map's candidates as a graph, with edges between neighbours that see each other."""
 
     def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
         self.scan_map = scan_map
@@ -44,7 +44,7 @@ class FreeSpace:
 
     @cached_property
     def _graph(self) -> Any:
-        """Sparse matrix (candidates, candidates) of lengths [m]."""
+        """Sparse matrix (candidates, candidates) of the edges' lengths [m]."""
         from scipy.sparse import coo_matrix  # noqa: PLC0415
 
         m = self.scan_map
@@ -59,7 +59,7 @@ class FreeSpace:
         return coo_matrix((length, (first, second)), (len(m.centers),) * 2).tocsr()
 
     def distance(self, start: Array, ends: Array, limit: float) -> Array:
-        """Metres (N,) from a place (3,) to others (N, 3) of the map's frame; inf beyond a limit."""
+        """Return distances (N,) [m] from a place (3,) to others (N, 3) in the map; inf beyond a limit."""
         straight = np.linalg.norm(ends - start, axis=1)
         walked = straight.copy()
         far = (straight > NEAR) & (straight <= limit)
@@ -71,12 +71,12 @@ class FreeSpace:
         return np.asarray(walked)
 
     def fraction_within(self, center: Array, radius: float) -> float:
-        """Fraction of the map's candidates within a radius [m] of a place (3,), at least one."""
+        """Return the fraction of candidates within a radius [m] of a place (3,), counting at least one."""
         near = self._tree.query_ball_point(center, radius, return_length=True)
         return max(int(near), 1) / max(len(self.scan_map.centers), 1)
 
     def _path_lengths(self, node: int, ends: NDArray[np.int64], limit: float) -> NDArray[np.float64]:
-        """Lengths (N,) of the shortest paths from a node to others (N,), inf beyond the limit [m]."""
+        """Return lengths (N,) of the shortest paths from a node to others (N,); inf beyond a limit [m]."""
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 
         known = self._known.get(node)
@@ -91,10 +91,10 @@ class FreeSpace:
 def look_past(
     scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any], workers: Workers
 ) -> NDArray[np.int64]:
-    """Return 1 (N,) where candidates see past their neighbours, 0 where they see nothing, else -2.
+    """Return 1 (N,) if a candidate sees past its neighbour, 0 if it sees nothing, -2 if its view is blocked.
 
-    A sum above 0 is a free way: nobody sees anything between, and somebody sees past. Both index candidates,
-    the first rise.
+    `first` (N,) and `second` (N,) are the pairs' candidates, `first` in ascending order. The way is free if
+    the sum of both directions is above 0: neither is blocked, and at least one sees past.
     """
     m = scan_map
     toward = m.centers[second] - m.centers[first]

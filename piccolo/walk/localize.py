@@ -20,7 +20,7 @@ from .tracker import Tracker
 SURE = 0.5  # frames with less are not smoothed with the others
 BANDS = 6  # of the information matrix beside its diagonal: two frames of three coordinates
 PRIOR_FLOOR = 1e-6  # [m^2] least variance of a position
-LONGEST_STEP = 3.0  # [s] frames farther apart say nothing of each other's acceleration
+LONGEST_STEP = 3.0  # [s] frames farther apart do not limit the acceleration
 
 # A frame's pose and covariance, both in the world
 Located = tuple[Pose, PoseCovariance]
@@ -28,7 +28,7 @@ Located = tuple[Pose, PoseCovariance]
 
 @dataclass(frozen=True)
 class Gap:
-    """A part of a walk that no walking person can have gone: a lift, a cut, a camera in a pocket."""
+    """A part of a walk that nobody can have walked: a lift, a cut, a camera in a pocket."""
 
     distance: float  # [m]
     seconds: float
@@ -36,7 +36,7 @@ class Gap:
 
 @dataclass(frozen=True)
 class Alone:
-    """The result of a frame without regard to the others."""
+    """The result of a frame localized alone."""
 
     status: str
     confidence: float
@@ -45,7 +45,7 @@ class Alone:
 
 @dataclass(frozen=True)
 class WalkFrame:
-    """A frame as a walk has it."""
+    """A frame's place in a walk."""
 
     time: float  # [s] from the walk's beginning; of frames without times their number
     frame: int  # from 0
@@ -69,13 +69,13 @@ def make_localizations(tracker: Tracker, path: Path) -> list[tuple[Localization,
         for k, (pose, covariance) in zip(sure[lo:hi], parts, strict=True):
             found[k] = replace(found[k], pose=pose, covariance=covariance)
     return [
-        (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), Gap(*gap) if gap else None))
+        (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), gap and Gap(gap[0], gap[1])))
         for k, (f, frame, gap) in enumerate(zip(found, tracker.frames, path.gaps, strict=True))
     ]
 
 
 def result_alone(frame: Frame) -> Alone | None:
-    """Return a frame's result without regard to the others, if it was searched so."""
+    """Return the result of a frame that was localized alone, else None."""
     a = frame.alone
     return None if a is None else Alone(a.status, a.confidence, a.pose)
 
@@ -83,7 +83,7 @@ def result_alone(frame: Frame) -> Alone | None:
 def make_localization(
     tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None
 ) -> Localization:
-    """Make the result of a frame with the probabilities that a walk gives its poses."""
+    """Make a frame's result from its poses and the probabilities that the walk gives them."""
     if not frame.states:
         return frame.alone or Localization()
     order = sorted(range(len(frame.states)), key=lambda j: (j != chosen, -probabilities[j]))
@@ -91,7 +91,7 @@ def make_localization(
     values = [float(probabilities[j]) for j in order]
     if best.covariance is not None:
         values[0] *= math.erf(MAX_DISTANCE / (best.covariance.largest_std * math.sqrt(2.0)))
-    # the frames around tell the place of one that is blurred or dark, but not where in it
+    # for a blurred or dark frame, its neighbours determine the place, but not the position in it
     values[0] *= 1.0 / (1.0 + math.exp(-frame.log_odds))
     none = max(1.0 - sum(values), 0.0)
     to_world = tracker.scan_map.to_world
@@ -115,11 +115,11 @@ def make_localization(
 
 
 def smooth_positions(located: Sequence[Located], times: Sequence[float], motion: Motion) -> list[Located]:
-    """Poses, and their covariances, that agree best with their own and with small accelerations.
+    """Smooth positions by small accelerations; return poses and covariances.
 
     Minimizes sum (x_k - z_k)' C_k^-1 (x_k - z_k) + sum |a_k|^2 / s^2 over the positions x_k, where a_k is the
-    second difference by times of three frames in a row and s the motion's deviation [m/s^2]. Rotations follow
-    their positions by each frame's own covariance.
+    second difference by time of three consecutive frames and s the motion's deviation [m/s^2]. Rotations
+    follow their positions by each frame's own covariance.
     """
     from scipy.linalg import solveh_banded  # noqa: PLC0415  # only walks wait for it
 
@@ -147,7 +147,7 @@ def smooth_positions(located: Sequence[Located], times: Sequence[float], motion:
 
 
 def acceleration_rows(times: Sequence[float], motion: Motion) -> list[tuple[int, Array]]:
-    """First of three frames, and the factors (3,) of their positions in a_k / s."""
+    """Return, for each three frames, the index of the first and the factors (3,) of x_k in a_k / s."""
     rows = []
     for k in range(len(times) - 2):
         before, after = np.diff(times[k : k + 3])
@@ -159,7 +159,7 @@ def acceleration_rows(times: Sequence[float], motion: Motion) -> list[tuple[int,
 
 
 def marginal_covariances(information: NDArray[np.float64]) -> list[Array]:
-    """Covariances (3, 3) of each position by the banded information matrix, upper form."""
+    """Return the covariance (3, 3) of each position from the banded information matrix (upper)."""
     from scipy.linalg import cho_solve_banded, cholesky_banded  # noqa: PLC0415
 
     n = information.shape[1] // 3
@@ -175,7 +175,7 @@ def marginal_covariances(information: NDArray[np.float64]) -> list[Array]:
 def move_pose(pose: Pose, covariance: PoseCovariance, move: Array, variance: Array) -> Located:
     """Move a pose by the smoothing of its position, and update its covariance.
 
-    Rotation and position are jointly Gaussian: the one follows the other by C_wd C_dd^-1.
+    Rotation and position are jointly Gaussian: the rotation follows by C_wd C_dd^-1.
     """
     C = covariance.matrix
     gain = C[:3, 3:] @ np.linalg.inv(C[3:, 3:] + PRIOR_FLOOR * np.eye(3))

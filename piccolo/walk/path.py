@@ -1,12 +1,13 @@
-"""The way through the poses of a walk's frames: a hidden Markov model, with frames that have no right pose.
+"""The path through the poses of a walk's frames: a hidden Markov model, with frames that have no right pose.
 
-A state is a pose of a frame; a frame may have none, and the way goes on from an earlier one. Viterbi (1967)
-finds the likeliest way, forward-backward (Rabiner 1989) the probability of each pose. Frames of one place
-err alike: what they say of one pose against another counts only as far as the camera has moved on, and only
-beyond what exact copies of a room differ by.
+A state is a pose of a frame; a frame may have none, and the path goes on from an earlier one. Viterbi (1967)
+finds the likeliest path, forward-backward (Rabiner 1989) the probability of each pose. Frames of one place
+have correlated errors: differences between poses count in proportion to the distance that the camera has
+moved, and only beyond the differences between exact copies of a room.
 
-The camera may also be at a place that no frame has listed, as a copy of one that is: what is followed from
-frame to frame speaks as much for that. Only a search of the whole scan tells, and each only so much.
+The camera may also be at a place that no frame lists, such as an unlisted copy: tracking from frame to frame
+supports that as well as the listed place. Only a search of the whole scan is evidence against it, and each
+search has a limited weight.
 """
 
 import math
@@ -21,24 +22,24 @@ from .frames import COPY_LOG_ODDS, MOST_ODDS, OTHER_LOG_ODDS, Frame, Motion, sta
 from .free_space import FreeSpace
 
 SAME_PLACE = 1.5  # [m] poses nearer to each other are of one place, not of copies
-TELLING_DISTANCE = 2.0  # [m] after which a frame says something new of its place
+TELLING_DISTANCE = 2.0  # [m] after which a frame is new evidence of its place
 REACH_SLACK = 0.3  # [m] beyond what a person walks
 REACH_SIGMA = 0.25  # [m] deviation of more
 GAP_LOG = -9.0  # a jump to any place: lift, cut, pocket
 UNTIMED_GAP_LOG = -4.0  # of frames without times
 JUMPED = -2.0  # less is a jump
 MOST_EXPECTED = 3.0  # [log] that a pose gains by being where it was to be expected
-MAX_SKIPPED = 25.0  # [log] frames that speak for their poses by more in all are not passed over
+MAX_SKIPPED = 25.0  # [log] frames whose poses have more odds together are not skipped
 LONGEST_SKIP = 400  # frames
-TELLING_LOG = 5.0  # what a search of the whole scan tells against places that it did not list
-LEAST_TOLD = 0.3  # of it, by one more from the same place
-LOST_LOG = -3.0  # that a camera is where nothing was listed, when a frame is not where it was followed to
-FOLLOWED_LOG = -6.0  # that it comes to be at a pose that was followed from another
+TELLING_LOG = 5.0  # evidence of a search of the whole scan against places that it did not list
+LEAST_TOLD = 0.3  # fraction of it that another search at the same place adds
+LOST_LOG = -3.0  # that a camera is at an unlisted place, if a frame is not where tracking led
+FOLLOWED_LOG = -6.0  # that it comes from there to a pose that was tracked from another
 UNLISTED = -1  # in place of the number of a state
 
 
 class Path(NamedTuple):
-    """The likeliest way through a walk's frames."""
+    """The likeliest path through a walk's frames."""
 
     chosen: list[int | None]  # the state of each frame on the likeliest way; None for no pose
     probabilities: list[Array]  # (S,) of each frame's states
@@ -46,7 +47,7 @@ class Path(NamedTuple):
 
 
 def emissions(frames: Sequence[Frame]) -> list[Array]:
-    """Log odds (S,) of each frame's states against none, as far as they tell something new."""
+    """Return log odds (S,) of each frame's states against none, counting only new evidence."""
     found: list[Array] = []
     last: Frame | None = None
     for frame in frames:
@@ -64,23 +65,24 @@ def emissions(frames: Sequence[Frame]) -> list[Array]:
 
 
 def new_differences(behind: Array, share: float) -> Array:
-    """Log differences (S,) of poses to the best that count in a frame that is new to a share.
+    """Return the log differences (S,) of poses to the best that count in a frame.
 
-    Copies differ by a little for as long as the camera is in one of them; non-copies just score lower.
+    `share` is the fraction of the frame that is new. Differences between copies count only by that
+    fraction; other poses just score lower.
     """
     is_other = np.clip((behind - COPY_LOG_ODDS) / (OTHER_LOG_ODDS - COPY_LOG_ODDS), 0.0, 1.0)
     return np.asarray(is_other * behind + (1.0 - is_other) * share * np.maximum(behind - COPY_LOG_ODDS, 0.0))
 
 
 def fraction_moved(before: Frame, frame: Frame) -> float:
-    """Fraction of a new place that a frame shows, by how far the camera has moved at least."""
+    """Return the fraction of a new place that a frame shows, by the least distance moved since another."""
     starts, ends = (state_centers(f.likely) for f in (before, frame))
     moved = float(np.linalg.norm(ends[:, None] - starts[None], axis=2).min())
     return min(moved / TELLING_DISTANCE, 1.0)
 
 
 def group_by_place(odds: Array, centers: Array) -> NDArray[np.int64]:
-    """Index (S,) of the likeliest pose in the place of each pose (S, 3) [m], by their log odds (S,)."""
+    """Return the index (S,) of the likeliest pose within SAME_PLACE of each pose (S, 3), by log odds (S,)."""
     leaders: list[int] = []
     place = np.empty(len(odds), np.int64)
     for j in np.argsort(-odds, kind="stable"):
@@ -91,9 +93,9 @@ def group_by_place(odds: Array, centers: Array) -> NDArray[np.int64]:
 
 
 def log_transition(distance: Array, seconds: float, motion: Motion, expected: Array | float = 0.0) -> Array:
-    """Log odds (N,) that a camera has gone so far [m] in so many seconds, against any place of the map.
+    """Return log odds (N,) that a camera has moved by distances [m] in a time [s], against any place.
 
-    `expected` is what a place gains that it can reach; a jump has its price.
+    `expected` is the gain of a place within reach; a place out of reach has the odds of a jump.
     """
     excess = np.maximum(distance - motion.max_speed * seconds - REACH_SLACK, 0.0)
     jump = GAP_LOG if motion.is_timed else UNTIMED_GAP_LOG
@@ -101,36 +103,36 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
 
 
 def log_leaving(log: Array, frame: Frame) -> Array:
-    """Log odds (S,) of leaving states for a place that is not listed, by the steps (S, N) to a frame."""
+    """Return log odds (S,) of leaving states for an unlisted place, from the steps (S, N) to a frame."""
     is_kept = (log.max(axis=1) > JUMPED) & (frame.how == "tracked" or frame.is_telling)
     return np.asarray(np.where(is_kept, GAP_LOG, LOST_LOG))
 
 
 def log_entering(frame: Frame) -> float:
-    """Log odds of coming to a frame's poses from a place that is not listed."""
+    """Return the log odds of coming from an unlisted place to a frame's poses."""
     return 0.0 if frame.how == "alone" else FOLLOWED_LOG
 
 
 class _Steps(NamedTuple):
-    """From a frame's states to those of a later one."""
+    """Log odds of the steps from a frame's states to those of a later one."""
 
     begin: int
     log: NDArray[np.float64]  # (S before, S)
 
 
 class _Unlisted(NamedTuple):
-    """The ways that lead to a frame at a place that is not listed."""
+    """Paths that lead to a frame at an unlisted place."""
 
     emitted: float = 0.0
     forward: float = 0.0  # sum over ways, emissions included
     best: float = 0.0  # of the best way
-    back: tuple[int, int] | None = None  # whence it comes
+    back: tuple[int, int] | None = None  # frame and state before
 
 
 class Lattice:
-    """The frames so far, with the logs of all ways that lead to each state; grows frame by frame.
+    """The frames so far, with the logs of all paths that lead to each state; it grows frame by frame.
 
-    A way begins where nothing is listed, at a log of 0.
+    A path begins at an unlisted place, with a log of 0.
     """
 
     def __init__(self, space: FreeSpace, motion: Motion) -> None:
@@ -173,9 +175,9 @@ class Lattice:
         self.back.append(back)
 
     def _unlisted_at(self, k: int, before: "_Unlisted") -> "_Unlisted":
-        """Return what a frame says for places that are not listed.
+        """Extend the unlisted paths to a frame.
 
-        If it does not tell, as much as for the best that is listed.
+        A frame that is not telling supports unlisted places as much as the best listed one.
         """
         gained = max([0.0, *(float(s.log.max()) for s in self.steps[k])])
         emitted = float(self.emitted[k].max(initial=-math.inf)) + gained
@@ -193,7 +195,7 @@ class Lattice:
         return _Unlisted(emitted, forward + emitted, best + emitted, back)
 
     def _new_fraction(self, k: int) -> float:
-        """Fraction of what a search of the whole scan can tell that is new in a frame."""
+        """Return the fraction of a whole search's evidence that is new in a frame."""
         frame = self.frames[k]
         if not frame.is_telling:
             return 0.0
@@ -201,7 +203,7 @@ class Lattice:
         return 1.0 if last is None else max(fraction_moved(last, frame), LEAST_TOLD)
 
     def _steps_to(self, k: int) -> list[_Steps]:
-        """Return steps from all earlier frames from which the way may lead to a frame."""
+        """Return the steps to a frame from all earlier frames from which the path may lead to it."""
         ends = state_centers(self.frames[k].states)
         steps: list[_Steps] = []
         passed = 0.0
@@ -223,22 +225,22 @@ class Lattice:
         return steps
 
     def _expected(self, start: Array, reach: float) -> float:
-        """Return the log odds that a pose within a reach [m] gains: more where less of the map lies there.
+        """Return the log odds that a pose within a reach [m] gains: the more, the less of the map lies there.
 
-        A frame's own odds hold where each place of the map is as likely as the others.
+        A frame's own odds assume that all places of the map are equally likely.
         """
         return min(-math.log(self.space.fraction_within(start, reach)), MOST_EXPECTED)
 
     def filter_last(self) -> Array:
-        """Probability (S,) of each state of the last frame by all that was before."""
+        """Return the probability (S,) of each state of the last frame, given all frames so far."""
         return np.asarray(np.exp(self.forward[-1] - self._total()))
 
     def _total(self) -> float:
-        """Log of the sum over all ways."""
+        """Return the log of the sum over all paths."""
         return float(np.logaddexp(self.unlisted[-1].forward, self.ended))
 
     def smooth(self) -> Path:
-        """Return the likeliest path, and the probability of each state by all frames."""
+        """Return the likeliest path, and the probability of each state given all frames."""
         backward = [np.zeros(len(f.states)) for f in self.frames]
         unlisted = 0.0
         for k in range(len(self.frames) - 1, -1, -1):

@@ -50,8 +50,8 @@ Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it ca
 def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> Path:
     """Find the path of all frames of a tracker, and search doubtful and lost ones again.
 
-    Where the path is in doubt, each place that a frame may show is looked for in its neighbours, so that no
-    copy loses by not having been listed. Then lost frames are looked for from those that are sure.
+    If the path is in doubt, each place that a frame may show is searched for in its neighbours too, so that
+    no copy loses because it was not listed. Then lost frames are searched for from sure ones.
     """
     num = len(tracker.frames)
     tracker.motion = estimate_motion(tracker)
@@ -100,7 +100,7 @@ def _is_certain(path: Path, k: int) -> bool:
 
 
 def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
-    """Give a frame the places of the frame a step before it that can be reached, and that it lacks."""
+    """Add to a frame the reachable places of the frame a step before it that it lacks."""
     frame = tracker.frames[k]
     if not frame.states or not 0 <= k - step < len(tracker.frames):
         return
@@ -116,7 +116,7 @@ def _complete(tracker: Tracker, k: int, step: int, read: Read) -> None:
 
 
 def _rivals(tracker: Tracker, m: int) -> list[Follower]:
-    """Return the likelier poses of a frame, one of each place; none if there is only one."""
+    """Return the likelier poses of a frame, one a place; empty if there is only one."""
     likely = tracker.frames[m].likely
     if len(likely) < 2:
         return []
@@ -127,7 +127,7 @@ def _rivals(tracker: Tracker, m: int) -> list[Follower]:
 
 
 def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math.inf) -> bool:
-    """Return True if a frame has a pose above the log odds that can be reached on foot."""
+    """Return True if a frame has a pose above the log odds within walking distance."""
     frame = tracker.frames[k]
     states = [state for state in frame.states if state.log_odds > least_odds]
     return any(_is_within(tracker, f, state, frame.time) for state in states)
@@ -136,7 +136,7 @@ def _is_reached(tracker: Tracker, f: Follower, k: int, least_odds: float = -math
 def _follower_of_lost(
     tracker: Tracker, path: Path, k: int, step: int, tried: set[tuple[int, int]]
 ) -> Follower | None:
-    """Return the nearest sure pose from which to search a frame without one on the path, once."""
+    """Return the nearest sure pose from which to search for a lost frame, each pair of frames once."""
     chosen = path.chosen[k]
     if chosen is not None and path.probabilities[k][chosen] > SURE:
         return None
@@ -150,7 +150,7 @@ def _follower_of_lost(
 
 
 def _find_again(tracker: Tracker, k: int, follower: Follower, panorama: Panorama, searched: set[int]) -> bool:
-    """Search a frame near where a follower leads, by features only once; True if it gains a pose."""
+    """Search for a frame near a follower, by features only once; return True if it gains a pose."""
     frame = tracker.frames[k]
     query = prepare_query(panorama, tracker.scan_map, tracker.settings, tracker.workers)
     end = follow(query, follower, frame.time, tracker.motion)
@@ -170,7 +170,7 @@ def _find_again(tracker: Tracker, k: int, follower: Follower, panorama: Panorama
 
 
 def _join(query: Query, frame: Frame, found: Hypothesis) -> bool:
-    """Add a pose to a frame, or replace a worse one nearby; True if the frame has changed."""
+    """Add a pose to a frame, or replace a worse one nearby; return True if the frame has changed."""
     for j, state in enumerate(frame.states):
         if is_same(state.pose, found.pose) and found.score > MIN_GAIN * state.score:
             frame.states[j] = make_states(query, [found])[0]
@@ -183,7 +183,7 @@ def _join(query: Query, frame: Frame, found: Hypothesis) -> bool:
 def _search_near(
     tracker: Tracker, frame: Frame, follower: Follower, radius: float, panorama: Panorama
 ) -> bool:
-    """Search a frame near a pose by local features; True if it is found."""
+    """Search for a frame near a pose by local features; return True if it is found."""
     x, y, z = (float(v) for v in tracker.scan_map.to_world(follower.state.pose).center_world)
     near = replace(tracker.settings.prior, near_world=(x, y, z), radius=radius)
     settings = replace(tracker.settings, prior=near)
@@ -196,7 +196,7 @@ def _search_near(
 
 
 def _is_sure(tracker: Tracker, path: Path, m: int) -> bool:
-    """Return True for a frame with a sure pose on the path, or that has just been found."""
+    """Return True for a frame with a sure pose on the path, or found since the path was made."""
     if not 0 <= m < len(tracker.frames) or not tracker.frames[m].states:
         return False
     chosen = path.chosen[m]

@@ -19,7 +19,15 @@ from ..localization.covariance import estimate_covariance
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
-from ..localization.refinement import FULL_LOSS, descend, descend_fine, descend_middle, perturb_middle, refine
+from ..localization.refinement import (
+    FULL_LOSS,
+    Limits,
+    descend,
+    descend_fine,
+    descend_middle,
+    perturb_middle,
+    refine,
+)
 from ..localization.search import search_poses
 from ..localization.selection import CLEAR_SCORE, assess_poses, rank
 from ..localization.settings import CoarseToFineSettings
@@ -44,7 +52,7 @@ LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
 MOST_LISTED = 12  # poses of a frame
 KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
-LAST_LIMITS = (FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
+LAST_LIMITS = Limits(FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
 MOST_TRACKED = 6  # poses from which a frame is tracked
 MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
 LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
@@ -69,7 +77,7 @@ class Follower(NamedTuple):
 
 
 class Tracker:
-    """The forward half of a walk: needs no future, and keeps what it found."""
+    """The forward half of a walk: it uses past frames only, and keeps their poses."""
 
     def __init__(
         self,
@@ -91,11 +99,14 @@ class Tracker:
 
     @property
     def frames(self) -> list[Frame]:
-        """All so far."""
+        """Frames so far."""
         return self.lattice.frames
 
     def forget_times(self) -> None:
-        """Of frames of which only the order is known: their times are numbers. Before the first one."""
+        """Use the numbers of frames as times, as only their order is known.
+
+        Call it before the first frame.
+        """
         step = MAX_STEP if self.motion.is_guess else self.motion.max_speed
         self.motion = replace(self.motion, max_speed=step, max_acceleration=NO_ACCELERATION, is_timed=False)
         self.lattice = Lattice(self.lattice.space, self.motion)
@@ -109,7 +120,7 @@ class Tracker:
 
     @one_blas_thread
     def add(self, panorama: Panorama, query: Query, time: float) -> Frame:
-        """Find the next frame, whose query is prepared."""
+        """Localize the next frame, whose query is prepared."""
         frame = Frame(time)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_far = bool(self.frames) and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
@@ -126,7 +137,7 @@ class Tracker:
         return frame
 
     def accept(self, frame: Frame) -> None:
-        """Count a frame that was found now or earlier."""
+        """Add a frame that was localized now or earlier."""
         self.walked += self._distance_moved(frame)
         self.lattice.add(frame)
         if frame.how == "alone":
@@ -141,7 +152,7 @@ class Tracker:
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
 
     def _distance_moved(self, frame: Frame) -> float:
-        """Metres from the frame before, from its nearest pose; 0 if one of the two has none."""
+        """Return the distance [m] from the nearest pose of the frame before; 0 if either has none."""
         before = next((f for f in reversed(self.frames) if f.states), None)
         if before is None or not frame.states:
             return 0.0
@@ -149,7 +160,7 @@ class Tracker:
         return float(np.linalg.norm(state_centers(before.states) - best, axis=1).min())
 
     def _follow(self, query: Query, frame: Frame, looks_near: bool) -> None:
-        """Descend from where the camera should be by each of its last poses, or look near these."""
+        """Descend from the predictions of the last poses; search near them if that fails."""
         followers = self.followers()
         if not followers:
             return
@@ -190,13 +201,13 @@ class Tracker:
         return Follower(state, last.time)
 
     def _check(self, query: Query, frame: Frame) -> None:
-        """Look for a frame that is followed in the whole scan too."""
+        """Search the whole scan for a frame that was tracked."""
         found = find_everywhere(query, CLEAR_SCORE)
         if found:
             frame.put(merge_states(query, frame.states, found), "alone")
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
-        """Search the whole scan, and keep what was tracked beside."""
+        """Search the whole scan, and keep the tracked poses too."""
         alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         tracked_to = [Hypothesis(state.pose, state.score) for state in frame.states]
         states = list_states(self.scan_map, alone)
@@ -223,7 +234,7 @@ def follow_all(query: Query, followers: Sequence[Follower], time: float, motion:
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
-    """Descend from where a camera should be; farther around if it may be far, or explains less."""
+    """Descend from a predicted pose; in a larger basin if it may be far off, or scores lower."""
     least = least_score(f)
     seconds = time - f.time
     starts = [f.state.pose]
@@ -241,7 +252,8 @@ def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis
 def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
     """Predict a camera's pose at constant velocity from an earlier pose and the last.
 
-    `ratio` is the time since, divided by the time between the two. At most max_distance [m] away.
+    `ratio` is the time since the last pose divided by the time between the two. The prediction is at most
+    `max_distance` [m] away.
     """
     move = ratio * (before.center_world - earlier.center_world)
     length = float(np.linalg.norm(move))
@@ -269,7 +281,7 @@ def track_on(query: Query, end: Hypothesis) -> Hypothesis:
 
 
 def descend_last(query: Query, pose: Pose) -> Hypothesis:
-    """Descend on the points themselves, and score the end as poses are selected."""
+    """Descend on the points themselves, and score the end by comparison with the photo."""
     pose = descend(query.points_at(pose), query.photo.images.full(), pose, LAST_LIMITS)
     return score_pose(query, pose)
 
@@ -287,9 +299,9 @@ def find_near(query: Query, near: Pose, radius: float, least_score: float) -> li
 
 
 def find_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
-    """Search the whole map by whole views; return poses, copies too, to centimetres, best first.
+    """Search the whole map by whole views; return poses and their copies, to centimetres, best first.
 
-    None if the best has less than the least score.
+    Empty if the best has less than the least score.
     """
     first = brief_query(replace(query, num_halves=0))
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
@@ -305,7 +317,7 @@ def find_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 
 
 def make_states(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
-    """Make states of a frame's poses, best first, with odds by whole views."""
+    """Make the states of a frame from its poses, best first, with odds by whole views."""
     ranked = suppress_near(sort_by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
     asked = replace(query, num_halves=0)
     best, *others = ranked
@@ -321,7 +333,7 @@ def make_states(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
 def associate(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
     """Make a state of another pose of a frame, with its odds relative to the best state.
 
-    None if the frame has it already, or if it is too much worse to be a copy.
+    None if the frame has the pose already, or if it is too much worse to be a copy.
     """
     best = max(states, key=lambda state: state.log_odds)
     if any(is_same(state.pose, found.pose) for state in states):
@@ -335,6 +347,6 @@ def associate(query: Query, states: Sequence[State], found: Hypothesis) -> State
 
 
 def is_same(pose: Pose, other: Pose) -> bool:
-    """Return True if two poses are one answer."""
+    """Return True if two poses are nearer than distinct poses are."""
     distance, angle = pose_errors(pose, other)
     return distance < MIN_DISTANCE and angle < MIN_ANGLE
