@@ -25,7 +25,7 @@ from .jobs.memory import is_shortage
 from .scan_map.prior import GpsPrior
 from .walk.localize import Alone, Gap, WalkFrame
 
-FORMAT = "piccolo-pose/8"
+FORMAT = "piccolo-pose/9"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE = "unreadable"
 FAILED = "failed"
@@ -238,7 +238,7 @@ def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any)
 
     `about` are the fields of Result that say what it is of and how made.
     """
-    apart = "pose", "warnings", "cameras"
+    apart = "pose", "warnings", "cameras", "standings"
     values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in apart}
     return Result(best_pose=found.pose, warnings=warnings + found.warnings, **values, **about)
 

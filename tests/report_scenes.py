@@ -96,7 +96,7 @@ def result_of(path, pose, status="localized", confidence=None, alternatives=()):
         best_pose=pose,
         loss=0.02,
         evidence=EVIDENCE,
-        alternatives=tuple(Alternative(other, 0.4, 0.5, 9, p) for other, p in alternatives),
+        alternatives=tuple(Alternative(other, 0.4, 9, p) for other, p in alternatives),
         covariance=PoseCovariance(spread, "heading 90 or 270 deg"),
         seconds={"search": 1.0},
         settings={"preset": "default"},

@@ -43,7 +43,7 @@ def test_right_and_wrong_evidence():
     p = posterior([RIGHT, ELSEWHERE], SURE)
     assert p[0] > 0.98
     assert classify(p, 0.9) == rule.LOCALIZED
-    p = posterior([WRONG, ELSEWHERE._replace(share=0.9)], None)
+    p = posterior([WRONG, ELSEWHERE._replace(ratio=0.9)], None)
     assert p[0] < 0.2
     assert classify(p, 0.9) == rule.NOT_LOCALIZED
 
@@ -56,7 +56,7 @@ def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies
     assert classify(p, 0.9) == rule.AMBIGUOUS
 
 
-@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5), ("share", 0.1)])
+@pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5), ("ratio", 0.1)])
 def test_more_evidence_is_more_probability(name, more):
     middling = Standing(1.0, 0.15, 8)
     stronger = middling._replace(**{name: getattr(middling, name) + more})

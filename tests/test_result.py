@@ -14,7 +14,7 @@ from piccolo.result import Result, Source, read_results, unreadable_result
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
 ELSEWHERE = Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0]))
-ALTERNATIVE = Alternative(ELSEWHERE, 0.2, 0.3, 7, 0.008)
+ALTERNATIVE = Alternative(ELSEWHERE, 0.2, 7, 0.008)
 RESULT = Result(
     status="localized",
     confidence=0.99,
@@ -54,7 +54,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/8"
+    assert document["format"] == "piccolo-pose/9"
     assert (document["storey"], document["height_above_floor_m"]) == (2, 1.51)
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
@@ -132,8 +132,8 @@ def test_several_files_of_a_cloud_are_a_list():
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/8"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/9"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/8"):
+    with pytest.raises(InputError, match="piccolo-pose/9"):
         Result.from_json(text)

@@ -183,7 +183,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     assert places(found.alternatives) == [1.0, 2.0]
     assert found.loss == 0.07
     assert [(a.score, a.num_matches) for a in found.alternatives] == [(0.3, 4), (0.2, 6)]
-    assert [a.share for a in found.alternatives] == pytest.approx([0.5 / 0.6, 0.4 / 0.6])
+    assert [s.ratio for s in found.standings] == pytest.approx([1.0, 0.5 / 0.6, 0.4 / 0.6])
     stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]

@@ -136,7 +136,7 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
     assert cases[:2] == ["clean", "black"]
     assert benchmark.main(["calibration", "--fit", str(out), "--check", str(out)]) == 0
     text = capsys.readouterr().out
-    assert re.search(r"share \d+\.\d+, log of the score \d+\.\d+", text)
+    assert re.search(r"ratio \d+\.\d+, log of the score \d+\.\d+", text)
     assert re.search(r"constant -?\d+\.\d+, log10 of the largest deviation", text)
     assert "| probability, learnt from | answers | mean stated | right |" in text
     assert "| covariance, others | right poses |" in text

@@ -19,7 +19,7 @@ MIN_CONFIDENCE = 0.9
 class Standing(NamedTuple):
     """Evidence for one of the poses found."""
 
-    share: float  # what it explains, divided by what the best pose does, over what both views show
+    ratio: float  # what it explains, divided by what the best pose does, over what both views show
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int  # local features that agree with it
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
@@ -35,21 +35,21 @@ class ChoiceModel(NamedTuple):
 LEAST_STD = 0.003  # [m] deviations below this are taken for it
 MOST_STD = 0.3  # [m] and those above this
 LEAST_SCORE = 0.02
-LEAST_SHARE = 0.1
-MOST_SHARE = 1.2
+LEAST_RATIO = 0.1
+MOST_RATIO = 1.2
 CLEAR_MATCHES = 40  # as many as a clear whole view of an upright sphere is worth, see docs/METHOD.md
 CONTRADICTED = 0.01  # odds of what the user says to be wrong
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
-FEATURES = ("log of the share", "log of the score", "log of the matches")
+FEATURES = ("log of the ratio", "log of the score", "log of the matches")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
 
 
 def pose_features(standing: Standing) -> Array:
     """Return the features (3,) of a pose's odds, as FEATURES names them."""
-    share = min(max(standing.share, LEAST_SHARE), MOST_SHARE)
-    return np.log([share, max(standing.score, LEAST_SCORE), standing.num_matches + NOISE_MATCHES])
+    ratio = min(max(standing.ratio, LEAST_RATIO), MOST_RATIO)
+    return np.log([ratio, max(standing.score, LEAST_SCORE), standing.num_matches + NOISE_MATCHES])
 
 
 def log_odds(standing: Standing, model: ChoiceModel = MODEL) -> float:

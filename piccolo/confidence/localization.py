@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from ..camera import Mount
 from ..geometry.pose import Pose
-from .confidence import NOT_LOCALIZED
+from .confidence import NOT_LOCALIZED, Standing
 from .covariance import PoseCovariance
 
 
@@ -30,7 +30,6 @@ class Alternative:
 
     pose: Pose
     score: float  # as of Evidence
-    share: float | None = None  # what it explains, divided by what the best does, over what both views show
     num_matches: int | None = None  # local features that agree with it
     probability: float | None = None  # that it is right; of the preset paper none is known
     scan: str | None = None  # name of the scan in which it lies, of a map that names its scans
@@ -64,3 +63,4 @@ class Localization:
     scan: str | None = None  # as of Alternative
     storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
     height_above_floor: float | None = None  # [m] of the pose, above the floor there
+    standings: tuple[Standing, ...] = ()  # evidence for the pose and each alternative; not in results

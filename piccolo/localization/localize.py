@@ -99,7 +99,7 @@ def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettin
         return best
     fraction = best.confidence / total
     others = [
-        Alternative(f.pose, f.evidence.score, None, f.evidence.num_matches, fraction * f.confidence)
+        Alternative(f.pose, f.evidence.score, f.evidence.num_matches, fraction * f.confidence)
         for f in others_found
         if f.pose and f.evidence
     ]

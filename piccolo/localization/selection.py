@@ -52,7 +52,7 @@ def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
     """Return the evidence for the best pose and for others, compared over what both views show."""
     at_best = compare(query, best.pose)
     ratios = [1.0, *(compare(query, h.pose).compute_ratio(at_best) for h in others)]
-    return [s._replace(share=v) for s, v in zip(assess_alone(query, [best, *others]), ratios, strict=True)]
+    return [s._replace(ratio=v) for s, v in zip(assess_alone(query, [best, *others]), ratios, strict=True)]
 
 
 def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
@@ -83,7 +83,7 @@ def select(query: Query, found: Selection) -> Selection:
     alone = assess_alone(query, ranked)
     ratios = [[other.compute_ratio(one) for other in seen] for one in seen]
     odds = np.array(
-        [[log_odds(a._replace(share=v)) for a, v in zip(alone, row, strict=True)] for row in ratios]
+        [[log_odds(a._replace(ratio=v)) for a, v in zip(alone, row, strict=True)] for row in ratios]
     )
     odds -= np.diag(odds)[:, None].copy()  # of the pose of each column against that of each row
     worst = np.where(np.eye(len(ranked), dtype=bool), -np.inf, odds).max(axis=1)

@@ -67,8 +67,8 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
         warnings += explain_doubts(query.photo.given, fit)
     matches = [s.num_matches if query.num_halves else None for s in standings[1:]]
     alternatives = tuple(
-        Alternative(query.scan_map.to_world(h.pose), h.score, s.share, num_matches, float(p))
-        for h, s, num_matches, p in zip(reported, standings[1:], matches, probabilities[1:-1], strict=True)
+        Alternative(query.scan_map.to_world(h.pose), h.score, num_matches, float(p))
+        for h, num_matches, p in zip(reported, matches, probabilities[1:-1], strict=True)
     )
     return Localization(
         classify(probabilities, settings.min_confidence),
@@ -82,6 +82,7 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
         warnings,
         cameras=() if fit is None else query.photo.given.cameras,
         focal_length=None if fit is None else fit.focal_length(query.photo.given),
+        standings=tuple(standings),
     )
 
 

@@ -99,7 +99,7 @@ def make_localization(
     own = frame.alone if is_own and frame.alone else Localization()
     status = classify(np.array([*values, none]), tracker.settings.min_confidence)
     others = tuple(
-        Alternative(to_world(s.pose), s.score, None, s.num_matches, p)
+        Alternative(to_world(s.pose), s.score, s.num_matches, p)
         for s, p in zip([frame.states[j] for j in order[1:]], values[1:], strict=True)
     )
     return Localization(

@@ -14,7 +14,6 @@ from scipy.stats import chi2
 from piccolo.cli.command import option
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
-    CLEAR_MATCHES,
     FEATURES,
     LOCALIZED,
     MIN_CONFIDENCE,
@@ -30,7 +29,6 @@ from piccolo.confidence.confidence import (
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.pose import Pose, is_correct, log_so3
-from piccolo.result import Result
 from piccolo.scenes.evaluation.tables import Table
 
 EPILOG = """\
@@ -70,25 +68,27 @@ def pose_error(pose: Pose, true_pose: Pose) -> Array:
 
 
 def read_outcome(line: str) -> Outcome | None:
-    """Read a line of tools/benchmark.py confidence; None if it has no pose or no probabilities."""
+    """Read a line of tools/benchmark.py confidence; None if no pose was found."""
     trial = json.loads(line)
-    result = Result.from_json(json.dumps(trial["result"]))
-    truth = trial["truth"]
-    if result.best_pose is None or result.evidence is None or result.probability_none is None:
+    poses = [read_pose(pose) for pose in trial["poses"]]
+    if not poses:
         return None
-    e = result.evidence
-    rows = [(1.0, e.score, e.num_matches)]
-    rows += [(a.share or 0.0, a.score, a.num_matches) for a in result.alternatives]
-    standings = [Standing(ratio, score, CLEAR_MATCHES if n is None else n) for ratio, score, n in rows]
-    poses = [result.best_pose, *(a.pose for a in result.alternatives)]
+    standings = [Standing(*standing) for standing in trial["standings"]]
+    matrix = trial["covariance"]
+    covariance = None if matrix is None else PoseCovariance(np.array(matrix), "")
     error = np.full(6, np.nan)
     right = len(poses)
-    if isinstance(truth, dict):
-        true_pose = Pose(np.array(truth["R_cam_from_world"]), np.array(truth["center_world"]))
-        error = pose_error(result.best_pose, true_pose)
+    if trial["truth"] is not None:
+        true_pose = read_pose(trial["truth"])
+        error = pose_error(poses[0], true_pose)
         right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
-    is_refused = result.confidence == 0.0 and result.probability_none == 1.0
-    return Outcome(str(trial["case"]), standings, result.covariance, right, is_refused, error)
+    is_refused = trial["probabilities"][-1] == 1.0
+    return Outcome(str(trial["case"]), standings, covariance, right, is_refused, error)
+
+
+def read_pose(document: dict[str, list[float]]) -> Pose:
+    """Read a pose that tools/benchmark.py confidence wrote."""
+    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
 
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:

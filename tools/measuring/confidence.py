@@ -15,15 +15,16 @@ from piccolo.cli.command import option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud, stream_points
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.settings import IN_METRES
+from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
 from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
+from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.opening import scan_of
-from piccolo.panorama import AS_STORED, read_panorama
+from piccolo.panorama import AS_STORED, read_panorama, read_photo
+from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.reproduce_paper import UPSIDE_DOWN
 from piccolo.scenes.scene import Scene, read_scene
 from piccolo.scenes.synthetic.room import PLAIN
@@ -38,7 +39,7 @@ example:
 
 Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
 queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
-over 0.1 m or 5 degrees off. Each trial is a line {"case", "scene", "truth", "result"}; a table on stdout.
+over 0.1 m or 5 degrees off. Trials are lines of JSON for tools/benchmark.py calibration; a table on stdout.
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
@@ -241,6 +242,30 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
             yield scene.name, points, trials
 
 
+def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
+    """Return what tools/benchmark.py calibration reads of a trial."""
+    poses = [found.pose, *(a.pose for a in found.alternatives)] if found.pose else []
+    return {
+        "case": trial.case,
+        "scene": scene,
+        "truth": trial.true_pose and pose_json(trial.true_pose),
+        "status": found.status,
+        "probabilities": [
+            found.confidence,
+            *(a.probability for a in found.alternatives),
+            found.probability_none,
+        ],
+        "poses": [pose_json(pose) for pose in poses],
+        "standings": [list(standing) for standing in found.standings],
+        "covariance": found.covariance and found.covariance.matrix.tolist(),
+    }
+
+
+def pose_json(pose: Pose) -> dict[str, object]:
+    """Return a pose as JSON has it."""
+    return {name: array.tolist() for name, array in vars(pose).items()}
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--seeds FIRST END", required=True)
@@ -257,16 +282,15 @@ def run(arguments: argparse.Namespace) -> int:
     with arguments.out.open("w") as file:
         for scene, (points, colors), trials in all_trials(arguments, workers):
             cloud = stream_points(Path("trial"), RawCloud(points.astype(np.float64), colors))
-            scan = scan_of(cloud, scene, IN_METRES, CoarseToFineSettings(), workers, Stopwatch())
+            scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
                 settings = CoarseToFineSettings(gravity=trial.gravity)
-                result = scan.localize_query(trial.rgb, AS_STORED, settings, trial.is_masked)
+                photo = read_photo(trial.rgb, AS_STORED, trial.is_masked)
+                found = localize(scan_map, photo, settings, workers, Stopwatch())
                 truth = trial.true_pose
-                ok = truth is not None and is_correct(result.best_pose, truth)
-                rows.append((trial.case, result.status, ok))
-                line = {"case": trial.case, "scene": scene, "result": json.loads(result.to_json())}
-                line["truth"] = truth and {name: array.tolist() for name, array in vars(truth).items()}
-                file.write(json.dumps(line) + "\n")
+                ok = truth is not None and is_correct(found.pose, truth)
+                rows.append((trial.case, found.status, ok))
+                file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
                 file.flush()
-                print_note(arguments, f"{scene}: {trial.case}: {result.status}, {'right' if ok else 'wrong'}")
+                print_note(arguments, f"{scene}: {trial.case}: {found.status}, {'right' if ok else 'wrong'}")
     return 1 if print_cases("case", rows) else 0
