@@ -4,6 +4,7 @@ Wide cells are prepared with the map. A view of fine cells is made when a search
 candidate, and kept until there are many.
 """
 
+import math
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -13,10 +14,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
+from ..geometry.pose import Array
 from ..geometry.sphere import SEARCH_RINGS, make_grid
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
-from .view import BLOCK, ViewConfig, render_block, render_wide_block, thread_scratch
+from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
+from ..panorama.local_normalization import LEVELS_PER_UNIT
+from .view import (
+    BLOCK,
+    Array32,
+    Mask,
+    Scratch,
+    ViewArrays,
+    ViewConfig,
+    average_nodes,
+    normalize_cells,
+    thread_scratch,
+)
 
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
@@ -56,14 +70,107 @@ def empty_views(num: int, num_cells: int) -> Views:
     )
 
 
+@inline_kernel
+def encode_level(channel: Scalar) -> np.int8:
+    """Return a normalised channel in 8 bits."""
+    level: Scalar = math.floor(channel * np.float32(LEVELS_PER_UNIT) + HALF)
+    return np.int8(min(max(level, np.float32(-127)), np.float32(127)))
+
+
+@kernel
+def render_block(
+    tree: Octree,
+    centers: Array,
+    voxel_per_range: float,
+    view: ViewArrays,
+    scratch: Scratch,
+    offsets: NDArray[np.int16],
+    unit: Array32,
+    levels: NDArray[np.int8],
+    is_seen: Mask,
+) -> None:
+    """Views from several centres in few bits: offsets in units of their own, channels in levels."""
+    n = len(view.solid_angle)
+    points = np.empty((3, n), np.float32)
+    channels = np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
+    shown = np.ones(n, np.bool_)
+    sums = np.empty((n, 8), np.float32)
+    for k in range(len(centers)):
+        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
+        normalize_cells(sums, view, shown, points, channels, weights)
+        largest = np.float32(1e-3)
+        for i in range(3):
+            for c in range(n):
+                largest = max(largest, abs(points[i, c]))
+        unit[k] = largest / np.float32(32767)
+        for i in range(3):
+            for c in range(n):
+                offsets[k, i, c] = np.int16(points[i, c] / unit[k])
+                levels[k, i, c] = encode_level(channels[i, c])
+        for c in range(n):
+            is_seen[k, c] = weights[c] > F0
+
+
+@kernel
+def render_wide_block(
+    tree: Octree,
+    centers: Array,
+    voxel_per_range: float,
+    view: ViewArrays,
+    scratch: Scratch,
+    features: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+) -> None:
+    """Views from several centres averaged over the wider cells that hold their statistics, in few bits.
+
+    Channels (n, 3, wider cells) in levels, by the whole cell's area, and how much of it is seen (n, wider
+    cells), 255 for all.
+    """
+    n = len(view.solid_angle)
+    points = np.empty((3, n), np.float32)
+    channels = np.empty((3, n), np.float32)
+    weights = np.empty(n, np.float32)
+    shown = np.ones(n, np.bool_)
+    sums = np.empty((n, 8), np.float32)
+    wide = np.empty((view.num_stats, 4), np.float32)
+    area = np.zeros(view.num_stats, np.float32)
+    for c in range(n):
+        area[view.stats_cell[c]] += view.solid_angle[c]
+    for k in range(len(centers)):
+        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
+        normalize_cells(sums, view, shown, points, channels, weights)
+        wide[:] = F0
+        for c in range(n):
+            if weights[c] > F0:
+                total = wide[view.stats_cell[c]]
+                for i in range(3):
+                    total[i] += weights[c] * channels[i, c]
+                total[3] += weights[c]
+        for c in range(view.num_stats):
+            for i in range(3):
+                features[k, i, c] = encode_level(wide[c, i] / area[c])
+            seen[k, c] = np.uint8(min(wide[c, 3] / area[c], F1) * np.float32(255) + HALF)
+
+
 def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers) -> Views:
     """The views from some centres (n, 3) [m]."""
     views = empty_views(len(centers), len(make_grid(config.num_rings)))
     views.centers[:] = centers
 
     def run(lo: int) -> None:
-        some, *out = (values[lo : lo + BLOCK] for values in views)
-        render_block(octree, some, config.voxel_per_range, config.arrays, thread_scratch(), *out)
+        part = slice(lo, lo + BLOCK)
+        render_block(
+            octree,
+            views.centers[part],
+            config.voxel_per_range,
+            config.arrays,
+            thread_scratch(),
+            views.offsets[part],
+            views.offset_unit[part],
+            views.features[part],
+            views.is_seen[part],
+        )
 
     list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
     return views
@@ -83,8 +190,16 @@ def render_wide(
     seen = np.empty((num, num_wide), np.uint8)
 
     def run(lo: int) -> None:
-        some, *out = (values[lo : lo + BLOCK] for values in (centers, features, seen))
-        render_wide_block(octree, some, config.voxel_per_range, config.arrays, thread_scratch(), *out)
+        part = slice(lo, lo + BLOCK)
+        render_wide_block(
+            octree,
+            centers[part],
+            config.voxel_per_range,
+            config.arrays,
+            thread_scratch(),
+            features[part],
+            seen[part],
+        )
 
     list(workers.map(run, range(0, num, BLOCK), "render views"))
     return WideViews(features.reshape(num, 3 * num_wide), seen)

@@ -9,12 +9,17 @@ import numpy as np
 
 from ..cloud.octree import Octree, collect
 from ..cloud.soa import PackedPoints, pack_points
-from ..geometry.pose import Pose
+from ..geometry.pose import Array, Pose
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import opponent, zscore
 from .view import (
+    Array32,
     Cells,
     Center,
+    Indices,
+    Mask,
+    Scratch,
+    ViewArrays,
     ViewConfig,
     average_nodes,
     average_view,
@@ -34,7 +39,7 @@ NUM_SURROUNDINGS = 2  # 11 MB
 
 
 @inline_kernel
-def node_fraction(node):
+def node_fraction(node: int) -> np.float32:
     """A number in [0, 1) that is drawn from a node's index, always the same (lowbias32, Wellons 2018)."""
     h = np.uint64(node)
     h = ((h ^ (h >> np.uint64(16))) * np.uint64(0x7FEB352D)) & LOW_32
@@ -43,7 +48,9 @@ def node_fraction(node):
 
 
 @inline_kernel
-def keep_visible(tree, nodes, cells, ranges, limits):
+def keep_visible(
+    tree: Octree, nodes: Indices, cells: Indices, ranges: Array32, limits: Array32
+) -> tuple[int, int]:
     """Put the visible ones of some nodes first. Returns how many these are, and their children."""
     count = num_children = 0
     for i in range(len(cells)):
@@ -56,7 +63,7 @@ def keep_visible(tree, nodes, cells, ranges, limits):
 
 
 @inline_kernel
-def take_children(tree, nodes, kept, found):
+def take_children(tree: Octree, nodes: Indices, kept: np.float32, found: Indices) -> int:
     """Write the children of some nodes, or those without any, each with the probability `kept`; how many.
 
     Each is kept or left out by its own number, so that a camera a little farther on sees nearly the same
@@ -77,7 +84,17 @@ def take_children(tree, nodes, kept, found):
 
 
 @kernel
-def render_points(tree, center, voxel_per_range, view, shown, scratch, offsets, channels, weights):
+def render_points(
+    tree: Octree,
+    center: Array,
+    voxel_per_range: float,
+    view: ViewArrays,
+    shown: Mask,
+    scratch: Scratch,
+    offsets: Array32,
+    channels: Array32,
+    weights: Array32,
+) -> int:
     """The visible points in cells that are shown, thinned to what fits: as `normalize_cells`, with weight 1.
 
     Voxels twice as large tell what is in front, and how colours vary. Returns how many.

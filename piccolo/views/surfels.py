@@ -16,7 +16,7 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import compute_pixels, compute_rays
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, F1, inline_kernel, kernel
+from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import channel
 from .zbuffer import View, indices_in_front, nearest_depth
 
@@ -44,6 +44,10 @@ MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
 MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
 HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
 FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
+
+Array32 = NDArray[np.float32]
+# of a surfel in the camera's frame: centre [m], normal, product of both, 1 / radius^2, range [m]
+Disc = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
 
 class Surfels(NamedTuple):
@@ -94,7 +98,7 @@ def planes(neighborhoods: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDA
 
 
 @inline_kernel
-def hit(surfel, dx, dy, dz, px_angle2):
+def hit(surfel: Disc, dx: Scalar, dy: Scalar, dz: Scalar, px_angle2: Scalar) -> tuple[Scalar, Scalar]:
     """Squared distance of the unit ray (dx, dy, dz) from a surfel's centre by its radius, and range [m]."""
     x, y, z, nx, ny, nz, along, per_radius2, distance = surfel
     facing = nx * dx + ny * dy + nz * dz
@@ -110,7 +114,7 @@ def hit(surfel, dx, dy, dz, px_angle2):
 
 
 @inline_kernel
-def half_width(rise, angle, cosines):
+def half_width(rise: Scalar, angle: Scalar, cosines: Scalar) -> float:
     """Azimuths [rad] on a row to each side of a centre that are within `angle` of it; -1 if none are.
 
     By how far the row is above the centre [rad], and the product of the cosines of their elevations.
@@ -123,7 +127,16 @@ def half_width(rise, angle, cosines):
 
 
 @kernel
-def splat(surfels, rgbx, extents, columns, rows, first_row, depth, sums):
+def splat(
+    surfels: Array32,
+    rgbx: NDArray[np.int32],
+    extents: Array,
+    columns: Array32,
+    rows: Array32,
+    first_row: int,
+    depth: Array32,
+    sums: Array32,
+) -> None:
     """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if that is not empty.
 
     surfels (N, 9): centre [m], normal, product of both, 1 / radius^2, range [m], in the camera's frame;

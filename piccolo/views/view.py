@@ -13,14 +13,16 @@ from numpy.typing import NDArray
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.pose import Array
 from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
-from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
-from ..panorama.local_normalization import LEVELS_PER_UNIT, mean_and_inverse_std, opponent, zscore
+from ..kernels.jit import F0, F1, HALF, kernel
+from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscore
 from .zbuffer import VISIBLE_FACTOR
 
 BLOCK = 64  # views that a thread makes at a time
 FAR = np.float32(1e30)
 
 Array32 = NDArray[np.float32]
+Indices = NDArray[np.int32]
+Mask = NDArray[np.bool_]
 Center = Sequence[float] | Array
 
 
@@ -99,7 +101,16 @@ class ViewConfig:
 
 
 @kernel
-def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
+def locate(
+    X: Array32,
+    Y: Array32,
+    Z: Array32,
+    num_columns: Indices,
+    first: Indices,
+    cells: Indices,
+    ranges: Array32,
+    turns: Array32,
+) -> None:
     """Write the cell and the range [m] of each position relative to the centre; `turns` is scratch."""
     num_rings = np.float32(len(num_columns))
     per_pi = np.float32(len(num_columns) / math.pi)
@@ -121,7 +132,9 @@ def locate(X, Y, Z, num_columns, first, cells, ranges, turns):
 
 
 @kernel
-def locate_nodes(tree, center, voxel_per_range, view, scratch):
+def locate_nodes(
+    tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, scratch: Scratch
+) -> int:
     """Fill the scratch with the nodes to draw, their offsets, cells and ranges; returns how many."""
     s = scratch
     n = collect(tree, center, voxel_per_range, s.nodes, s.directions)
@@ -133,7 +146,9 @@ def locate_nodes(tree, center, voxel_per_range, view, scratch):
 
 
 @kernel
-def average_nodes(tree, center, voxel_per_range, view, scratch, sums):
+def average_nodes(
+    tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, scratch: Scratch, sums: Array32
+) -> int:
     """Write (cells, 8): sums of x, y, z, r, g, b and the count of each cell's front, and its range.
 
     Of the nodes around a centre, which are left in the scratch; returns how many these are.
@@ -158,7 +173,15 @@ def average_nodes(tree, center, voxel_per_range, view, scratch, sums):
 
 
 @kernel
-def average_colors(sums, view, shown, offsets, channels, weights, moments):
+def average_colors(
+    sums: Array32,
+    view: ViewArrays,
+    shown: Mask,
+    offsets: Array32,
+    channels: Array32,
+    weights: Array32,
+    moments: Array32,
+) -> None:
     """Write relative positions, opponent channels and weights of the cells shown; add up their moments."""
     moments[:] = F0
     for c in range(len(sums)):
@@ -183,7 +206,7 @@ def average_colors(sums, view, shown, offsets, channels, weights, moments):
 
 
 @kernel
-def cell_statistics(moments, view, weights, stats):
+def cell_statistics(moments: Array32, view: ViewArrays, weights: Array32, stats: Array32) -> None:
     """Write the local means of the channels and 1 / deviations (6, cells) around cells of positive weight.
 
     Taken at the wider cells that hold the moments, and interpolated between these.
@@ -222,7 +245,15 @@ def cell_statistics(moments, view, weights, stats):
 
 
 @kernel
-def describe_cells(sums, view, shown, offsets, channels, weights, stats):
+def describe_cells(
+    sums: Array32,
+    view: ViewArrays,
+    shown: Mask,
+    offsets: Array32,
+    channels: Array32,
+    weights: Array32,
+    stats: Array32,
+) -> None:
     """Write position, opponent channels, weight and local statistics of each cell shown, by its sums."""
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, shown, offsets, channels, weights, moments)
@@ -230,7 +261,9 @@ def describe_cells(sums, view, shown, offsets, channels, weights, stats):
 
 
 @kernel
-def normalize_cells(sums, view, shown, offsets, channels, weights):
+def normalize_cells(
+    sums: Array32, view: ViewArrays, shown: Mask, offsets: Array32, channels: Array32, weights: Array32
+) -> None:
     """Write position, locally normalised channels and weight of each cell shown, by its sums."""
     stats = np.empty((6, len(weights)), np.float32)
     describe_cells(sums, view, shown, offsets, channels, weights, stats)
@@ -240,73 +273,15 @@ def normalize_cells(sums, view, shown, offsets, channels, weights):
                 channels[k, c] = zscore(channels[k, c], stats[k, c], stats[3 + k, c])
 
 
-@inline_kernel
-def encode_level(channel):
-    """A normalised channel in 8 bits."""
-    level = math.floor(channel * np.float32(LEVELS_PER_UNIT) + HALF)
-    return np.int8(min(max(level, np.float32(-127)), np.float32(127)))
-
-
 @kernel
-def render_block(tree, centers, voxel_per_range, view, scratch, offsets, unit, levels, is_seen):
-    """Views from several centres in few bits: offsets in units of their own, channels in levels."""
-    n = len(view.solid_angle)
-    points = np.empty((3, n), np.float32)
-    channels = np.empty((3, n), np.float32)
-    weights = np.empty(n, np.float32)
-    shown = np.ones(n, np.bool_)
-    sums = np.empty((n, 8), np.float32)
-    for k in range(len(centers)):
-        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
-        normalize_cells(sums, view, shown, points, channels, weights)
-        largest = np.float32(1e-3)
-        for i in range(3):
-            for c in range(n):
-                largest = max(largest, abs(points[i, c]))
-        unit[k] = largest / np.float32(32767)
-        for i in range(3):
-            for c in range(n):
-                offsets[k, i, c] = np.int16(points[i, c] / unit[k])
-                levels[k, i, c] = encode_level(channels[i, c])
-        for c in range(n):
-            is_seen[k, c] = weights[c] > F0
-
-
-@kernel
-def render_wide_block(tree, centers, voxel_per_range, view, scratch, features, seen):
-    """Views from several centres averaged over the wider cells that hold their statistics, in few bits.
-
-    Channels (n, 3, wider cells) in levels, by the whole cell's area, and how much of it is seen (n, wider
-    cells), 255 for all.
-    """
-    n = len(view.solid_angle)
-    points = np.empty((3, n), np.float32)
-    channels = np.empty((3, n), np.float32)
-    weights = np.empty(n, np.float32)
-    shown = np.ones(n, np.bool_)
-    sums = np.empty((n, 8), np.float32)
-    wide = np.empty((view.num_stats, 4), np.float32)
-    area = np.zeros(view.num_stats, np.float32)
-    for c in range(n):
-        area[view.stats_cell[c]] += view.solid_angle[c]
-    for k in range(len(centers)):
-        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
-        normalize_cells(sums, view, shown, points, channels, weights)
-        wide[:] = F0
-        for c in range(n):
-            if weights[c] > F0:
-                total = wide[view.stats_cell[c]]
-                for i in range(3):
-                    total[i] += weights[c] * channels[i, c]
-                total[3] += weights[c]
-        for c in range(view.num_stats):
-            for i in range(3):
-                features[k, i, c] = encode_level(wide[c, i] / area[c])
-            seen[k, c] = np.uint8(min(wide[c, 3] / area[c], F1) * np.float32(255) + HALF)
-
-
-@kernel
-def nearest_ranges(tree, centers, voxel_per_range, view, scratch, ranges):
+def nearest_ranges(
+    tree: Octree,
+    centers: NDArray[np.floating[Any]],
+    voxel_per_range: float,
+    view: ViewArrays,
+    scratch: Scratch,
+    ranges: Array32,
+) -> None:
     """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
     for k in range(len(centers)):
         n = locate_nodes(tree, centers[k], voxel_per_range, view, scratch)

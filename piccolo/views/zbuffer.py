@@ -10,8 +10,9 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import kernel
-from ..panorama.texels import channel, in_camera, pose_float32
+from ..panorama.texels import Pose32, channel, in_camera, pose_float32
 
+Coordinates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]  # x, y, z (N,) [m]
 CHUNK = 4096
 
 # A point is visible if it is not farther than the nearest in its cell by this much. The factor lets grazing
@@ -40,7 +41,14 @@ class View(NamedTuple):
 
 
 @kernel
-def cells_and_ranges(points, begin, pose, width, cells, ranges):
+def cells_and_ranges(
+    points: Coordinates,
+    begin: int,
+    pose: Pose32,
+    width: int,
+    cells: NDArray[np.int32],
+    ranges: NDArray[np.float32],
+) -> int:
     """Write the cell (row * width + column) of points from `begin` on, and the range [m]; returns how many.
 
     Chunk by chunk: the arithmetic is vectorised, the scatter that follows can't be.
@@ -63,7 +71,9 @@ def cells_and_ranges(points, begin, pose, width, cells, ranges):
 
 
 @kernel
-def nearest_ranges(points, R_cam_from_world, center_world, width, depth):
+def nearest_ranges(
+    points: Coordinates, R_cam_from_world: Array, center_world: Array, width: int, depth: NDArray[np.float32]
+) -> None:
     """Write the range [m] of the nearest point of each cell into `depth` (H * W,), which holds inf before."""
     pose = pose_float32(R_cam_from_world, center_world)
     cells = np.empty(CHUNK, np.int32)
@@ -74,7 +84,15 @@ def nearest_ranges(points, R_cam_from_world, center_world, width, depth):
 
 
 @kernel
-def mean_colors(points, rgbx, R_cam_from_world, center_world, width, depth, sums):
+def mean_colors(
+    points: Coordinates,
+    rgbx: NDArray[np.int32],
+    R_cam_from_world: Array,
+    center_world: Array,
+    width: int,
+    depth: NDArray[np.float32],
+    sums: Array,
+) -> None:
     """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within BAND of the nearest."""
     pose = pose_float32(R_cam_from_world, center_world)
     cells = np.empty(CHUNK, np.int32)
@@ -91,7 +109,14 @@ def mean_colors(points, rgbx, R_cam_from_world, center_world, width, depth, sums
 
 
 @kernel
-def select_visible(points, R_cam_from_world, center_world, width, depth, indices):
+def select_visible(
+    points: Coordinates,
+    R_cam_from_world: Array,
+    center_world: Array,
+    width: int,
+    depth: NDArray[np.float32],
+    indices: NDArray[np.int64],
+) -> int:
     """Write the indices of the points near the front of their cells; returns how many."""
     pose = pose_float32(R_cam_from_world, center_world)
     cells = np.empty(CHUNK, np.int32)
@@ -105,7 +130,7 @@ def select_visible(points, R_cam_from_world, center_world, width, depth, indices
     return count
 
 
-def _xyz(points: PackedPoints) -> tuple[NDArray[np.float32], ...]:
+def _xyz(points: PackedPoints) -> Coordinates:
     return points.x, points.y, points.z
 
 

@@ -17,9 +17,11 @@ CHUNK = 4_096  # rays
 NUM_FIRST = 32  # boxes
 MARGIN = 1e-6  # of a cone around rays [rad], and of a range [m]
 
+Integer = int | np.int64  # in a kernel
+
 
 @inline_kernel
-def hash_unit(i, j, seed):
+def hash_unit(i: Integer, j: Integer, seed: Integer) -> float:
     """A number in [0, 1) that looks random, of two integers and a seed."""
     h = (i * 374761393 + j * 668265263 + seed * 2147483647) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
@@ -28,23 +30,21 @@ def hash_unit(i, j, seed):
 
 
 @inline_kernel
-def value_noise(s, t, seed):
+def value_noise(s: float, t: float, seed: Integer) -> float:
     """Smooth noise in [0, 1] with cells of size 1."""
-    i = math.floor(s)
-    j = math.floor(t)
+    i = np.int64(math.floor(s))
+    j = np.int64(math.floor(t))
     x = s - i
     y = t - j
     x = x * x * (3.0 - 2.0 * x)
     y = y * y * (3.0 - 2.0 * y)
-    i = np.int64(i)
-    j = np.int64(j)
     top = hash_unit(i, j, seed) * (1.0 - x) + hash_unit(i + 1, j, seed) * x
     bottom = hash_unit(i, j + 1, seed) * (1.0 - x) + hash_unit(i + 1, j + 1, seed) * x
     return top * (1.0 - y) + bottom * y
 
 
 @inline_kernel
-def cloudy(s, t, seed):
+def cloudy(s: float, t: float, seed: Integer) -> float:
     """Noise in [0, 1] of three scales: 1 m, 0.25 m, 0.06 m."""
     coarse = value_noise(s, t, seed)
     middle = value_noise(4.0 * s, 4.0 * t, seed + 1)
@@ -52,7 +52,7 @@ def cloudy(s, t, seed):
 
 
 @inline_kernel
-def second_color_fraction(pattern, s, t, scale, seed):
+def second_color_fraction(pattern: Integer, s: float, t: float, scale: float, seed: Integer) -> float:
     """Fraction in [0, 1] of the second colour at (s, t) [m]; patterns as in room.py."""
     i = np.int64(math.floor(s / scale))
     j = np.int64(math.floor(t / scale))
@@ -76,7 +76,7 @@ def second_color_fraction(pattern, s, t, scale, seed):
 
 
 @kernel
-def hit_boxes(origin, directions, boxes, ranges, hits):
+def hit_boxes(origin: Array, directions: Array, boxes: Array, ranges: Array, hits: NDArray[np.int64]) -> None:
     """Write the range [m] of each ray (N, 3) to its first hit or inf, and 3 * box + axis of the face or -1.
 
     A box around the origin is not hit. Boxes outside, rays inside: the inner loop has no branch to stop SIMD.
@@ -117,7 +117,16 @@ def hit_boxes(origin, directions, boxes, ranges, hits):
 
 
 @kernel
-def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
+def shade(
+    origin: Array,
+    directions: Array,
+    ranges: Array,
+    hits: NDArray[np.int64],
+    boxes: Array,
+    materials: Array,
+    lights: Array,
+    rgb: Array,
+) -> None:
     """Write the colour (N, 3) in [0, 1] of each hit, lit by its box's lamp; black where nothing is hit."""
     for n in range(len(directions)):
         rgb[n, :] = 0.0
@@ -149,7 +158,7 @@ def shade(origin, directions, ranges, hits, boxes, materials, lights, rgb):
 
 
 @kernel
-def ranges_ahead(origin, axis, cone_width, boxes, least):
+def ranges_ahead(origin: Array, axis: Array, cone_width: float, boxes: Array, least: Array) -> None:
     """Write the distance [m] of each box (B, 7), inf where its bounding sphere is outside a cone of rays.
 
     The cone is around the unit `axis` (3,), its half width [rad].
