@@ -126,7 +126,7 @@ def _mount_of(entry: Mapping[str, Any]) -> Mount:
         camera,
         tuple(tuple(map(float, row)) for row in entry.get("R_lens_from_cam", IDENTITY)),
         tuple(map(float, entry.get("center_cam", (0.0, 0.0, 0.0)))),
-        (*map(_whole, entry.get("offset", (0, 0))),),  # type: ignore[arg-type]
+        (*map(_whole, entry.get("offset", (0, 0))),),  # type: ignore[arg-type]  # Mount checks the length
         image,
     )
 

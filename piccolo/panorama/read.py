@@ -1,4 +1,4 @@
-"""Reads a picture file or a folder of cube faces as a panorama: a full sphere, and the pixels that count."""
+"""A picture file or a folder of cube faces, read as a panorama: a full sphere, and the pixels that count."""
 
 from dataclasses import replace
 from os import PathLike

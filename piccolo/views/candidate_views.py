@@ -57,7 +57,7 @@ class WideViews(NamedTuple):
 
 
 def empty_views(num: int, num_cells: int) -> Views:
-    """Room for some views."""
+    """Return arrays, not filled, for `num` views of `num_cells` cells."""
     if num:
         bytes_per_cell = 6 + 3 + 1  # offsets, channels, seen
         check_memory(num * num_cells * bytes_per_cell, f"the scan: {num} views", "cut out a part of it")
@@ -89,7 +89,10 @@ def render_block(
     levels: NDArray[np.int8],
     is_seen: Mask,
 ) -> None:
-    """Views from several centres in few bits: offsets in units of their own, channels in levels."""
+    """Write views from several centres (n, 3) [m] in few bits: the arrays of `Views`.
+
+    `unit` (n,) [m] is what one step of an offset stands for; `levels` are the channels.
+    """
     n = len(view.solid_angle)
     points = np.empty((3, n), np.float32)
     channels = np.empty((3, n), np.float32)
@@ -122,10 +125,11 @@ def render_wide_block(
     features: NDArray[np.int8],
     seen: NDArray[np.uint8],
 ) -> None:
-    """Views from several centres averaged over the wider cells that hold their statistics, in few bits.
+    """Write views from several centres (n, 3) [m], averaged over wider cells, in few bits.
 
-    Channels (n, 3, wider cells) in levels, by the whole cell's area, and how much of it is seen (n, wider
-    cells), 255 for all.
+    The wider cells are those that hold the statistics. `features` (n, 3, wider cells) are channels in levels,
+    averaged over a cell's whole area, where what is not seen counts as 0; `seen` (n, wider cells) is the
+    fraction of this area that is seen, 255 for all.
     """
     n = len(view.solid_angle)
     points = np.empty((3, n), np.float32)
@@ -154,7 +158,7 @@ def render_wide_block(
 
 
 def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers) -> Views:
-    """The views from some centres (n, 3) [m]."""
+    """Render the views from some centres (n, 3) [m]."""
     views = empty_views(len(centers), len(make_grid(config.num_rings)))
     views.centers[:] = centers
 
@@ -179,9 +183,9 @@ def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfi
 def render_wide(
     octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers
 ) -> WideViews:
-    """The views from some centres (n, 3) [m], averaged over wide cells.
+    """Render the views from some centres (n, 3) [m], averaged over wide cells.
 
-    They are drawn of larger voxels than `config` has, as averages ask for no more.
+    Their voxels are larger than `config` says: averages need no finer ones.
     """
     config = replace(config, stats_rings=WIDE_RINGS, voxel_per_range=WIDE_VOXEL_PER_RANGE)
     num, num_wide = len(centers), len(make_grid(WIDE_RINGS))
@@ -216,7 +220,7 @@ class CandidateViews:
     num_made: int = field(init=False, default=0)
 
     def __post_init__(self) -> None:
-        """None is made."""
+        """Begin without views."""
         self._lock = threading.Lock()
         self._forget()
 
@@ -226,7 +230,10 @@ class CandidateViews:
         self._row = np.full(len(self.centers), -1, np.int64)
 
     def at(self, candidates: NDArray[np.int64], workers: Workers) -> tuple[NDArray[np.int64], Views]:
-        """The rows (n,) of some candidates (n,) among the views made, and these."""
+        """Return the rows (n,) of some candidates (n,) in the views made so far, and these views.
+
+        Views of candidates that have none yet are rendered first.
+        """
         with self._lock:
             missing = np.unique(candidates[self._row[candidates] < 0])
             if len(missing) and self.num_made + len(missing) > MOST_KEPT:
@@ -238,7 +245,7 @@ class CandidateViews:
             return self._row[candidates], self.made
 
     def _append(self, views: Views) -> None:
-        """Put views behind those made, in arrays twice as long if there is no room: nobody's rows change."""
+        """Append views to those made; without room, copy all to arrays twice as long. No row changes."""
         begin = self.num_made
         self.num_made += len(views.centers)
         if self.num_made > len(self.made.centers):
@@ -250,6 +257,6 @@ class CandidateViews:
 
 
 def put_rows(wholes: Sequence[Any], begin: int, parts: Sequence[Any]) -> None:
-    """Write some views into others, from a row on."""
+    """Copy each array of `parts` into the array of `wholes` at its place, from row `begin` on."""
     for whole, part in zip(wholes, parts, strict=True):
         whole[begin : begin + len(part)] = part

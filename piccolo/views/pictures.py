@@ -23,10 +23,10 @@ UPRIGHT = np.eye(3)
 
 
 def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A picture (H, W, 3); what is not seen (H, W) takes colours around it, the farther away the smoother.
+    """Fill the pixels of a picture (H, W, 3) where `is_seen` (H, W) is False from the colours around them.
 
-    From the same at half the size, in bytes, as floating-point copies of a large picture would take
-    gigabytes. Black if nothing is seen at all.
+    They come from the picture filled at half the size: the larger the hole, the smoother. All is computed in
+    bytes, as floating-point copies of a large picture would take gigabytes. Black if nothing is seen.
     """
     height, width = is_seen.shape
     if is_seen.all() or width == 1:
@@ -51,9 +51,10 @@ def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np
 
 
 def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
-    """Bytes of a file with an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray, as the suffix says.
+    """Return the file, as bytes, of an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray.
 
-    The quality, up to 100, is that of a JPEG.
+    The suffix, such as ".png", gives the format; `quality`, up to 100, is that of a JPEG. Raises OSError if
+    the image can't be encoded.
     """
     order = cv2.COLOR_RGBA2BGRA if image.ndim == 3 and image.shape[2] == 4 else cv2.COLOR_RGB2BGR
     bgr = cv2.cvtColor(image, order) if image.ndim == 3 else image
@@ -65,20 +66,20 @@ def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, qua
 
 
 def resize_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
-    """The panorama's colours, resized to (width / 2, width, 3)."""
+    """Return the panorama's colours, resized to (width / 2, width, 3)."""
     rgb = shrink(panorama, width).rgb
     return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
+    """Stack two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
     row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
     mixed = np.where(((row + column) % 2 == 0)[..., None], photo, cloud)
     return np.concatenate([photo, cloud, mixed])
 
 
 def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: Workers) -> bytes:
-    """PNG file of three images, one above the other: panorama, cloud from the pose, checkerboard of both.
+    """Return a PNG file of panorama, cloud rendered at the pose and checkerboard of both, top to bottom.
 
     A photo by one camera is shown in its own field, others as spheres.
     """
@@ -95,12 +96,18 @@ def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: W
 
 
 def sphere_width_for(camera: Camera) -> int:
-    """Width [px], even, of the sphere that is as fine as the camera's picture at its axis, bounded."""
+    """Return the even width [px] of a sphere with the resolution of the camera at its axis.
+
+    It is at most MAX_SPHERE_WIDTH.
+    """
     return min(2 * math.ceil(math.pi * camera.resolution), MAX_SPHERE_WIDTH)
 
 
 def cut(image: NDArray[np.uint8], camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> NDArray[np.uint8]:
-    """A camera's picture (height, width, 3) of that of the sphere (H, W, 3); black where it shows nothing."""
+    """Return a camera's picture (height, width, 3), sampled from a sphere's (H, W, 3).
+
+    Pixels that show no direction are black.
+    """
     u, v, is_in = _places(camera, image.shape[1], R_lens_from_cam)
     around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
     found = cv2.remap(around, u + np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR)
@@ -109,7 +116,10 @@ def cut(image: NDArray[np.uint8], camera: Camera, R_lens_from_cam: Array = UPRIG
 
 
 def cut_view(view: View, camera: Camera) -> View:
-    """A camera's view of that of the sphere; ranges of the nearest pixel, infinite where nothing is shown."""
+    """Return a camera's view, sampled from that of the sphere.
+
+    Its ranges are those of the nearest pixel, infinite where a pixel shows no direction.
+    """
     width = view.depth.shape[1]
     u, v, is_in = _places(camera, width, UPRIGHT)
     rows = np.clip(v.astype(np.int64), 0, width // 2 - 1)
@@ -120,7 +130,7 @@ def cut_view(view: View, camera: Camera) -> View:
 def _places(
     camera: Camera, width: int, R_lens_from_cam: Array
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-    """Columns and rows of the sphere that pixels show (height, width), and which show any."""
+    """Return columns and rows [px] of the sphere at a camera's pixels (height, width), and which show any."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays, is_in = camera.rays(np.stack([u, v], axis=-1))
     columns, rows = compute_pixels(rays @ R_lens_from_cam, width)

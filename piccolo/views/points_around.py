@@ -1,6 +1,6 @@
-"""The points that a camera sees around it, as fine as it can tell them apart: for the last millimetres.
+"""The points that a camera sees around it, as fine as its pixels: for the last millimetres.
 
-And views from places on a grid, the last few kept: a pose that hardly moves sees what it saw before.
+Views are rendered from places on a grid, and the last few are kept: a pose that hardly moves uses them again.
 """
 
 from functools import lru_cache, partial
@@ -40,7 +40,7 @@ NUM_SURROUNDINGS = 2  # 11 MB
 
 @inline_kernel
 def node_fraction(node: int) -> np.float32:
-    """A number in [0, 1) that is drawn from a node's index, always the same (lowbias32, Wellons 2018)."""
+    """Return a number in [0, 1) that looks random: a hash of a node's index (lowbias32, Wellons 2018)."""
     h = np.uint64(node)
     h = ((h ^ (h >> np.uint64(16))) * np.uint64(0x7FEB352D)) & LOW_32
     h = ((h ^ (h >> np.uint64(15))) * np.uint64(0x846CA68B)) & LOW_32
@@ -51,7 +51,10 @@ def node_fraction(node: int) -> np.float32:
 def keep_visible(
     tree: Octree, nodes: Indices, cells: Indices, ranges: Array32, limits: Array32
 ) -> tuple[int, int]:
-    """Put the visible ones of some nodes first. Returns how many these are, and their children."""
+    """Move the visible nodes to the front; return their number, and that of their children.
+
+    A node is visible up to the range in column 7 of `limits` (cells, 8). One without children counts as one.
+    """
     count = num_children = 0
     for i in range(len(cells)):
         if ranges[i] <= limits[cells[i], 7]:
@@ -64,10 +67,10 @@ def keep_visible(
 
 @inline_kernel
 def take_children(tree: Octree, nodes: Indices, kept: np.float32, found: Indices) -> int:
-    """Write the children of some nodes, or those without any, each with the probability `kept`; how many.
+    """Write some children of nodes, each kept with the probability `kept`; return their number.
 
-    Each is kept or left out by its own number, so that a camera a little farther on sees nearly the same
-    points: a descent that is begun again from where it ended then ends there.
+    A node without children stands for itself. A node's hash decides whether it is kept, so that a camera a
+    little farther on sees nearly the same points: a descent that starts again where it ended then ends there.
     """
     count = 0
     for i in range(len(nodes)):
@@ -95,9 +98,10 @@ def render_points(
     channels: Array32,
     weights: Array32,
 ) -> int:
-    """The visible points in cells that are shown, thinned to what fits: as `normalize_cells`, with weight 1.
+    """Write a sample of the visible points in cells that are shown; return their number.
 
-    Voxels twice as large tell what is in front, and how colours vary. Returns how many.
+    The sample fits the arrays. Offsets and channels are as in `normalize_cells`, weights are 1. Occlusion
+    and local statistics are computed from voxels twice as large.
     """
     s = scratch
     num_cells = len(view.solid_angle)
@@ -139,9 +143,9 @@ def render_points(
 
 
 def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, count: int) -> Cells:
-    """The scan seen from a centre (3,) [m], as at most `count` points with equal weights, not as cells.
+    """Return what is seen from a centre (3,) [m] as at most `count` points of equal weights, not as cells.
 
-    In the cells that are shown: a byte each.
+    `shown` has a byte for each cell of `config`: 1 if points in it are wanted, else 0.
     """
     *found, center = empty_cells(count, center_map)
     is_shown = np.frombuffer(shown, np.bool_)
@@ -153,9 +157,10 @@ def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown
 
 
 def points_around(octree: Octree, center_map: Center, voxel_per_range: float) -> PackedPoints:
-    """All nodes as coloured points, those far from a centre (3,) [m] as large as it is far to them.
+    """Return nodes in all directions from a centre (3,) [m], hidden or not, as coloured points.
 
-    Of however large a scan, some hundred thousand.
+    Voxels are at most `voxel_per_range` times their distance wide. There are some hundred thousand points,
+    however large the scan.
     """
     scratch = thread_scratch()
     n = collect(
@@ -167,7 +172,7 @@ def points_around(octree: Octree, center_map: Center, voxel_per_range: float) ->
 
 
 class RecentViews:
-    """Views of one scan, each made when it is asked for and not among the last; from any thread."""
+    """The last few views of one scan, each rendered when it is asked for and not kept; from any thread."""
 
     def __init__(self, octree: Octree) -> None:
         self.averages = lru_cache(NUM_VIEWS)(partial(average_view, octree))
@@ -176,6 +181,6 @@ class RecentViews:
 
 
 def round_position(pose: Pose) -> tuple[float, float, float]:
-    """The place [m] nearest to a pose of the map."""
+    """Return the place [m] on the grid that is nearest to a pose in the map."""
     x, y, z = (round(float(value) / PLACE_SPACING) * PLACE_SPACING for value in pose.center_world)
     return x, y, z

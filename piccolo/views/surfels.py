@@ -58,12 +58,12 @@ class Surfels(NamedTuple):
     radii: NDArray[np.float32]  # (N,) [m], 0 for a surfel no larger than a pixel
 
     def take(self, indices: NDArray[np.integer]) -> "Surfels":
-        """The surfels at `indices`, in that order."""
+        """Return the surfels at `indices`, in that order."""
         return Surfels(self.points.take(indices), self.normals[indices], self.radii[indices])
 
 
 def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
-    """Each point as a surfel over its nearest neighbours; points in the air are left out."""
+    """Fit a surfel to each point and its nearest neighbours; leave out points in the air."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no picture need not wait for it
 
     positions = np.stack([points.x, points.y, points.z], axis=1)
@@ -89,7 +89,10 @@ def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
 
 
 def planes(neighborhoods: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Unit normals (N, 3) of neighbourhoods (N, K, 3), 0 without a plane; and which fill a volume (N,)."""
+    """Fit planes to neighbourhoods (N, K, 3); return unit normals (N, 3), and which fill a volume (N,).
+
+    The normal is 0 where there is no plane.
+    """
     offsets = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
     is_thick = values[:, 0] > MAX_THICKNESS * values.sum(axis=1)
@@ -99,7 +102,11 @@ def planes(neighborhoods: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDA
 
 @inline_kernel
 def hit(surfel: Disc, dx: Scalar, dy: Scalar, dz: Scalar, px_angle2: Scalar) -> tuple[Scalar, Scalar]:
-    """Squared distance of the unit ray (dx, dy, dz) from a surfel's centre by its radius, and range [m]."""
+    """Intersect a unit ray (dx, dy, dz) with a surfel's plane; return (distance / radius)^2 and range [m].
+
+    The distance is that of the intersection from the surfel's centre. `px_angle2` is the square of the
+    least radius [rad]: a ray nearer to the centre meets the surfel, however small.
+    """
     x, y, z, nx, ny, nz, along, per_radius2, distance = surfel
     facing = nx * dx + ny * dy + nz * dz
     t = along / facing
@@ -115,9 +122,10 @@ def hit(surfel: Disc, dx: Scalar, dy: Scalar, dz: Scalar, px_angle2: Scalar) -> 
 
 @inline_kernel
 def half_width(rise: Scalar, angle: Scalar, cosines: Scalar) -> float:
-    """Azimuths [rad] on a row to each side of a centre that are within `angle` of it; -1 if none are.
+    """Return the azimuth [rad] to each side up to which a row is within `angle` of a centre; -1 if nowhere.
 
-    By how far the row is above the centre [rad], and the product of the cosines of their elevations.
+    `rise` [rad] is the row's elevation above the centre's; `cosines` is the product of the cosines of both
+    elevations.
     """
     over = math.sin(0.5 * angle) ** 2 - math.sin(0.5 * rise) ** 2
     if over < 0.0:
@@ -137,7 +145,7 @@ def splat(
     depth: Array32,
     sums: Array32,
 ) -> None:
-    """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if that is not empty.
+    """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if it is not empty.
 
     surfels (N, 9): centre [m], normal, product of both, 1 / radius^2, range [m], in the camera's frame;
     extents (N, 3): column and row of the centre [px], radius as seen [rad]; columns (W, 2), rows (W / 2, 2):
@@ -180,23 +188,24 @@ def splat(
 
 
 def axes_of_pixels(width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Cosines and sines of each column's azimuth (width, 2) and of each row's elevation (width / 2, 2)."""
+    """Return cosine and sine of each column's azimuth (width, 2) and each row's elevation (width / 2, 2)."""
     columns = compute_rays(np.arange(width) + 0.5, width / 4.0, width)[:, :2]
     rows = compute_rays(width / 2.0, np.arange(width // 2) + 0.5, width)[:, ::2]
     return columns.astype(np.float32), rows.astype(np.float32)
 
 
 def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers) -> View:
-    """The cloud at `pose`, `width` x width / 2 pixels; colours in uint8."""
+    """Render the cloud as surfels at a pose, (width / 2, width) pixels; colours in uint8."""
     visible = points.take(visible_indices(points, pose.center_world)).subsample(MAX_SURFELS)
     return render_surfels(make_surfels(visible, workers), pose, width, workers)
 
 
 def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
-    """Indices of all points but those behind a surface that goes on around them.
+    """Return the indices of all points but those behind a surface that goes on around them.
 
-    `visible_points` lets what is in front in a cell hide all of the cell: a rim of two degrees around
-    each thing would be missing in a picture. Here nine cells must agree, of one or the other size.
+    In `visible_points` the nearest point of a cell hides the whole cell: a picture would lack a rim of two
+    degrees around each object. Here a point is hidden only if it is behind the nearest point of each of nine
+    cells around it, in one of two cell sizes.
     """
     kept = np.arange(len(points))
     for width in HIDING_WIDTHS:
@@ -211,7 +220,7 @@ def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int
 
 
 def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
-    """The surfels seen from `pose`; colours in uint8."""
+    """Render surfels at a pose, (width / 2, width) pixels; colours in uint8."""
     p = surfels.points
     ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - pose.center_world, axis=1)
     largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
@@ -242,7 +251,7 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
 
 
 def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[NDArray[np.float32], Array]:
-    """Surfels (N, 9) and extents (N, 3) as `splat` reads them."""
+    """Return surfels (N, 9) and extents (N, 3) as `splat` reads them."""
     p = surfels.points
     x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ pose.R_cam_from_world.T
     ranges = np.linalg.norm(x_cam, axis=1)

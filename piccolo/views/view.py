@@ -27,7 +27,7 @@ Center = Sequence[float] | Array
 
 
 class Cells(NamedTuple):
-    """The scan seen from a centre, on cells of the sphere or as points."""
+    """Surfaces of the scan seen from a centre, on cells of the sphere or as points."""
 
     offsets: NDArray[np.float32]  # (3, N) [m] from the centre
     channels: NDArray[np.float32]  # (3, N) opponent colours, locally normalised [standard deviations]
@@ -135,7 +135,7 @@ def locate(
 def locate_nodes(
     tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, scratch: Scratch
 ) -> int:
-    """Fill the scratch with the nodes to draw, their offsets, cells and ranges; returns how many."""
+    """Fill the scratch with the nodes to draw, their offsets, cells and ranges; return their number."""
     s = scratch
     n = collect(tree, center, voxel_per_range, s.nodes, s.directions)
     x = s.directions[0, :n]  # a row each: of a cut of all three, the stride is unknown to the compiler
@@ -149,9 +149,10 @@ def locate_nodes(
 def average_nodes(
     tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, scratch: Scratch, sums: Array32
 ) -> int:
-    """Write (cells, 8): sums of x, y, z, r, g, b and the count of each cell's front, and its range.
+    """Write (cells, 8): sums of x, y, z, r, g, b, and the count, of each cell's nearest nodes; and its range.
 
-    Of the nodes around a centre, which are left in the scratch; returns how many these are.
+    Positions are relative to the centre [m], colours in [0, 1]. Nearest nodes are those up to `view.front`
+    times the range [m] of the very nearest. All nodes stay in the scratch; their number is returned.
     """
     n = locate_nodes(tree, center, voxel_per_range, view, scratch)
     s = scratch
@@ -254,7 +255,7 @@ def describe_cells(
     weights: Array32,
     stats: Array32,
 ) -> None:
-    """Write position, opponent channels, weight and local statistics of each cell shown, by its sums."""
+    """Write position, opponent channels, weight and local statistics of each cell shown, from its sums."""
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, shown, offsets, channels, weights, moments)
     cell_statistics(moments, view, weights, stats)
@@ -264,7 +265,7 @@ def describe_cells(
 def normalize_cells(
     sums: Array32, view: ViewArrays, shown: Mask, offsets: Array32, channels: Array32, weights: Array32
 ) -> None:
-    """Write position, locally normalised channels and weight of each cell shown, by its sums."""
+    """Write position, locally normalised channels and weight of each cell shown, from its sums."""
     stats = np.empty((6, len(weights)), np.float32)
     describe_cells(sums, view, shown, offsets, channels, weights, stats)
     for k in range(3):
@@ -296,7 +297,7 @@ _local = threading.local()
 
 
 def thread_scratch() -> Scratch:
-    """The calling thread's own scratch, for the largest view: fresh memory costs as much as a view."""
+    """Return the calling thread's own scratch, for the largest view: fresh memory costs as much as a view."""
     if not hasattr(_local, "scratch"):
         nodes, cells = np.empty((2, MAX_NODES), np.int32)
         floats = np.empty((5, MAX_NODES), np.float32)
@@ -306,7 +307,7 @@ def thread_scratch() -> Scratch:
 
 
 def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Array32:
-    """Sums (cells, 8), as `average_nodes` writes them, of what is seen around a centre (3,) [m]."""
+    """Render a view from a centre (3,) [m]; return its sums (cells, 8) as `average_nodes` writes them."""
     sums = np.empty((len(make_grid(config.num_rings)), 8), np.float32)
     center = np.asarray(center_map, np.float64)
     average_nodes(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), sums)
@@ -314,13 +315,13 @@ def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Arra
 
 
 def empty_cells(n: int, center_map: Center) -> Cells:
-    """Room for some cells or points around a centre (3,) [m]."""
+    """Return arrays, not filled, for `n` cells or points around a centre (3,) [m]."""
     offsets, channels = np.empty((2, 3, n), np.float32)
     return Cells(offsets, channels, np.empty(n, np.float32), np.asarray(center_map, np.float64))
 
 
 def normalize_view(sums: Array32, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_]) -> Cells:
-    """A view around a centre (3,) [m] by its sums (N, 8): those cells (N,) of `config` that are shown."""
+    """Normalise a view from a centre (3,) [m], given its sums (N, 8); cells not shown (N,) weigh 0."""
     cells = empty_cells(len(sums), center_map)
     normalize_cells(sums, config.arrays, shown, *cells[:3])
     return cells
@@ -329,7 +330,7 @@ def normalize_view(sums: Array32, center_map: Center, config: ViewConfig, shown:
 def ranges_around(
     octree: Octree, centers_map: NDArray[np.floating[Any]], config: ViewConfig
 ) -> NDArray[np.float32]:
-    """Ranges (n, cells) [m] of the nearest of what is seen from each centre (n, 3), 0 for nothing."""
+    """Return the range [m] of the nearest node in each cell around each centre: (n, cells), 0 for none."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
     centers_map = np.ascontiguousarray(centers_map)  # one kernel for all
     nearest_ranges(octree, centers_map, config.voxel_per_range, config.arrays, thread_scratch(), ranges)

@@ -36,7 +36,7 @@ class View(NamedTuple):
 
     @property
     def is_seen(self) -> NDArray[np.bool_]:
-        """(H, W), true where something was seen."""
+        """True where something was seen, (H, W)."""
         return np.isfinite(self.depth)
 
 
@@ -49,9 +49,9 @@ def cells_and_ranges(
     cells: NDArray[np.int32],
     ranges: NDArray[np.float32],
 ) -> int:
-    """Write the cell (row * width + column) of points from `begin` on, and the range [m]; returns how many.
+    """Write cell (row * width + column) and range [m] of a chunk of points; return its length.
 
-    Chunk by chunk: the arithmetic is vectorised, the scatter that follows can't be.
+    The chunk begins at `begin`. The arithmetic is vectorised, the scatter that follows can't be.
     """
     W = np.float32(width)
     last_column = np.int32(width - 1)
@@ -117,7 +117,7 @@ def select_visible(
     depth: NDArray[np.float32],
     indices: NDArray[np.int64],
 ) -> int:
-    """Write the indices of the points near the front of their cells; returns how many."""
+    """Write the indices of the points that are visible, given `depth` (H * W,) [m]; return their number."""
     pose = pose_float32(R_cam_from_world, center_world)
     cells = np.empty(CHUNK, np.int32)
     ranges = np.empty(CHUNK, np.float32)
@@ -135,14 +135,17 @@ def _xyz(points: PackedPoints) -> Coordinates:
 
 
 def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.float32]:
-    """Range (width / 2, width) [m] of the nearest point in each cell, inf where there is none."""
+    """Return the range (width / 2, width) [m] of the nearest point in each cell, inf where there is none."""
     depth = np.full((width // 2, width), np.inf, np.float32)
     nearest_ranges(_xyz(points), pose.R_cam_from_world, pose.center_world, width, depth.reshape(-1))
     return depth
 
 
 def render_view(points: PackedPoints, pose: Pose, width: int) -> View:
-    """The cloud at `pose`, `width` cells around; colours (float32, 0 to 1) within BAND of the nearest."""
+    """Render the cloud at a pose, (width / 2, width) cells; colours in float32, 0 to 1.
+
+    A cell's colour is the mean of the points within BAND of its nearest range.
+    """
     depth = nearest_depth(points, pose, width)
     sums = np.zeros((depth.size, 4))
     R, t = pose.R_cam_from_world, pose.center_world
@@ -154,9 +157,9 @@ def render_view(points: PackedPoints, pose: Pose, width: int) -> View:
 def indices_in_front(
     points: PackedPoints, center_world: Array, depth: NDArray[np.float32]
 ) -> NDArray[np.int64]:
-    """Indices of the points that a camera at a place (3,), turned as the world, sees no farther than `depth`.
+    """Return the indices of the points that are not behind `depth` (H, W) [m], seen from a place (3,) [m].
 
-    Ranges (H, W) [m].
+    The camera's axes are the world's. A point may be farther by VISIBLE_FACTOR and VISIBLE_OFFSET.
     """
     indices = np.empty(len(points), np.int64)
     count = select_visible(_xyz(points), np.eye(3), center_world, depth.shape[1], depth.reshape(-1), indices)
@@ -164,13 +167,13 @@ def indices_in_front(
 
 
 def visible_points(points: PackedPoints, center_world: Array) -> PackedPoints:
-    """The points that a camera at `center_world` (3,) sees, whichever way it is turned."""
+    """Return the points that are visible from `center_world` (3,) [m], whichever way the camera is turned."""
     depth = nearest_depth(points, Pose(np.eye(3), center_world), VISIBLE_WIDTH)
     return points.take(indices_in_front(points, center_world, depth))
 
 
 def is_free_space(points: PackedPoints, center: Array, width: int, min_clearance: float) -> bool:
-    """True if no point is within `min_clearance` [m] of `center` (3,), and points are seen all around.
+    """Return True if no point is within `min_clearance` [m] of `center` (3,), and points are seen all around.
 
     Both follow from the nearest range in each cell of an equirectangular view `width` cells wide.
     """
