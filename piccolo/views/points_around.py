@@ -3,6 +3,7 @@
 Views are rendered from places on a grid, and the last few are kept: a pose that hardly moves uses them again.
 """
 
+from collections.abc import Callable
 from functools import lru_cache, partial
 
 import numpy as np
@@ -36,6 +37,8 @@ PLACE_SPACING = 0.01  # [m] between places
 NUM_VIEWS = 32  # are kept: 12 MB
 NUM_POINT_SETS = 8  # 7 MB
 NUM_SURROUNDINGS = 2  # 11 MB
+
+Place = tuple[float, float, float]  # [m]
 
 
 @inline_kernel
@@ -175,12 +178,18 @@ class RecentViews:
     """The last few views of one scan, each rendered when it is asked for and not kept; from any thread."""
 
     def __init__(self, octree: Octree) -> None:
-        self.averages = lru_cache(NUM_VIEWS)(partial(average_view, octree))
-        self.points = lru_cache(NUM_POINT_SETS)(partial(visible_points, octree))
-        self.surroundings = lru_cache(NUM_SURROUNDINGS)(partial(points_around, octree))
+        self.averages: Callable[[Place, ViewConfig], Array32] = lru_cache(NUM_VIEWS)(
+            partial(average_view, octree)
+        )
+        self.points: Callable[[Place, ViewConfig, bytes, int], Cells] = lru_cache(NUM_POINT_SETS)(
+            partial(visible_points, octree)
+        )
+        self.surroundings: Callable[[Place, float], PackedPoints] = lru_cache(NUM_SURROUNDINGS)(
+            partial(points_around, octree)
+        )
 
 
-def round_position(pose: Pose) -> tuple[float, float, float]:
+def round_position(pose: Pose) -> Place:
     """Return the place [m] on the grid that is nearest to a pose in the map."""
     x, y, z = (round(float(value) / PLACE_SPACING) * PLACE_SPACING for value in pose.center_world)
     return x, y, z

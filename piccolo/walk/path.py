@@ -145,7 +145,7 @@ class Lattice:
         self.best: list[Array] = []  # of the best way
         self.back: list[list[tuple[int, int] | None]] = []
         self.unlisted: list[_Unlisted] = []
-        self.ended = -math.inf  # the sum over ways that end at a state
+        self.ended: float = -math.inf  # the sum over ways that end at a state
 
     def add(self, frame: Frame) -> None:
         """Add the next frame in time."""

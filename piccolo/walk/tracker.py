@@ -87,15 +87,15 @@ class Tracker:
         motion: Motion,
         space: FreeSpace | None = None,
     ) -> None:
-        self.scan_map = apply_prior(scan_map, settings.prior)
+        self.scan_map: ScanMap = apply_prior(scan_map, settings.prior)
         self.settings = settings
         self.workers = workers
-        self.motion = motion
-        self.lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
-        self.num_lost = 0
-        self.next_search = 1
-        self.walked = 0.0  # [m] since the whole scan was searched
-        self.is_sure = False
+        self.motion: Motion = motion
+        self.lattice: Lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
+        self.num_lost: int = 0
+        self.next_search: int = 1
+        self.walked: float = 0.0  # [m] since the whole scan was searched
+        self.is_sure: bool = False
 
     @property
     def frames(self) -> list[Frame]:
