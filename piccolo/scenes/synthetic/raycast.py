@@ -20,7 +20,7 @@ MARGIN = 1e-6  # of a cone around rays [rad], and of a range [m]
 
 @inline_kernel
 def hash_unit(i, j, seed):
-    """A number in [0, 1) that looks random, of two integers and a seed."""
+    """Hash two integers and a seed to a pseudo-random number in [0, 1)."""
     h = (i * 374761393 + j * 668265263 + seed * 2147483647) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
     h = ((h ^ (h >> 15)) * 1911520717) & 0x7FFFFFFF
