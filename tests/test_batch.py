@@ -382,7 +382,7 @@ def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, out, capsy
     table.write_text(f"name,x,y,radius,height\n{rows}")
     assert _run(scene, out, "--priors", str(table), "--height", "0.2", "2.2") == 0
     err = capsys.readouterr().err
-    assert "1 names of no panorama here, such as clean_9.jpg" in err.splitlines()[0]  # before the work
+    assert "1 names without a panorama, such as clean_9.jpg" in err.splitlines()[0]  # before the work
     assert "%|" not in err  # a bar is for a terminal
     priors = [line["settings"]["prior"] for line in _lines(out)]
     assert priors[0]["near_world"] == [x, y, None]

@@ -265,7 +265,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     monkeypatch.setattr(jit.time, "monotonic", lambda: next(seconds))
     for is_quiet in (False, True):
         compiling = jit.Compiling()
-        with progress.log_shown(is_quiet):
+        with progress.showing_log(is_quiet):
             compiling.start()
             compiling.finish()
             compiling.finish()

@@ -150,7 +150,7 @@ CUT = "the file is cut off or broken"
         (RECORD_SIZE, "<H", 33, "records of 33 bytes, wanted 34 or more in point format 3"),
         (COUNT, "<I", 1201, f"promises 1201 points of 34 bytes, found room for 1200; {CUT}"),
         (COUNT, "<I", 0, "promises 0 points"),
-        (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale of 0"),
+        (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale 0"),
         (SCALE_X + 24, "<d", float("inf"), r"offsets \[ *inf"),
     ],
 )

@@ -256,7 +256,7 @@ class Evaluation:
                 try:
                     result = wait().result
                 except WorkerLostError as error:
-                    result = localizer.lost(task, error, None).result
+                    result = localizer.answer_of_lost(task, error, None).result
                 self.record(scene, query, result, is_inside)
 
     def select_labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:

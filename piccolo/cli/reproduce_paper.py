@@ -62,7 +62,8 @@ def run_condition(
 ) -> tuple[list[QueryResult], int]:
     """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
-    reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
+    cloud_settings = CloudSettings(labels=labels)
+    read_options = ReadOptions(labels=labels)
     transformed = []
     num_failed = 0
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
@@ -74,7 +75,8 @@ def run_condition(
             except InputError as error:
                 print_error(arguments, str(error), EXIT_BAD_INPUT)
                 num_failed += len(scene.queries)
-        config = Localizer((), condition.settings, *reading, CachePolicy(True, Path(temporary)))
+        cache = CachePolicy(True, Path(temporary))
+        config = Localizer((), condition.settings, cloud_settings, read_options, cache)
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         path = out / file_name(condition)
         rows, num_failed_later = run_scenes(arguments, path, config, transformed, variants)

@@ -37,7 +37,7 @@ from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY
 from .outputs import check_suffix
-from .progress import progress_bar, shown
+from .progress import progress_bar, show_progress
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
 ONLY_WITH = ("every", "times", "max_speed", "plan")
@@ -116,7 +116,7 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
     with temporary_folder() as folder:
         found = frames_of(arguments.video, seconds, folder)
         bar = {"desc": "read the video", "unit": " frames", "leave": False}
-        shots = shown(found, arguments.quiet, **bar)
+        shots = show_progress(found, arguments.quiet, **bar)
         frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
         yield WalkInputs(frames, motion, metres)
 
@@ -201,7 +201,7 @@ def follow_all(
         # each is prepared while the one before it is followed
         prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.path, frame.name), left, 2)
         with interruptible() as interruption:
-            pairs = shown(prepared, arguments.quiet, **bar)
+            pairs = show_progress(prepared, arguments.quiet, **bar)
             for frame, wait in interruption.each(pairs) if file else pairs:
                 result = walk.follow(wait(), frame.time)
                 if result.error is not None:

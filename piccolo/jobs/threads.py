@@ -64,12 +64,12 @@ ProgressCallback = Callable[[str, int, int | None], None]
 def report_progress(callback: ProgressCallback) -> Progress:
     """Progress that a callback is told of."""
 
-    def watched(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
+    def watch(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
         for done, value in enumerate(values, start=1):
             callback(label, done, total)
             yield value
 
-    return watched
+    return watch
 
 
 def ignore_warning(warning: str) -> None:

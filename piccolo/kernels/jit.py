@@ -148,9 +148,9 @@ def rebuild(
     wrappers = description.llvm_cpython_wrapper_name, description.llvm_cfunc_wrapper_name
     names = description.llvm_func_name, *wrappers
     stand_in = llvm.parse_assembly("".join(f'define void @"{each}"() {{ ret void }}\n' for each in names))
-    parts = (name, kind, (machine_code, stand_in.as_bitcode())), description
+    stub_library = (name, kind, (machine_code, stand_in.as_bitcode()))
     make: Callable[..., Any] = compiler.CompileResult._rebuild  # Numba gives it no type
-    compiled = make(target_context, *parts, *others)
+    compiled = make(target_context, stub_library, description, *others)
     compiled.library._get_module_for_linking = cache(partial(llvm.parse_bitcode, bitcode))
     return compiled
 

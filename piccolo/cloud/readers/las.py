@@ -91,10 +91,8 @@ class LasHeader(NamedTuple):
         fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
-        kinds, begins = zip(*fields.values(), strict=True)
-        return np.dtype(
-            {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
-        )
+        kinds, at = zip(*fields.values(), strict=True)
+        return np.dtype({"names": [*fields], "formats": kinds, "offsets": at, "itemsize": self.record_size})
 
     @property
     def has_colors(self) -> bool:
@@ -129,14 +127,15 @@ def read_header(path: Path) -> LasHeader:
         wrong = f"records of {record_size} bytes, wanted {least} or more in point format {point_format}"
         raise InputError(f"{path}: {wrong if least else f'unknown point format {point_format}, {WANTED}'}")
     if not (np.isfinite([scales, offsets]).all() and scales.all()):
-        found = f"scales {scales} and offsets {offsets}"
-        raise InputError(f"{path}: {found}, wanted finite ones and no scale of 0")
+        raise InputError(f"{path}: scales {scales} and offsets {offsets}, wanted finite ones and no scale 0")
     room = (size - points_offset) // record_size
     if num_points == 0 or (num_points > room and not is_compressed):
         promised = f"promises {num_points} points of {record_size} bytes, found room for {room}"
         raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
-    sizes = size, header_size, points_offset, num_vlrs, point_format, record_size, num_points
-    return LasHeader(path, *sizes, scales, offsets, is_compressed)
+    return LasHeader(
+        path, size, header_size, points_offset, num_vlrs, point_format, record_size, num_points,
+        scales, offsets, is_compressed,
+    )  # fmt: skip
 
 
 class LasLayout(NamedTuple):

@@ -90,8 +90,10 @@ def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
         for path in sorted(rgb.glob("camera_*_rgb.png")):
             if room := PICTURE.match(path.name):
                 stem = path.name.removesuffix("_rgb.png")
-                files = (pose / f"{stem}_pose.json", semantic / f"{stem}_semantic.png")
-                pictures[match[1], room[1]].append(Picture(path, match[1] + match[2], *files))
+                pose_file = pose / f"{stem}_pose.json"
+                labels_file = semantic / f"{stem}_semantic.png"
+                picture = Picture(path, match[1] + match[2], pose_file, labels_file)
+                pictures[match[1], room[1]].append(picture)
     return pictures
 
 
