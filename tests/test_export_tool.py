@@ -182,7 +182,7 @@ def test_a_picture_stored_turned_is_left_out(run, tmp_path):
         words = ["--format", name, "--out", tmp_path / name]
         code, document, err = run(*words, results=results)
         assert (code, document["poses"]) == (1, 1)
-        assert "b.jpg: found it stored turned (EXIF orientation 6), wanted it upright" in err
+        assert "b.jpg: found it stored rotated (EXIF orientation 6), wanted it upright" in err
         words = ["--format", name, "--out", tmp_path / f"{name}-sized", "--size", "64", "32"]
         assert run(*words, results=results)[1]["poses"] == 3
 

@@ -240,7 +240,7 @@ def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys)
     assert _command(folder, *walk, "--times", _times(folder, queries)) == 0
     before = (tmp_path / "a.jsonl").read_bytes()
     assert _command(folder, *walk, "--times", "order") == 3
-    assert "--overwrite starts again" in capsys.readouterr().err
+    assert "use --overwrite to start again" in capsys.readouterr().err
     assert (tmp_path / "a.jsonl").read_bytes() == before
     assert _command(folder, *walk, "--times", "order", "--overwrite") == 0
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the method, write the page of figures, and learn the confidence."""
+"""Measure the method, write BENCHMARK.md, and fit the confidence."""
 
 import argparse
 import sys

@@ -43,8 +43,8 @@ def new_parser(
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add --quiet and --debug to a parser, or to one of its subcommands."""
     unless_given = argparse.SUPPRESS  # a subcommand keeps what stood before it
-    option(parser, "--quiet", "nothing on stderr but errors", default=unless_given)
-    option(parser, "--debug", "show the traceback of an error", default=unless_given)
+    option(parser, "--quiet", "print only errors to stderr", default=unless_given)
+    option(parser, "--debug", "print the traceback of an error", default=unless_given)
 
 
 def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:

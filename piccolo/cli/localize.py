@@ -211,12 +211,18 @@ def finish(
         num_dropped = records.finish(file, keeps_others=run.total is None)
     if run.total != 1 or run.left_out or num_dropped:
         words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
-        again = ", which the same command tries again" if counts[FAILED] else ""
+        again = ", which the same command will try again" if counts[FAILED] else ""
         note = f"{counts.total()} panoramas in {seconds:.0f} s: {words}{again}"
-        dropped = f"dropped {num_dropped} results of panoramas not named any more" if num_dropped else ""
+        dropped = (
+            f"dropped {num_dropped} results of panoramas that are no longer given" if num_dropped else ""
+        )
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
     if interruption.number:
-        how = "the same command goes on from here" if file else "with --out FILE the same command goes on"
+        how = (
+            "the same command continues from here"
+            if file
+            else "with --out FILE the same command would continue"
+        )
         return interruption.stop(arguments, f"{counts.total()} results", how)
     if run.total is None:
         note_unused_priors(arguments, run.localizer)

@@ -34,18 +34,20 @@ examples:
 experiments:
 {_EXPERIMENTS}
 
-Writes OUT/NAME.md and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
-The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
+Writes the table OUT/NAME.md and the runs OUT/NAME/CONDITION_PRESET.jsonl, for tools/evaluate.py --compare.
+A repeated command resumes a stopped experiment. Modified clouds and images are temporary files.
 """
 PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser.add_argument("names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="see below")
-    option(parser, "--scenes FOLDER ...", required=True)
-    option(parser, "--out FOLDER", "made if it is not there", required=True)
-    option(parser, "--variants NAME ...", "only these splits", default=[])
+    parser.add_argument(
+        "names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="experiments, see below"
+    )
+    option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
+    option(parser, "--out FOLDER", "folder of the tables and runs; created if missing", required=True)
+    option(parser, "--variants NAME ...", "only these splits of the data", default=[])
     option(parser, "--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
     add_execution_options(parser, default_jobs=1)
     parser.set_defaults(mask=None)

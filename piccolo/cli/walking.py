@@ -75,7 +75,7 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
         "--walk, --video: wanted --walk with --pano, or --video alone": is_video == bool(arguments.pano),
         "--walk: found names on stdin, wanted files or folders": is_from_stdin(arguments.pano),
         "--every: only with --video": not is_video and arguments.every is not None,
-        "--times: not with --video, which knows its times": is_video and arguments.times is not None,
+        "--times: not with --video, which contains its times": is_video and arguments.times is not None,
     }
     for name in NOT_WITH:
         wrong[f"--{name.replace('_', '-')}: not with a walk"] = getattr(arguments, name) not in (None, False)
@@ -141,7 +141,9 @@ def run_walk(
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
         if interruption.number:
             how = (
-                "the same command goes on" if frames_file(arguments.out) else "with --out FILE it would go on"
+                "the same command continues"
+                if frames_file(arguments.out)
+                else "with --out FILE it would continue"
             )
             return interruption.stop(arguments, f"{len(walk.taken)} frames", how)
         results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
@@ -219,7 +221,7 @@ def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, key: str, i
     lines = whole_lines(path, size)
     first = next(lines, b"")
     if first.strip() not in (b"", key.encode()):
-        raise InputError(f"{path}: of a walk with other settings, another scan or version; {WAYS}")
+        raise InputError(f"{path}: found a walk with other settings, another scan or version; {WAYS}")
     kept = len(first)
     for frame, line in zip(frames, lines, strict=False):
         try:

@@ -87,7 +87,7 @@ class Workers:
     def __post_init__(self) -> None:
         """Refuse a count that means nothing."""
         if not 1 <= self.num_threads <= MAX_THREADS:
-            raise InputError(f"num_threads: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
+            raise InputError(f"`num_threads`: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 
     def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> list[Value]:
         """Return function(item) of each item, in order; within another call's function one after another.

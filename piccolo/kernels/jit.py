@@ -55,7 +55,7 @@ def kernel_folder() -> Path | None:
         folder = own_folder(cache_root() / "kernels", NAME, PRIVATE)
         if is_own(folder.stat(), WRITABLE):
             return folder
-        reason = f"{folder}: others may write to it; delete it"
+        reason = f"{folder}: other users may write to it; delete it"
     except OSError as error:
         reason = in_words(error)
     warn_not_kept(reason)
@@ -65,13 +65,13 @@ def kernel_folder() -> Path | None:
 @cache
 def warn_not_kept(reason: str) -> None:
     """Warn once that the next run has to compile again."""
-    log.warning("%s; compiled code is not kept, and each run takes half a minute more", reason)
+    log.warning("%s; compiled code is not kept, and each run takes half a minute longer", reason)
 
 
 @cache
 def warn_damaged(folder: Path) -> None:
     """Warn once, however many files are damaged."""
-    log.warning("%s: damaged compiled code; it is compiled anew", folder)
+    log.warning("%s: damaged compiled code; it is compiled again", folder)
 
 
 @cache

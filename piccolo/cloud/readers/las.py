@@ -306,7 +306,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         path,
         lambda: (_read_colors(header, records, is_8_bit) for records in _chunks(header, layout)),
         header.num_points,
-        (f"{note} (largest value {brightest} in {num_samples} points looked at)",) if is_8_bit else (),
+        (f"{note} (largest value {brightest} in {num_samples} points checked)",) if is_8_bit else (),
     )
 
 
@@ -314,12 +314,12 @@ def _gray_source(
     header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
 ) -> PointSource:
     if not options.intensity_as_gray:
-        why = f"red green blue are 0 in all {num_samples} points looked at"
+        why = f"red green blue are 0 in all {num_samples} points checked"
         if not header.has_colors:
             why = f"point format {header.point_format} has intensity only"
         largest, num_samples = _largest(header, layout, "intensity")
         if largest == 0:
-            why += f"; its intensity is 0 in all {num_samples} points looked at"
+            why += f"; its intensity is 0 in all {num_samples} points checked"
             raise InputError(f"{header.path}: has neither colours nor intensity: {why}, {WANTED}")
         raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
     read_chunks = intensity_reader(header.path, lambda: _read_scalar(header, layout, "intensity"))

@@ -138,17 +138,17 @@ def plan_building(size: Array, num_rooms: int, num_storeys: int) -> Plan:
     size = np.asarray(size, float)
     if not ((size >= MIN_ROOM) & (size <= MAX_SIZE)).all():
         wanted = f"wanted {list(MIN_ROOM)} to {MAX_SIZE} m in a building"
-        raise InputError(f"size: found {size.tolist()}, {wanted}")
+        raise InputError(f"`size`: found {size.tolist()}, {wanted}")
     if not 1 <= num_storeys <= MAX_STOREYS:
-        raise InputError(f"storeys: found {num_storeys}, wanted 1 to {MAX_STOREYS}")
+        raise InputError(f"`storeys`: found {num_storeys}, wanted 1 to {MAX_STOREYS}")
     if not num_storeys <= num_rooms <= MAX_ROOMS:
-        raise InputError(f"rooms: found {num_rooms}, wanted one a storey to {MAX_ROOMS}")
+        raise InputError(f"`rooms`: found {num_rooms}, wanted one per storey to {MAX_ROOMS}")
     per_storey = -(-num_rooms // num_storeys)
     num_corridors = -(-per_storey // (2 * COLUMNS))
     plan = Plan(size, num_rooms, num_storeys, num_corridors, -(-per_storey // (2 * num_corridors)))
     if num_storeys > 1 and 2.0 * FLIGHT_BEGIN + plan.flight(0).run > plan.num_corridors * plan.depth:
         raise InputError(
-            f"size: rooms of {size.tolist()} m are too high for stairs in the halls between them"
+            f"`size`: rooms of {size.tolist()} m are too high for stairs in the halls between them"
         )
     return plan
 
@@ -157,7 +157,7 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
     """Make a building of rooms of `size` (3,) [m]; a fraction `twins` of them are exact copies of others."""
     plan = plan_building(size, num_rooms, num_storeys)
     if not 0.0 <= twins < 1.0:
-        raise InputError(f"twins: found {twins}, wanted at least 0 and less than 1")
+        raise InputError(f"`twins`: found {twins}, wanted at least 0 and less than 1")
     rng = np.random.default_rng([seed, 50])
     copies = np.arange(num_rooms)
     order = rng.permutation(num_rooms)

@@ -41,13 +41,15 @@ class WalkOptions:
     def __post_init__(self) -> None:
         """Refuse what means nothing."""
         if self.variant not in WALK_VARIANTS:
-            raise InputError(f"variants: found {self.variant}, wanted {' or '.join(WALK_VARIANTS)} in a walk")
+            raise InputError(
+                f"`variants`: found {self.variant}, wanted {' or '.join(WALK_VARIANTS)} in a walk"
+            )
         if not 0.1 <= self.rate <= 120.0:
-            raise InputError(f"frame-rate: found {self.rate}, wanted 0.1 to 120 a second")
+            raise InputError(f"`frame_rate`: found {self.rate}, wanted 0.1 to 120 per second")
         if not 0.0 <= self.bad_fraction <= 1.0:
-            raise InputError(f"bad-frames: found {self.bad_fraction}, wanted 0 to 1")
+            raise InputError(f"`bad_frames`: found {self.bad_fraction}, wanted 0 to 1")
         if not 0 <= self.num_people <= MAX_PEOPLE:
-            raise InputError(f"people: found {self.num_people}, wanted 0 to {MAX_PEOPLE}")
+            raise InputError(f"`people`: found {self.num_people}, wanted 0 to {MAX_PEOPLE}")
 
 
 class Frame(NamedTuple):

@@ -48,8 +48,8 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
         position = room.corner + rng.uniform(low, high)
         if room.clearance(position) >= MIN_CLEARANCE:
             return position
-    text = f"has no place {MIN_CLEARANCE} m from everything; use a larger one"
-    raise InputError(f"size: a room of {room.size.tolist()} m {text}")
+    text = f"has no free position {MIN_CLEARANCE} m from everything; use a larger one"
+    raise InputError(f"`size`: a room of {room.size.tolist()} m {text}")
 
 
 def scan_room(
@@ -157,9 +157,11 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     """`num_rooms` rooms of `size` (3,) [m], all different."""
     size = np.asarray(size, dtype=float)
     if not ((size >= MIN_SIZE) & (size <= MAX_SIZE)).all():  # so that NaN is refused too
-        raise InputError(f"size: {size.tolist()} is not between {MIN_SIZE} and {MAX_SIZE} m each way")
+        raise InputError(
+            f"`size`: found {size.tolist()}, wanted {MIN_SIZE} to {MAX_SIZE} m in each direction"
+        )
     if not 1 <= num_rooms <= MAX_ROOMS:
-        raise InputError(f"rooms: {num_rooms} is not between 1 and {MAX_ROOMS}")
+        raise InputError(f"`rooms`: found {num_rooms}, wanted 1 to {MAX_ROOMS}")
     columns = int(np.ceil(np.sqrt(num_rooms)))
     rooms = []
     for k in range(num_rooms):
@@ -189,7 +191,7 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
 def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, np.random.Generator]:
     """Return room, camera pose and random generator of query number `index` of a variant."""
     if variant not in VARIANTS:
-        raise InputError(f"variant: {variant!r} is not one of {', '.join(VARIANTS)}")
+        raise InputError(f"variant: found {variant!r}, wanted one of {', '.join(VARIANTS)}")
     rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
     number = int(rng.integers(len(world.rooms)))
     room = world.rooms[number]
