@@ -1,4 +1,4 @@
-"""Turn a coloured scan so that z is up: find up, write the cloud and the 4 x 4 transform."""
+"""Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
 import argparse
 import json
@@ -34,12 +34,12 @@ examples:
   python tools/align_gravity.py --cloud scan.ply --out aligned.ply --assume-nothing --pano photo.jpg
   python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
 
-The dominant planes give the vertical. Its end that is closer to the file's up axis (z, in glTF y) or to --up
-is up; the axis may be up to 15 degrees off. If the scan may have any orientation, --assume-nothing decides by
-furniture and free space, and --pano by a photo. If up remains unknown, nothing is written. Otherwise the
-cloud is written as binary PLY in the unit of the scan, with the transform next to it: aligned.txt, four rows
-of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). A single PLY file keeps its other
-properties and faces. Prints one JSON object to stdout; without --out, nothing else is written.
+The dominant planes give the vertical; of its two directions, the one closer to the file's up axis (z, in glTF
+y) or to --up is up. The axis may be up to 15 degrees off. If the scan may have any orientation,
+--assume-nothing decides by furniture and free space, and --pano by a photo. If up remains unknown, nothing is
+written. Otherwise the cloud is written as binary PLY in the unit of the scan, with the transform next to it:
+aligned.txt, four rows of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). A single PLY file
+keeps its other properties and faces. Prints one JSON object to stdout; without --out, this is all.
 """
 
 

@@ -1,4 +1,4 @@
-"""Localize the panoramas of scenes with true poses, and measure how good the poses are."""
+"""Localize the panoramas of scenes with true poses, and measure the errors of the poses."""
 
 import argparse
 import json
@@ -63,8 +63,8 @@ Scenes are folders with a queries.json, a cloud and images, at any depth below -
 stopped run. --results are lines of localize.py instead; each belongs to the query with the same path, or else
 with the same file name. Tables are Markdown on stdout (on stderr if one of the files is stdout).
 For walks (make_room.py --walk) there is a table with a line per walk. ATE and RPE are defined as in evo, over
-localized frames, without alignment; RPE leaves out steps across other frames. A query without a true pose is
-correct if it is not localized.
+localized frames, without alignment; RPE leaves out steps across other frames. A query with
+"answerable": false is correct if it is not localized.
 Queries that can't be read and --results without a query are named on stderr; the others are still evaluated,
 and the exit code is 3.
 """
@@ -82,8 +82,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--force", "also take --results of other clouds than the scene's")
     option(group, "--cache FOLDER", CACHE_TEXT)
     group = parser.add_argument_group("tables and plots")
-    option(group, "--max-distance M", "a correct pose has a smaller position error", default=0.1)
-    option(group, "--max-angle DEG", "and a smaller rotation error", default=5.0)
+    option(group, "--max-distance M", "position error below which a pose is correct [m]", default=0.1)
+    option(group, "--max-angle DEG", "rotation error below which a pose is correct", default=5.0)
     option(group, "--csv FILE", "write a line per query; - is stdout, also for the other files")
     option(group, "--markdown FILE", "write the tables to this file too")
     option(group, "--errors PNG", "plot: fraction of queries below each error, and recall over thresholds")

@@ -1,4 +1,4 @@
-"""Write the poses of localize.py as files of other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
+"""Write the poses of localize.py for other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""Draw the sampling loss over a plan of the cloud: its least value over height and rotation at each place."""
+"""Draw the sampling loss on a plan of the cloud: its minimum over height and rotation at each position."""
 
 import argparse
 import json

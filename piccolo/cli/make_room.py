@@ -1,4 +1,4 @@
-"""Make a seeded furnished room: a coloured scan of it, and panoramas with true poses."""
+"""Make a synthetic furnished room from a seed: a coloured scan, and panoramas with true poses."""
 
 import argparse
 import itertools
@@ -109,9 +109,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--frame-rate HZ", "frames per second", default=2.0)
     option(group, "--people N", "number of people who walk along with the camera", default=0)
     option(group, "--blur", "add motion blur")
-    option(
-        group, "--bad-frames FRACTION", f"fraction of the frames that are {', '.join(BAD_KINDS)}", default=0.0
-    )
+    option(group, "--bad-frames FRACTION", f"fraction of bad frames: {', '.join(BAD_KINDS)}", default=0.0)
     option(group, "--video", "also write FOLDER/VARIANT_walk_K.mp4")
 
 

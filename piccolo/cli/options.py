@@ -183,7 +183,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     text = (
         f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file with "
     )
-    text += f"the columns name and time [s] (default {EXIF} if all frames have different times in it, else {ORDER})"
+    text += f"the columns name and time [s] (default {EXIF} if its times differ, else {ORDER})"
     option(group, "--times SOURCE", text)
     text = f"maximum speed of the camera [m/s] (default {MAX_SPEED:g}); if only the order is known, "
     option(group, "--max-speed X", text + "maximum distance between frames [m] (default: estimated)")

@@ -1,4 +1,4 @@
-"""Prepare a cloud once: the map file that localize.py takes in place of the cloud."""
+"""Prepare the map of a cloud: a file that localize.py takes instead of the cloud."""
 
 import argparse
 import json
@@ -21,7 +21,7 @@ example:
   python tools/prepare_map.py --add house.map --cloud 2.e57 --name "Storey 2" --out house.map
   python localize.py --cloud house.map --pano query.jpg --within "Storey 2"
 
-localize.py prepares and caches maps by itself; use this tool to copy a map, or to prepare it beforehand.
+localize.py prepares and caches maps by itself; use this tool to keep a map as a file, or to make it earlier.
 Prints one JSON object that describes the map to stdout.
 """
 

@@ -1,4 +1,4 @@
-"""Write a page of results: plans of the storeys, the photos as spheres, and the scan from the poses found."""
+"""Write a web page of results: plans of the storeys, photos as spheres, the scan seen from their poses."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""The paper's experiments on scenes with true poses: a table beside the paper's figures."""
+"""Run the paper's experiments on scenes with true poses, and compare the results with its figures."""
 
 import argparse
 import tempfile

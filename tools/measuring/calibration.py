@@ -1,4 +1,4 @@
-"""Learn the confidence from trials, and check it, and the covariances, on others."""
+"""Fit the confidence to trials, and check it and the covariances on others."""
 
 import argparse
 import json

@@ -1,4 +1,4 @@
-"""Measure accuracy, damage, phone photos, time and memory, and write all of it as one page of Markdown."""
+"""Measure accuracy, damage, phone photos, time and memory, and write them as one page of Markdown."""
 
 import argparse
 import datetime
@@ -43,8 +43,8 @@ examples:
   python tools/benchmark.py all --scenes BENCH/house --only kernels
 
 A folder has cloud.ply, images, and queries.json with true poses. If it has cameras/, its pictures are photos,
-each with a calibration cameras/NAME.camera.json; else they are panoramas. Damage and phone photos are made of
-the panoramas of the variant clean, or of all if there is none.
+each with a calibration cameras/NAME.camera.json; else they are panoramas. Damaged pictures and phone photos
+are made from the panoramas of the variant clean, or of all if there is none.
 """
 ROOT = Path(__file__).resolve().parents[2]
 PAPER_SETTINGS = PaperSettings()
