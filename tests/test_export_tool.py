@@ -130,7 +130,7 @@ def test_two_results_of_one_picture_are_refused_where_the_name_is_the_key(run, t
     out = tmp_path / "out"
     code, _, err = run("--format", "opensfm", "--size", "64", "32", "--out", out, results=results)
     assert code == 3
-    assert "p/a.jpg: has two results (clouds a.ply, b.ply); --cloud chooses one" in err
+    assert "p/a.jpg: has two results (clouds a.ply, b.ply); choose one with --cloud" in err
     assert run("--format", "csv", "--out", out, results=results)[1]["poses"] == 2
 
 

@@ -65,7 +65,7 @@ def test_two_far_strays_change_little():
 def test_a_bare_room_may_be_upside_down(w):
     up, reason = up_of(bare_room(), w)
     assert up is None
-    assert reason == "floor and ceiling look alike: furniture +0.0, free ways +0.0"
+    assert reason == "floor and ceiling look alike: furniture +0.0, free space +0.0"
 
 
 def roofs():

@@ -131,7 +131,7 @@ def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(
         assert _command(folder, *command) == 3
     results = read_results([out])
     assert [r.status for r in results] == ["localized", "failed", "localized"]
-    assert "may be taken" in results[1].error
+    assert "may be used" in results[1].error
     assert _command(folder, *command, "--min-confidence", "0.7") == 3
     prepared, prepare = [], Walk.prepare
     monkeypatch.setattr(Walk, "prepare", lambda self, *a: prepared.append(a[1]) or prepare(self, *a))

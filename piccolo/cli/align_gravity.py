@@ -81,7 +81,7 @@ def find_known_up(
     if not arguments.assume_nothing:
         named = R_z_from_axis(arguments.up, cloud.up)[2]
         if arguments.up == "auto" and evident is not None and evident @ named < np.cos(MAX_LEAN):
-            return None, f"the floors do not face {cloud.up}, by their {reason}"
+            return None, f"the floors do not face {cloud.up} ({reason})"
         return named, "up is the named axis"
     scanners = cloud.station_axes
     if len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):

@@ -90,7 +90,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
         yield f"left out {num_left_out} of {num_left_out + len(selection.results)} results: {reasons}"
     if (num_clouds := len(selection.clouds)) > 1:
-        yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
+        yield f"poses in {num_clouds} clouds are assumed to be in one coordinate system; --cloud selects"
 
 
 def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:

@@ -114,7 +114,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not (arguments.out or arguments.animate):
         raise InputError("give --out, --animate or both")
     if (arguments.depth or arguments.mask_out) and (not arguments.out or is_folder(arguments.out)):
-        raise InputError("--depth, --mask-out: work with a single picture only, --out FILE")
+        raise InputError("--depth, --mask-out: only with a single picture, --out FILE")
     if not MIN_WIDTH <= arguments.width <= MAX_WIDTH or arguments.width % 2:
         raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
     for name, path in outputs_of(arguments).items():
@@ -257,7 +257,7 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
     """Write the descent towards the pose; one JSON line."""
     ((name, pose, camera),) = poses
     if camera is not None:
-        raise InputError(f"{name}: found a photo by the model {camera.model}, --animate wanted a sphere")
+        raise InputError(f"{name}: found the camera model {camera.model}, wanted a sphere for --animate")
     panorama = shrink(read_panorama(find_photo(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
     start = perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)

@@ -183,7 +183,7 @@ def find_sense(
     # the least lesser cue: in high storeys, whose trusses look like tables, both cues must agree
     least = 0.3 if np.diff(levels).max() > 4.0 else -0.5
     is_plain = sense * cues.sum() > 1.0 and (sense * cues).min() > least
-    reason = "furniture {:+.1f}, free ways {:+.1f}".format(*sense * cues)
+    reason = "furniture {:+.1f}, free space {:+.1f}".format(*sense * cues)
     return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
 
 

@@ -102,7 +102,7 @@ class Compiling:
         now = time.monotonic()
         if now - self.quiet_since >= QUIET_S:
             self.quiet_since = now
-            log.info("compiling kernels, once: %d so far, half a minute in all", self.count)
+            log.info("compiling kernels (only once): %d so far, half a minute in total", self.count)
 
 
 compiling = Compiling()

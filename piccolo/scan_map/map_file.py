@@ -34,7 +34,7 @@ NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
-WANTED = "wanted a whole map by tools/prepare_map.py"
+WANTED = "wanted a whole map of tools/prepare_map.py"
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:

@@ -102,7 +102,7 @@ def extend_map(
     """Return a prepared map with another scan added; a scan without a name is named after the map's file."""
     if not find_prepared_map([map_path]):
         found = "no prepared map" if map_path.exists() else "no such file"
-        raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
+        raise InputError(f"{map_path}: found {found}, wanted a map of tools/prepare_map.py")
     if path := find_prepared_map(paths):
         raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
     if cloud_settings.up != "auto":
