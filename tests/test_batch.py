@@ -109,7 +109,7 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, cap
         (["--height", "0.5", "2"], "line 1: made with prior"),
         (["--cloud", "other"], "line 1: made with another scan, or the scan has changed since"),
         (["--pano", "clean_1.jpg"], "it has no result of the panoramas given"),
-        (b"some notes of the user\n", "line 1: no result of localize.py"),
+        (b"some notes of the user\n", "line 1: not a result of localize.py"),
         (b"notes without an end", "its last line does not belong to results"),
         (b'{"format": "piccolo-pose/3"}\n', "line 1: found format 'piccolo-pose/3'"),
     ],

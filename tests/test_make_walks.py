@@ -85,7 +85,7 @@ def test_a_building_without_a_walk_has_single_panoramas(tmp_path, capsys):
         ("--storeys 5", "--storeys: found 5, wanted 1 to 4"),
         ("--storeys 3", "--rooms: found 2, wanted one per storey to 256"),
         ("--storeys 1 --size 2.5 4 3", "--size: found [2.5, 4.0, 3.0], wanted [2.6, 2.6, 2.3] to 50.0 m"),
-        ("--storeys 2 --size 4 4 9", "size: rooms of [4.0, 4.0, 9.0] m are too high for stairs"),
+        ("--storeys 2 --size 4 4 9", "--size: rooms of [4.0, 4.0, 9.0] m are too high for stairs"),
     ],
 )
 def test_command_line_refuses_in_one_line_before_anything_is_written(words, message, tmp_path, capsys):
