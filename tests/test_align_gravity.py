@@ -293,5 +293,5 @@ def test_a_cloud_on_stdout_and_nothing_beside_it(tilted, tmp_path, capfdbinary):
     assert align_gravity.main(["--cloud", str(tilted), "--up", "z", "--out", "-", "--quiet"]) == 0
     assert capfdbinary.readouterr() == (out.read_bytes(), b"")
     assert align_gravity.main(["--cloud", str(tilted), "--out", "-", "--queries", "q.json"]) == 2
-    assert b"--queries: nothing can be written beside --out -" in capfdbinary.readouterr().err
+    assert b"--queries: nothing can be written next to --out -" in capfdbinary.readouterr().err
     assert not Path("-.txt").exists()

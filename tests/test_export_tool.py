@@ -56,7 +56,7 @@ def test_only_localized_poses_are_written_and_the_others_counted(run, tmp_path):
     assert (code, document["poses"]) == (0, 2)
     assert document["left_out"] == {"not_localized": 1, "ambiguous": 1, "without a pose": 1}
     assert "left out 3 of 5 results: 1 not_localized, 1 ambiguous, 1 without a pose" in err
-    assert "poses in 2 clouds are taken as in one coordinate system" in err
+    assert "poses in 2 clouds are assumed to be in one coordinate system" in err
     assert [line.split(",")[0] for line in lines_of(tmp_path / "p.csv")[1:]] == ["p/a.jpg", "p/e.jpg"]
 
 
@@ -212,7 +212,7 @@ def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
     code, document, err = run(*words, "--force", results=results)
     assert (code, document["poses"]) == (0, 3)
     assert "found 1 of 3 results of another scan" in err
-    assert "poses in 3 clouds are taken as in one coordinate system" in run(*words[:4], results=results)[2]
+    assert "poses in 3 clouds are assumed to be in one coordinate system" in run(*words[:4], results=results)[2]
 
 
 def test_damaged_results_are_refused_with_file_and_line(tmp_path):
