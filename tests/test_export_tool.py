@@ -212,7 +212,9 @@ def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
     code, document, err = run(*words, "--force", results=results)
     assert (code, document["poses"]) == (0, 3)
     assert "found 1 of 3 results of another scan" in err
-    assert "poses in 3 clouds are assumed to be in one coordinate system" in run(*words[:4], results=results)[2]
+    assert (
+        "poses in 3 clouds are assumed to be in one coordinate system" in run(*words[:4], results=results)[2]
+    )
 
 
 def test_damaged_results_are_refused_with_file_and_line(tmp_path):
