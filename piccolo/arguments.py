@@ -32,7 +32,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) 
         if name == "return" or values[name] is None:
             continue
         if not is_of_kind(values[name], kind):
-            raise InputError(f"`{name}`: found {found_text(values[name])}, wanted {describe(kind)}")
+            raise InputError(f"`{name}`: found {describe_value(values[name])}, wanted {describe(kind)}")
         given[name] = plain(values[name], kind)
     return given
 
@@ -90,7 +90,7 @@ def describe(kind: Any) -> str:
     return WORDS.get(origin, "a function" if origin is Callable else origin.__name__)
 
 
-def found_text(value: object) -> str:
+def describe_value(value: object) -> str:
     """Return a value as text for a message: of an array, dtype and shape."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"

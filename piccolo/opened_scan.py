@@ -32,8 +32,8 @@ from .scan_walk import Walk, WalkAbout, photo_facts
 from .walk.frames import Motion
 from .walk.tracker import Tracker
 
-OTHER_METHOD = "`settings`: of another method than the one that the scan was prepared for"
-LABELS_WARNING = "`labels`: the confidence was learnt on colours, and is a rough guide only"
+OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
+LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
 
@@ -69,9 +69,11 @@ class OpenedScan:
         Raises InputError for the preset paper, and for a focal length that is to be refined.
         """
         if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
-            raise InputError("walks: not of the preset paper")
+            raise InputError("walks: not available with the preset paper")
         if read_options.refine_focal:
-            raise InputError("`refine_focal`: not an option of walks; refine it with one photo")
+            raise InputError(
+                "`refine_focal`: not an option of walks; refine the focal length with a single photo"
+            )
         check_within(self.prepared, settings.prior.within)
         quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
         tracker = Tracker(self.prepared, settings, quiet, motion)

@@ -107,7 +107,7 @@ def open_scan(  # noqa: PLR0913  options by name
         cloud = stream_of_arrays(source, colors)
         return Scan(scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch()))
     if colors is not None:
-        raise InputError("colors: given beside files, wanted with an array of points only")
+        raise InputError("colors: found files, wanted an array of points")
     paths = [Path(source)] if isinstance(source, str | PathLike) else [Path(path) for path in source]
     if not paths:
         raise InputError("open_scan: found no file, wanted a scan's path")

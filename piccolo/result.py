@@ -354,7 +354,7 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
     words = f"found {len(others)} of {len(results)} results of another scan than {scan}"
     if not is_forced:
         first = f"the first of {others[0].cloud_name}"
-        raise InputError(f"{others[0].pano}: {words}, {first}, wanted this scan, or force")
+        raise InputError(f"{others[0].pano}: {words}, {first}, wanted this scan, or `force`")
     return words
 
 

@@ -203,5 +203,5 @@ class Walk:
 
 def localization_in(result: Result) -> Localization:
     """Return the localization in a result."""
-    names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras"}
+    names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras", "standings"}
     return Localization(pose=result.best_pose, **{name: getattr(result, name) for name in names})

@@ -108,10 +108,10 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, cap
         (["--gravity", "known"], "line 1: made with gravity 'auto', not 'known'"),
         (["--height", "0.5", "2"], "line 1: made with prior"),
         (["--cloud", "other"], "line 1: made with another scan, or the scan has changed since"),
-        (["--pano", "clean_1.jpg"], "none of its results is of a panorama that this command names"),
-        (b"some notes of the user\n", "line 1: no result of localize.py"),
-        (b"notes without an end", "its end is no line of results"),
-        (b'{"format": "piccolo-pose/3"}\n', "line 1: of format 'piccolo-pose/3'"),
+        (["--pano", "clean_1.jpg"], "it has no result of the panoramas given"),
+        (b"some notes of the user\n", "line 1: not a result of localize.py"),
+        (b"notes without an end", "its last line does not belong to results"),
+        (b'{"format": "piccolo-pose/3"}\n', "line 1: found format 'piccolo-pose/3'"),
     ],
 )
 def test_a_file_of_another_run_is_refused_with_both_ways(
@@ -133,7 +133,7 @@ def test_a_file_of_another_run_is_refused_with_both_ways(
     assert _run(scene, out, "--quiet", *more, pano=panos) == 3
     err = capsys.readouterr().err
     assert message in err
-    assert "--overwrite starts again, another --out keeps both" in err
+    assert "use --overwrite to start again, or another --out" in err
     assert err.count("\n") == 1
     assert out.read_bytes() == before
 
@@ -182,7 +182,7 @@ def test_photos_added_removed_or_changed_cost_only_their_own_lines(
     assert written({**first, "a.jpg": images[2], "c.jpg": images[0]})[0] == ["a.jpg", "c.jpg"]
     done, err = written({"d.jpg": images[1], "c.jpg": images[2]})
     assert done == ["c.jpg"]
-    assert "; dropped 2 results of panoramas not named any more\n" in err
+    assert "; dropped 2 results of panoramas that are no longer given\n" in err
     names = [str(photos / name) for name in ("d.jpg", "c.jpg", "d.jpg")]
     assert written({"d.jpg": images[1], "c.jpg": images[2]}, *names)[0] == ["d.jpg"]
     before = _lines(out)
@@ -235,7 +235,7 @@ def test_what_the_system_did_to_a_photo_is_tried_again(scene, out, counted, monk
     Short.errors.update({names[0]: MemoryError(), names[2]: OSError(errno.EIO, "Input/output error", "x")})
     assert _run(scene, out, *PAPER) == 3
     err = capsys.readouterr().err
-    assert "0 unreadable, 2 failed, which the same command tries again" in err
+    assert "0 unreadable, 2 failed, which the same command will try again" in err
     assert "not enough memory (none is left)" in err
     assert [line["status"] == "failed" for line in _lines(out)] == [True, False, True]
     counted.clear()
@@ -305,7 +305,7 @@ def test_files_left_out_are_counted_and_links_to_folders_searched(scene, tmp_pat
     for name in ("a.GIF", "b.gif", "c.bmp", "d"):
         (photos / name).touch()
     assert _run(scene, out, *PAPER, pano=[str(photos)]) < 2
-    assert "; 5 files left out: 2 without an ending, 2 .gif, 1 .bmp\n" in capsys.readouterr().err
+    assert "; 5 files left out: 2 without a suffix, 2 .gif, 1 .bmp\n" in capsys.readouterr().err
     (tmp_path / "few").mkdir()
     for name in "abcdefg":
         (tmp_path / "few" / f"x.{name}").touch()
@@ -322,7 +322,7 @@ def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):
         process.send_signal(signal.SIGINT)
         err = process.stderr.read()
     assert process.returncode == 130
-    assert "the same command goes on from here" in err
+    assert "the same command continues from here" in err
     assert "Traceback" not in err
     assert 1 <= len(_lines(out)) < 30
     assert out.read_bytes().endswith(b"\n")
@@ -382,7 +382,7 @@ def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, out, capsy
     table.write_text(f"name,x,y,radius,height\n{rows}")
     assert _run(scene, out, "--priors", str(table), "--height", "0.2", "2.2") == 0
     err = capsys.readouterr().err
-    assert "1 names of no panorama here, such as clean_9.jpg" in err.splitlines()[0]  # before the work
+    assert "1 names without a panorama, such as clean_9.jpg" in err.splitlines()[0]  # before the work
     assert "%|" not in err  # a bar is for a terminal
     priors = [line["settings"]["prior"] for line in _lines(out)]
     assert priors[0]["near_world"] == [x, y, None]

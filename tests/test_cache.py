@@ -71,7 +71,7 @@ def test_a_folder_that_others_may_have_filled_is_not_trusted(folders, monkeypatc
     if how == "of another":
         uid = os.getuid()
         monkeypatch.setattr(os, "getuid", iter([uid, uid + 1]).__next__)
-    with pytest.raises(OSError, match=r"others may write to it|File exists"):
+    with pytest.raises(OSError, match=r"other users may write to it|File exists"):
         _root()
     folders[1].chmod(0o1777)
     if how == "replaceable":
@@ -86,7 +86,7 @@ def test_a_users_cache_that_others_may_write_to_is_told_and_left(
     (tmp_path / "piccolo").mkdir()
     (tmp_path / "piccolo").chmod(mode)
     assert _root().parent == folders[1]
-    assert "others may write to it, and nothing there is trusted" in caplog.text
+    assert "other users may write to it, so it is not used" in caplog.text
 
 
 @pytest.mark.parametrize("how", ["open to the group", "a file", "no place", "full disk"])
@@ -108,7 +108,7 @@ def test_where_no_kernel_can_be_kept_one_warning_says_so(folders, tmp_path, monk
         compiled = kernel(eval(f"lambda {name}: {name} + 1"))
         assert compiled(np.float64(3.0)) == 4.0
     (warning,) = [record.getMessage() for record in caplog.records]
-    assert warning.endswith("compiled code is not kept, and each run takes half a minute more")
+    assert warning.endswith("compiled code is not kept, and each run takes half a minute longer")
     assert not list(root.rglob("*.kernel"))
 
 
@@ -177,7 +177,7 @@ def test_damaged_compiled_code_is_noticed_and_made_anew(tmp_path, monkeypatch, c
     assert anew(values) == 10.0
     assert sum(anew.stats.cache_misses.values()) == 1
     assert kernel(total)(values) == 10.0  # it was written anew
-    text = "damaged compiled code; it is compiled anew"
+    text = "damaged compiled code; it is compiled again"
     assert [record.getMessage() for record in caplog.records] == [f"{tmp_path}: {text}"]
     other = path.with_name(32 * "0" + ".kernel")
     damaged = [b"", whole[: jit.DIGEST_SIZE], whole[:-1], whole + b"0"]
@@ -237,7 +237,7 @@ def test_where_numba_is_not_as_it_was_kernels_are_compiled(tmp_path, monkeypatch
     assert kernel(total)(values) == 10.0
     (warning,) = [record.getMessage() for record in caplog.records]
     assert warning.startswith(f"Numba {numba.__version__}: ")
-    assert warning.endswith("compiled code is not kept, and each run takes half a minute more")
+    assert warning.endswith("compiled code is not kept, and each run takes half a minute longer")
 
 
 def test_bounds_are_checked_where_code_without_is_kept(tmp_path, monkeypatch):
@@ -265,11 +265,11 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     monkeypatch.setattr(jit.time, "monotonic", lambda: next(seconds))
     for is_quiet in (False, True):
         compiling = jit.Compiling()
-        with progress.log_shown(is_quiet):
+        with progress.showing_log(is_quiet):
             compiling.start()
             compiling.finish()
             compiling.finish()
-        text = "compiling kernels, once: 2 so far, half a minute in all\n"
+        text = "compiling kernels (only once): 2 so far, half a minute in total\n"
         assert capsys.readouterr().err == ("" if is_quiet else text)
         seconds = iter([10.0, 11.0, 14.0])
     assert logging.getLogger("piccolo").level == logging.NOTSET

@@ -280,6 +280,6 @@ def test_a_rig_says_how_far_apart_its_cameras_are(tmp_path):
     far = [Mount(m.camera, m.R_lens_from_cam, (0.0, 0.2, 0.0), image=m.image) for m in four_sides()[:2]]
     folder = write_instant(tmp_path / "1", far, this, pose)
     (note,) = read_panorama(folder, calibrated(far)).warnings
-    assert note == "the rig's cameras are up to 0.20 m from its origin: near things come out displaced"
+    assert note == "the rig's cameras are up to 0.20 m from its origin: near objects appear displaced"
     (folder / "1.png").unlink()
     assert_refused("found 0 pictures for the camera '1.png' of made", read_panorama, folder, calibrated(far))

@@ -88,7 +88,7 @@ def test_8_bit_colors_in_16_bit_fields_are_told_of(tmp_path, is_compressed):
     path = write(tmp_path, laz_bytes(content, 100) if is_compressed else content)
     assert open_source(path).warnings == (
         f"{path}: the colours are read as 8-bit values in 16-bit fields (largest value {RAW.colors.max()} in "
-        "1200 points looked at)",
+        "1200 points checked)",
     )
     assert_read_as_written(path)
 
@@ -126,7 +126,7 @@ def test_an_intensity_of_0_is_not_recommended(tmp_path, point_format):
             why = "point format" if point_format in (1, 6) else "red green blue are 0 in all 1200 points"
             assert why in str(error.value)
             assert ("`intensity_as_gray`" in str(error.value)) == is_there
-            assert ("its intensity is 0 in all 1200 points looked at, wanted" in str(error.value)) != is_there
+            assert ("its intensity is 0 in all 1200 points checked, wanted" in str(error.value)) != is_there
 
 
 def patched(content, position, form, value):
@@ -150,7 +150,7 @@ CUT = "the file is cut off or broken"
         (RECORD_SIZE, "<H", 33, "records of 33 bytes, wanted 34 or more in point format 3"),
         (COUNT, "<I", 1201, f"promises 1201 points of 34 bytes, found room for 1200; {CUT}"),
         (COUNT, "<I", 0, "promises 0 points"),
-        (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale of 0"),
+        (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale 0"),
         (SCALE_X + 24, "<d", float("inf"), r"offsets \[ *inf"),
     ],
 )

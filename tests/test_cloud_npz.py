@@ -205,4 +205,4 @@ def test_a_damaged_map_is_still_a_map(tmp_path):
         assert is_map_file(path)
     path.write_bytes(content[: len(content) // 2])
     assert is_map_file(path)
-    assert_refused(r"wanted a whole map by tools/prepare_map.py", load_map, path)
+    assert_refused(r"wanted a whole map of tools/prepare_map.py", load_map, path)

@@ -162,8 +162,8 @@ def test_floors_on_edge_are_told_and_nothing_is_turned_but_by_word(up):
     assert np.array_equal(scan_map.R_map_from_world, LEVEL) == (up != "-y")
     if up == "auto":
         (warning,) = scan_map.warnings
-        assert warning.startswith("the floors face 90 deg away from z, which is taken for up (furniture +")
-        assert warning.endswith("; set `up` to -y, or turn the scan by tools/align_gravity.py")
+        assert warning.startswith("the floors face 90 deg away from z, which is used as up (furniture +")
+        assert warning.endswith("; set `up` to -y, or rotate the scan with tools/align_gravity.py")
     else:
         assert scan_map.warnings == ()
 

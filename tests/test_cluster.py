@@ -63,7 +63,7 @@ def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_pa
         os.killpg(process.pid, signal.SIGINT)
         err = process.stderr.read()
         assert process.wait() == 130
-    assert "ended by Ctrl-C after 8 results; the same command goes on from here" in err
+    assert "ended by Ctrl-C after 8 results; the same command continues from here" in err
     assert "Traceback" not in err
     assert localize.main([*words, "--pano", *names, "--jobs", "1"]) == 3
     assert untimed(out) == untimed(whole)
@@ -95,7 +95,7 @@ def test_an_evaluation_on_a_cluster_gives_the_same(scene, scheduler, tmp_path, m
     assert untimed(outs[0]) == untimed(outs[1])
     monkeypatch.setattr(cluster.Cluster, "has_files", lambda *_: False)
     assert evaluate.main([*words, "--out", str(tmp_path / "c"), "--dask", str(scheduler)]) == 3
-    assert "not all workers see" in capsys.readouterr().err
+    assert "not all workers can read" in capsys.readouterr().err
 
 
 def test_a_cluster_that_is_none_is_told_in_one_line(scene, tmp_path, monkeypatch, capsys):

@@ -118,7 +118,7 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
     ("error", "code", "text"),
     [
         (UsageError("--a: wrong"), 2, "--a: wrong"),
-        (InputError("a: wanted a map by tools/prepare_map.py"), 3, "a: wanted a map by piccolo-prepare-map"),
+        (InputError("a: wanted a map of tools/prepare_map.py"), 3, "a: wanted a map of piccolo-prepare-map"),
         (FileNotFoundError(2, "No such file", "b.ply"), 3, "b.ply: cannot be used (No such file)"),
         (KeyboardInterrupt(), 130, "interrupted"),
         (ZeroDivisionError("c"), 4, "internal error: ZeroDivisionError('c'); --debug shows where"),

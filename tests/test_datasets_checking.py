@@ -39,6 +39,6 @@ def test_more_than_half_must_fit_and_advice_names_the_way_that_fits_most():
     assert not checking.Check((fit(0.3, "axes are x", 0.4),)).is_passed
     wrong = fit(0.02, "the camera's x, y, z are z, x, y", 0.6)
     advice = checking.Check((wrong, wrong, fit(0.1))).advice
-    assert "scores 0.02, 0.02, 0.10, wanted 0.1 and more; 0.60 if the camera's x, y, z are z, x, y" in advice
+    assert "scores 0.02, 0.02, 0.10, wanted 0.1 or more; 0.60 if the camera's x, y, z are z, x, y" in advice
     fits = wrong, fit(0.02), fit(0.05, "others", 0.06)
     assert checking.Check(fits).advice.endswith("no other axes fit better")

@@ -85,7 +85,7 @@ def test_trajectory_with_pictures_named_by_time(folder, tmp_path, capsys):
     code, (line,), _ = made.run(capsys, "generic", folder, tmp_path / "out", "--axes", "optical")
     assert (code, line["queries"]) == (0, 1)
     made.assert_fits(tmp_path / "out" / "my photos")
-    made.assert_refused("in the list or by --axes", capsys, "generic", folder, tmp_path / "out2")
+    made.assert_refused("in the list, or as --axes", capsys, "generic", folder, tmp_path / "out2")
     (folder / "poses.txt").write_text("1 2 3\n")
     assert "found '1 2 3', wanted timestamp tx" in made.run(capsys, "generic", folder, tmp_path / "out2")[2]
     (folder / "images").rename(folder / "pictures")

@@ -155,7 +155,7 @@ def test_refused_folders(dataset, tmp_path, capsys):
     made.assert_refused("found no room with panoramas", *where[:2], tmp_path, where[3])
     made.assert_refused("found no office_9, wanted one of office_1", *where, "--rooms", "office_9")
     (dataset / "Stanford3dDataset_v1.2").rename(dataset / "Stanford3dDataset_v1.2_Aligned_Version")
-    made.assert_refused("turned one by one", *where)
+    made.assert_refused("rotated one by one", *where)
 
 
 def test_rooms_without_a_cloud_are_counted(dataset, tmp_path, capsys):

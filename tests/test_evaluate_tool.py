@@ -152,8 +152,8 @@ def test_refusals(scenes, tmp_path, capsys):
     other.touch()
     run = ["--scenes", scenes, "--out", tmp_path / "c"]
     for code, words, message in (
-        (2, ["--out", "x"], "--scenes goes with --out or --results"),
-        (2, ["--scenes", "x", "--compare", "a", "b"], "--scenes goes with --out or --results"),
+        (2, ["--out", "x"], "--scenes: needed with --out and --results"),
+        (2, ["--scenes", "x", "--compare", "a", "b"], "--scenes: needed with --out and --results"),
         (2, [*run, "--jobs", 0], "--jobs: found 0"),
         (2, [*run, "--max-distance", -1], "--max-distance, --max-angle: wanted numbers above 0"),
         (2, ["--compare", "a", "b", "--csv", "c"], "--csv, --risk: not with --compare"),

@@ -185,6 +185,6 @@ def test_a_run_is_resumed_after_its_last_whole_line(tmp_path):
     assert len(rows) == 2
     assert path.read_bytes()[size:] == ROWS[2].to_json()[:50].encode()
     path.write_text('{"my": "notes"}')
-    assert_refused("its end is no line of a run of tools/evaluate.py", read_run, path)
+    assert_refused("its last line does not belong to a run of tools/evaluate.py", read_run, path)
     path.write_text("{}\n")
     assert_refused(r"run\.jsonl, line 1: evaluation: found", read_run, path)

@@ -137,7 +137,7 @@ def test_photos_are_refused_by_formats_of_spheres_and_two_in_a_picture_by_colmap
     message = "found 2 cameras in one picture, wanted one for colmap"
     if name != "colmap":
         cameras.pop()
-        message = "a.jpg: found a photo by the model OPENCV, wanted a sphere for"
+        message = "a.jpg: found a photo with the camera model OPENCV, wanted a sphere for"
     photo = result(tmp_path / "a.jpg", POSES[0], cameras=tuple(cameras))
     with pytest.raises(InputError, match=message):
         export([photo], name, tmp_path / "out", Options())

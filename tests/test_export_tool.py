@@ -56,7 +56,7 @@ def test_only_localized_poses_are_written_and_the_others_counted(run, tmp_path):
     assert (code, document["poses"]) == (0, 2)
     assert document["left_out"] == {"not_localized": 1, "ambiguous": 1, "without a pose": 1}
     assert "left out 3 of 5 results: 1 not_localized, 1 ambiguous, 1 without a pose" in err
-    assert "poses in 2 clouds are taken as in one coordinate system" in err
+    assert "poses in 2 clouds are assumed to be in one coordinate system" in err
     assert [line.split(",")[0] for line in lines_of(tmp_path / "p.csv")[1:]] == ["p/a.jpg", "p/e.jpg"]
 
 
@@ -130,7 +130,7 @@ def test_two_results_of_one_picture_are_refused_where_the_name_is_the_key(run, t
     out = tmp_path / "out"
     code, _, err = run("--format", "opensfm", "--size", "64", "32", "--out", out, results=results)
     assert code == 3
-    assert "p/a.jpg: has two results (clouds a.ply, b.ply); --cloud chooses one" in err
+    assert "p/a.jpg: has two results (clouds a.ply, b.ply); choose one with --cloud" in err
     assert run("--format", "csv", "--out", out, results=results)[1]["poses"] == 2
 
 
@@ -182,7 +182,7 @@ def test_a_picture_stored_turned_is_left_out(run, tmp_path):
         words = ["--format", name, "--out", tmp_path / name]
         code, document, err = run(*words, results=results)
         assert (code, document["poses"]) == (1, 1)
-        assert "b.jpg: found it stored turned (EXIF orientation 6), wanted it upright" in err
+        assert "b.jpg: found it stored rotated (EXIF orientation 6), wanted it upright" in err
         words = ["--format", name, "--out", tmp_path / f"{name}-sized", "--size", "64", "32"]
         assert run(*words, results=results)[1]["poses"] == 3
 
@@ -212,7 +212,9 @@ def test_results_of_another_content_of_the_cloud_are_refused(run, tmp_path):
     code, document, err = run(*words, "--force", results=results)
     assert (code, document["poses"]) == (0, 3)
     assert "found 1 of 3 results of another scan" in err
-    assert "poses in 3 clouds are taken as in one coordinate system" in run(*words[:4], results=results)[2]
+    assert (
+        "poses in 3 clouds are assumed to be in one coordinate system" in run(*words[:4], results=results)[2]
+    )
 
 
 def test_damaged_results_are_refused_with_file_and_line(tmp_path):

@@ -65,7 +65,7 @@ def test_two_far_strays_change_little():
 def test_a_bare_room_may_be_upside_down(w):
     up, reason = up_of(bare_room(), w)
     assert up is None
-    assert reason == "floor and ceiling look alike: furniture +0.0, free ways +0.0"
+    assert reason == "floor and ceiling look alike: furniture +0.0, free space +0.0"
 
 
 def roofs():
@@ -83,7 +83,7 @@ def roofs():
         (np.random.default_rng(8).uniform(-3.0, 3.0, (20_000, 3)), "no dominant planes"),
         (np.linspace(0.0, 9.0, 2000)[:, None] * [1.0, 2.0, 3.0], "no dominant planes"),
         (box([0, 0, 0], [3, 3, 9]), "9.0 m high|3.0 m high and 3.0 m wide, a wall may be the floor"),
-        (roofs(), "neither level nor upright"),
+        (roofs(), "neither horizontal nor vertical"),
         (np.random.default_rng(9).uniform(-9.0, 9.0, (50_000, 3)) * [1, 1, 1e-4], "a floor and a ceiling"),
     ],
     ids=["volume", "line", "tower", "roofs", "ground"],

@@ -94,7 +94,7 @@ def test_a_signal_ends_all_and_the_same_command_goes_on(scene, many, tmp_path):
         os.killpg(process.pid, signal.SIGTERM)
         err = process.stderr.read()
         assert process.wait() == 143
-    assert "the same command goes on from here" in err
+    assert "the same command continues from here" in err
     assert "Traceback" not in err
     assert list(temporary.iterdir()) == []
     text = out.read_text()

@@ -172,9 +172,9 @@ def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
     arguments = _arguments(scene, *PAPER)
     first, second = (start_localize(arguments, **options) for _ in range(2))
     try:
-        assert any("compiling kernels, once" in line for line in first.stderr)
+        assert any("compiling kernels (only once)" in line for line in first.stderr)
         first.send_signal(signal.SIGSTOP)
-        assert any("compiling kernels, once" in line for line in second.stderr)
+        assert any("compiling kernels (only once)" in line for line in second.stderr)
     finally:
         first.send_signal(signal.SIGCONT)
     poses = [json.loads(process.communicate(timeout=120)[0])["center_world"] for process in (first, second)]

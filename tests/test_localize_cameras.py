@@ -170,6 +170,6 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     main([*cloud, "--pano", str(tmp_path / "phone.jpg")])
     out, err = capsys.readouterr()
     assert json.loads(out)["camera"]["model"] == "SIMPLE_PINHOLE"
-    assert "read as a pinhole photo 115.1 deg wide, focal length 153 px by EXIF's 35 mm equivalent" in err
+    assert "read as a pinhole photo 115.1 deg wide, focal length 153 px from EXIF's 35 mm equivalent" in err
     assert main([*cloud, "--pano", str(tmp_path / "phone.jpg"), "--camera", str(rig)]) == 2
     assert "give it as --rig" in capsys.readouterr().err

@@ -45,7 +45,7 @@ def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(syst
     memory.limit_memory(3.0)
     assert memory.memory_left() == pytest.approx(2e9, rel=1e-4)
     memory.check_memory(1.9e9, "a", "b")
-    with pytest.raises(InputError, match=r"^the grid needs 2.1 GB of memory, 2 GB may be taken; cut it, or"):
+    with pytest.raises(InputError, match=r"^the grid needs 2.1 GB of memory, 2 GB may be used; cut it, or"):
         memory.check_memory(2.1e9, "the grid", "cut it")
     memory.limit_memory(500.0)
     assert memory.memory_left() == pytest.approx(8e9)

@@ -75,7 +75,7 @@ def test_a_damaged_map_is_made_anew_with_one_warning(cloud, tmp_path, monkeypatc
         path.mkdir()
     (warning,) = _open(cloud, tmp_path, monkeypatch)
     assert str(path) in warning
-    assert warning.endswith("the prepared map is not kept" if how == "folder" else "it is made anew")
+    assert warning.endswith("the prepared map is not kept" if how == "folder" else "it is prepared again")
     assert how == "folder" or path.read_bytes() == whole
     assert how == "folder" or _open(cloud, tmp_path, monkeypatch, 0) == []
 

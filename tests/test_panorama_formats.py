@@ -58,8 +58,8 @@ def test_tiff_is_turned_once(tmp_path, orientation, image):
     np.testing.assert_array_equal(read_panorama(write(tmp_path / "a.tif", content)).rgb, expected)
 
 
-RARE = "the TIFF is cut off, damaged or of a rare kind"
-BAD_WEBP = "the WEBP is cut off, damaged or of a rare kind"
+RARE = "the TIFF is cut off, damaged or of an unsupported kind"
+BAD_WEBP = "the WEBP is cut off, damaged or of an unsupported kind"
 WEBP = with_metadata(encoded(RGB, ".webp", LOSSLESS), orientation=1)
 
 
@@ -191,7 +191,7 @@ def test_a_damaged_heic_and_a_missing_library_are_one_line(tmp_path, monkeypatch
     content = heic(RGB)
     for size in (20, 200, len(content) // 2, len(content) - 9):
         path.write_bytes(content[:size])
-        assert_refused("the HEIF is cut off, damaged or of a rare kind", read_panorama, path)
+        assert_refused("the HEIF is cut off, damaged or of an unsupported kind", read_panorama, path)
     path.write_bytes(content)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
     assert_refused(r"a\.heic: needs pillow_heif, .*-r requirements-formats\.txt", read_panorama, path)

@@ -110,7 +110,7 @@ def test_refusals_leave_nothing(run, scene, tmp_path):
         (2, [*at, *out, "--width", 101], "--width 101: wanted an even number"),
         (2, [*at, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
         (2, [*at, *out, "--depth", "a.exr"], "--depth a.exr: wanted"),
-        (2, [*at, "--out", "a", "--depth", "a.png"], "work with a single picture only"),
+        (2, [*at, "--out", "a", "--depth", "a.png"], "only with a single picture"),
         (2, [*at, *out, "--heading", "nan"], "must be finite"),
         (2, [*at, "--animate", "a.gif"], "--animate: only with --result or --queries"),
         (2, ["--pose", "T.txt", *out, "--heading", 3], "only with --at"),

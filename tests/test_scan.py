@@ -25,7 +25,7 @@ def test_options_that_are_none_are_named(scan):
         ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
         ({"units": "inch"}, piccolo.InputError, "`units`: found 'inch', wanted one of mm, cm, m"),
         ({"up": "w"}, piccolo.InputError, "`up`: found 'w', wanted one of auto, z"),
-        ({"num_threads": 0}, piccolo.InputError, "num_threads: found 0"),
+        ({"num_threads": 0}, piccolo.InputError, "`num_threads`: found 0"),
     ):
         with pytest.raises(error, match=text):
             piccolo.open_scan(points, points, **options)
@@ -35,7 +35,7 @@ def test_options_that_are_none_are_named(scan):
         ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
         ({"gravity": "Known"}, piccolo.InputError, "`gravity`: found 'Known', wanted one of auto"),
         ({"mask": np.ones((3, 3), bool)}, piccolo.InputError, "mask: wanted an array"),
-        ({"fov_deg": 90.0}, piccolo.InputError, "go with files"),
+        ({"fov_deg": 90.0}, piccolo.InputError, "need a file"),
     ):
         with pytest.raises(error, match=text):
             scan.localize(np.zeros((64, 128, 3), np.uint8), **options)

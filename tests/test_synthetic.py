@@ -40,9 +40,9 @@ def test_clearance_is_the_distance_to_the_nearest_surface():
 def test_room_without_a_free_place_and_an_unknown_variant_are_refused():
     this = make_room(5, SMALL, np.zeros(3))
     full = this._replace(boxes=np.array([[*(SMALL / 2), *(SMALL / 2), 0.0]]))
-    with pytest.raises(InputError, match=r"size: .* no place 0\.35 m from everything"):
+    with pytest.raises(InputError, match=r"size`: .* no free position 0\.35 m from everything"):
         free_position(full, np.random.default_rng(0), (1.0, 1.9))
-    with pytest.raises(InputError, match="variant: 'odd' is not one of"):
+    with pytest.raises(InputError, match="variant: found 'odd', wanted one of"):
         make_query(make_world(0, SMALL), 0, "odd", 128, Workers())
 
 

@@ -131,7 +131,7 @@ def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(
         assert _command(folder, *command) == 3
     results = read_results([out])
     assert [r.status for r in results] == ["localized", "failed", "localized"]
-    assert "may be taken" in results[1].error
+    assert "may be used" in results[1].error
     assert _command(folder, *command, "--min-confidence", "0.7") == 3
     prepared, prepare = [], Walk.prepare
     monkeypatch.setattr(Walk, "prepare", lambda self, *a: prepared.append(a[1]) or prepare(self, *a))
@@ -240,7 +240,7 @@ def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys)
     assert _command(folder, *walk, "--times", _times(folder, queries)) == 0
     before = (tmp_path / "a.jsonl").read_bytes()
     assert _command(folder, *walk, "--times", "order") == 3
-    assert "--overwrite starts again" in capsys.readouterr().err
+    assert "use --overwrite to start again" in capsys.readouterr().err
     assert (tmp_path / "a.jsonl").read_bytes() == before
     assert _command(folder, *walk, "--times", "order", "--overwrite") == 0
 

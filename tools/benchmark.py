@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""Measure the method, write the page of figures, and learn the confidence."""
+"""Measure the method, write BENCHMARK.md, and fit the confidence."""
 
 import argparse
 import sys
@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_run_options(subparser)
 
 
-@command(__file__, __doc__, "", add_arguments, "0 done, 1 a false answer of confidence")
+@command(__file__, __doc__, "", add_arguments, "0 done, 1 confidence found a false answer")
 def main(arguments: argparse.Namespace) -> int:
     """Run the measurement asked for; returns the exit code."""
     return int(MEASUREMENTS[arguments.measurement].run(arguments))

@@ -92,5 +92,5 @@ def describe_left_out(left_out: Counter[str]) -> str:
     kinds = sorted(left_out.items(), key=lambda kind: (-kind[1], kind[0]))[:MAX_KINDS]
     if rest := left_out.total() - sum(count for _, count in kinds):
         kinds.append(("of other kinds", rest))
-    listed = ", ".join(f"{count} {printable(kind) or 'without an ending'}" for kind, count in kinds)
+    listed = ", ".join(f"{count} {printable(kind) or 'without a suffix'}" for kind, count in kinds)
     return f"{left_out.total()} files left out: {listed}" if kinds else ""

@@ -105,12 +105,12 @@ class Localizer:
         """Return the fields of a panorama's line that say how it was made, the most telling first."""
 
         @lru_cache
-        def expected_of(settings: Settings) -> Mapping[str, Any]:
+        def make_fields(settings: Settings) -> Mapping[str, Any]:
             scan = {"cloud_sha256": cloud_sha256, "cloud": self.name}
             repeated = settings_json(settings, self.cloud_settings, self.read_options)
             return dict(json.loads(json.dumps({**scan, "settings": repeated, "version": __version__})))
 
-        return lambda pano: expected_of(self.settings_of(pano))
+        return lambda pano: make_fields(self.settings_of(pano))
 
     def open(self) -> Callable[[Task], Answer]:
         """Open the scan in this process; return what answers tasks."""
@@ -140,7 +140,7 @@ class Localizer:
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask)
 
-    def lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
+    def answer_of_lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
         """Return the answer to a task whose workers were lost."""
         about = {
             "settings": settings_json(task.settings, self.cloud_settings, self.read_options),

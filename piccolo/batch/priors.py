@@ -45,8 +45,8 @@ class PriorTable:
                 raise InputError(text) from error
 
     @property
-    def unused(self) -> list[str]:
-        """Names that no panorama has had."""
+    def names_without_panorama(self) -> list[str]:
+        """Names in the table that no panorama has had."""
         return [name for name in self.by_name if name not in self.used]
 
 

@@ -12,7 +12,7 @@ from ..files.line_file import LineFile, whole_lines, whole_size
 from ..result import FAILED, FORMAT
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
-WAYS = "`overwrite` starts again, another `out` keeps both"
+WAYS = "use `overwrite` to start again, or another `out`"
 Name = TypeVar("Name", Path, str)
 
 
@@ -22,9 +22,9 @@ def _fields_of(line: bytes, where: str) -> dict[str, Any]:
         fields = json.loads(line)
         found = fields["format"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise InputError(f"{where}: no result of localize.py; {WAYS}") from error
+        raise InputError(f"{where}: not a result of localize.py; {WAYS}") from error
     if found != FORMAT:
-        raise InputError(f"{where}: of format {found!r}, not {FORMAT!r}; {WAYS}")
+        raise InputError(f"{where}: found format {found!r}, wanted {FORMAT!r}; {WAYS}")
     return {**fields, "line": where}
 
 
@@ -101,7 +101,7 @@ class Records:
             self._others.setdefault(pano, []).append(line)
             self.size = span[1]
         if self._others and named is not None and named.isdisjoint(self._others):
-            text = f"none of its results is of a panorama that this command names; {WAYS}"
+            text = f"it has no result of the panoramas given; {WAYS}"
             raise InputError(f"{self.path}: {text}")
 
     def remaining(

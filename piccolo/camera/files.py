@@ -115,10 +115,12 @@ def _mount_of(entry: Mapping[str, Any]) -> Mount:
     places = {"R_lens_from_cam", "center_cam", "offset", "image"}
     if odd := sorted(entry.keys() - known - places):
         raise ValueError(f"a field {odd[0]!r} that is none of {', '.join(sorted(known | places))}")
-    size = _whole(entry["width"]), _whole(entry["height"])
+    width = _whole(entry["width"])
+    height = _whole(entry["height"])
     angle = entry.get("max_angle_deg")
     params = tuple(map(float, entry["params"]))
-    camera = Camera(entry["model"], *size, params, None if angle is None else float(angle))
+    max_angle_deg = None if angle is None else float(angle)
+    camera = Camera(entry["model"], width, height, params, max_angle_deg)
     image = entry.get("image")
     if image is not None and not (isinstance(image, str) and image.isprintable() and image):
         raise ValueError(f"an image {image!r} that is no name")

@@ -192,7 +192,7 @@ class Camera:
 
     @property
     def lens(self) -> str:
-        """How the angle from the axis becomes a radius."""
+        """Return the projection, which turns the angle from the optical axis into a radius."""
         return MODELS[self.model][0]
 
     @cached_property

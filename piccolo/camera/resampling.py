@@ -127,7 +127,7 @@ def _places(
 
 
 def _num_samples(places: Array, is_in: NDArray[np.bool_]) -> int:
-    """How many samples a pixel needs across and down: of the largest step between a block's cells."""
+    """Return the number of samples a pixel needs in each direction, for the largest step between cells."""
     across = np.linalg.norm(np.diff(places, axis=1), axis=2)[is_in[:, 1:] & is_in[:, :-1]]
     down = np.linalg.norm(np.diff(places, axis=0), axis=2)[is_in[1:] & is_in[:-1]]
     largest = max(across.max(initial=1.0), down.max(initial=1.0)) / CELL

@@ -1,4 +1,4 @@
-"""Turn a coloured scan so that z is up: find up, write the cloud and the 4 x 4 transform."""
+"""Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
 import argparse
 import json
@@ -34,23 +34,27 @@ examples:
   python tools/align_gravity.py --cloud scan.ply --out aligned.ply --assume-nothing --pano photo.jpg
   python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
 
-Planes find the vertical. Which end of it is up says the axis of the file (z, in glTF y) or --up, from which
-it may be 15 degrees off. Of a scan that may lie in any way, --assume-nothing finds up where furniture and
-free ways make it plain, and --pano by a photo. Where up isn't known nothing is written. Else the cloud is
-written as binary PLY in the unit of the scan, and beside it the transform: aligned.txt, four rows of four
-numbers, as CloudCompare reads them (docs/CONVENTIONS.md). One PLY file keeps its other properties and faces.
-One JSON object on stdout; without --out nothing else is written.
+The dominant planes give the vertical; of its two directions, the one closer to the file's up axis (z, in glTF
+y) or to --up is up. The axis may be up to 15 degrees off. If the scan may have any orientation,
+--assume-nothing decides by furniture and free space, and --pano by a photo. If up remains unknown, nothing is
+written. Otherwise the cloud is written as binary PLY in the unit of the scan, with the transform next to it:
+aligned.txt, four rows of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). A single PLY file
+keeps its other properties and faces. Prints one JSON object to stdout; without --out, this is all.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    add_cloud_options(parser, "coloured scan, as for localize.py")
-    option(parser, "--out FILE", "the turned cloud, a PLY file; - is stdout")
-    option(parser, "--queries FILE", "true poses in the scan, to be turned with it and written beside --out")
-    option(parser, "--yaw-walls", "also turn about z, least, so that the dominant walls are along x and y")
-    option(parser, "--assume-nothing", "the scan may lie in any way: its own evidence alone decides")
-    option(parser, "--pano FILE", "upright photo taken in the scan, which is localized: its up decides")
+    add_cloud_options(parser, "coloured scan as for localize.py")
+    option(parser, "--out FILE", "write the rotated cloud to this PLY file; - is stdout")
+    option(parser, "--queries FILE", "true poses in the scan: rotate them too and write them next to --out")
+    option(
+        parser,
+        "--yaw-walls",
+        "also rotate about z, as little as possible, to align the dominant walls with x and y",
+    )
+    option(parser, "--assume-nothing", "the scan may have any orientation: find up from its contents")
+    option(parser, "--pano FILE", "localize this upright photo in the scan, and take its up direction")
 
 
 def check_arguments(a: argparse.Namespace) -> None:
@@ -59,7 +63,7 @@ def check_arguments(a: argparse.Namespace) -> None:
         "--queries needs --out": a.queries and not a.out,
         "--assume-nothing can't be combined with --up": a.up != "auto" and a.assume_nothing,
         "--pano can't be combined with --up": a.up != "auto" and a.pano,
-        f"--queries: nothing can be written beside --out {a.out}": a.queries and a.out and is_stream(a.out),
+        f"--queries: nothing can be written next to --out {a.out}": a.queries and a.out and is_stream(a.out),
     }
     for text, is_wrong in refusals.items():
         if is_wrong:
@@ -77,7 +81,7 @@ def find_known_up(
     if not arguments.assume_nothing:
         named = R_z_from_axis(arguments.up, cloud.up)[2]
         if arguments.up == "auto" and evident is not None and evident @ named < np.cos(MAX_LEAN):
-            return None, f"the floors do not face {cloud.up}, by their {reason}"
+            return None, f"the floors do not face {cloud.up} ({reason})"
         return named, "up is the named axis"
     scanners = cloud.station_axes
     if len(scanners) and dot(scanners, scanners[0]).min() > np.cos(MAX_LEAN):

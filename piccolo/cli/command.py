@@ -8,7 +8,7 @@ from typing import Any
 
 from ..jobs.memory import check_address_space
 from .errors import UsageError, print_note, raising_signals, report_error
-from .progress import log_shown
+from .progress import showing_log
 from .start import as_started, for_terminal
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
@@ -43,8 +43,8 @@ def new_parser(
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add --quiet and --debug to a parser, or to one of its subcommands."""
     unless_given = argparse.SUPPRESS  # a subcommand keeps what stood before it
-    option(parser, "--quiet", "nothing on stderr but errors", default=unless_given)
-    option(parser, "--debug", "show the traceback of an error", default=unless_given)
+    option(parser, "--quiet", "print only errors to stderr", default=unless_given)
+    option(parser, "--debug", "print the traceback of an error", default=unless_given)
 
 
 def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
@@ -112,7 +112,7 @@ def command(
             arguments = parse(parser, argv)
             lost: list[KeyboardInterrupt] = []
             try:
-                with log_shown(arguments.quiet), raising_signals(lost):
+                with showing_log(arguments.quiet), raising_signals(lost):
                     check_address_space()
                     exit_code = run(arguments)
                     sys.stdout.flush()  # here, where a closed pipe is caught

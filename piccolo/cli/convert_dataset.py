@@ -27,9 +27,9 @@ datasets:
 example:
   python tools/convert_dataset.py stanford2d3ds --from data/stanford --out scenes --areas 1 3 --check 3
 
-Writes OUT/SCENE/cloud.ply, images/ (links to the dataset's own, or copies), labels/ and queries.json: see
-docs/DATASETS.md, also for each dataset's folders and poses. A scene that is there already is left as it is.
-A scene with a damaged file is left out and named on stderr, and the others go on. One JSON object a scene.
+Writes OUT/SCENE/cloud.ply, images/ (links to the dataset's files, or copies), labels/ and queries.json.
+docs/DATASETS.md describes them, and the folders and poses of each dataset. An existing scene is not changed.
+A scene with a damaged file is left out and named on stderr. Prints one JSON object per scene.
 """
 
 
@@ -38,12 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     for name, dataset in DATASETS.items():
         one = subparsers.add_parser(name, description=dataset.description, formatter_class=HelpFormatter)
-        option(one, "--from FOLDER", "the dataset", required=True, dest="folder")
-        option(one, "--out FOLDER", "made if it is not there", required=True)
-        text = "only these, by the last part of a scene's name: office_1, weddingHall_1, a house"
+        option(one, "--from FOLDER", "folder of the dataset", required=True, dest="folder")
+        option(one, "--out FOLDER", "folder of the scenes; created if missing", required=True)
+        text = "only these, the last parts of scene names: office_1, weddingHall_1, a house"
         option(one, "--rooms NAME ...", text, default=[])
-        option(one, "--check N", "compare N panoramas of each scene with its cloud", default=0)
-        text = "copy the panoramas, so that the dataset can be removed (default: link to them)"
+        option(one, "--check N", "check the poses of N panoramas of each scene against its cloud", default=0)
+        text = "copy the panoramas, so that the dataset can be deleted (default: link to them)"
         option(one, "--copy", text)
         add_own_options(one, name)
         add_run_options(one)
@@ -52,18 +52,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
     """Add the options of one dataset alone; of `generic` those where the list has no column."""
     if dataset == "stanford2d3ds":
-        option(parser, "--areas 1-6 ...", "only these", default=[])
-        text = "clouds from Annotations with a label a point, and labels/ of the panoramas"
+        option(parser, "--areas 1-6 ...", "only these areas", default=[])
+        text = "write clouds with a label per point (from Annotations), and labels/ of the panoramas"
         option(parser, "--labels", text)
     elif dataset == "mpo":
-        option(parser, "--seed N", "of the random transforms", default=0)
+        option(parser, "--seed N", "seed of the random transforms", default=0)
     elif dataset == "generic":
-        option(parser, "--poses FILE", "the list (default poses.csv, .json, .txt or .tum of --from)")
-        option(parser, "--cloud FILE", "(default the one cloud in --from)")
-        option(parser, "--images FOLDER", "pictures named by times (default images of --from)")
+        option(parser, "--poses FILE", "list of poses (default: poses.csv, .json, .txt or .tum in --from)")
+        option(parser, "--cloud FILE", "cloud of the scene (default: the only cloud in --from)")
+        option(
+            parser, "--images FOLDER", "folder of pictures named by their times (default: images in --from)"
+        )
         text = "piccolo: forward, left, up; optical: right, down, forward; opengl: right, up, back"
-        option(parser, "--axes", f"of the camera; {text}", choices=AXES)
-        text = "what a row's [R | t] takes camera coordinates to, or from"
+        option(parser, "--axes", f"axes of the camera; {text}", choices=AXES)
+        text = "direction of the transform [R | t] of a row"
         option(parser, "--direction", text, choices=DIRECTIONS)
 
 

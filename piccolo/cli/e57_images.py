@@ -18,8 +18,8 @@ example:
   python tools/e57_images.py scan.e57 --extract photos
   python localize.py --cloud scan.e57 --pano photos/scan_0.jpg
 
-is_usable: the image is spherical, as localize.py needs it; fov_deg is 360 for a full sphere.
-pose: x_world = R_world_from_image @ x_image + center_world, as the file has it.
+is_usable: the image is spherical, so localize.py can read it; fov_deg is 360 for a full sphere.
+pose: that of the file, x_world = R_world_from_image @ x_image + center_world.
 """
 SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
@@ -37,8 +37,8 @@ def image_json(index: int, image: E57Image) -> dict[str, object]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser.add_argument("e57", type=Path, metavar="FILE", help="an E57 file")
-    option(parser, "--extract FOLDER", "write the images here")
+    parser.add_argument("e57", type=Path, metavar="FILE", help="E57 file")
+    option(parser, "--extract FOLDER", "write the images to this folder")
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)

@@ -21,7 +21,7 @@ EXIT_BAD_INPUT = 3
 EXIT_INTERNAL = 4
 EXIT_BROKEN_PIPE = 141
 RETRY = 0.1  # [s] after which a signal is sent again
-SHORTAGE = "not enough memory ({}); set --max-memory or fewer --threads, or thin the scan"
+SHORTAGE = "not enough memory ({}); lower --max-memory or --threads, or thin the scan"
 
 
 class UsageError(InputError):

@@ -1,4 +1,4 @@
-"""Localize the panoramas of scenes with true poses, and measure how good the poses are."""
+"""Localize the panoramas of scenes with true poses, and measure the errors of the poses."""
 
 import argparse
 import json
@@ -41,6 +41,7 @@ from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, Terminated, UsageError, checking_options, print_error, print_note
 from .executing import Interruption, check_execution, connecting, count_jobs, executing, interruptible
 from .options import (
+    CACHE_TEXT,
     add_cloud_reading_options,
     add_execution_options,
     add_method_options,
@@ -58,35 +59,37 @@ examples:
   python tools/evaluate.py --compare paper.jsonl run.jsonl
 
 Scenes are folders with a queries.json, a cloud and images, at any depth below --scenes (docs/DATASETS.md).
---out runs the queries that it does not have yet, and appends a line for each as it comes: give the same
-command again to resume a run that was stopped. --results are lines of localize.py instead; each belongs to
-the query of the same path, or else of the same file name. Tables are Markdown, on stdout (on stderr where
-one of the files is stdout).
-Walks (make_room.py --walk) have a table with a line each: ATE and RPE are evo's, of localized frames, nothing
-aligned, steps over other frames left out. A photo that has no answer is right when refused.
-Queries that can't be read, and --results of no query, are named on stderr, and the rest is done before exit
-code 3.
+--out localizes the queries that the run lacks, and appends a line for each: repeat the command to resume a
+stopped run. --results are lines of localize.py instead; each belongs to the query with the same path, or else
+with the same file name. Tables are Markdown on stdout (on stderr if one of the files is stdout).
+For walks (make_room.py --walk) there is a table with a line per walk. ATE and RPE are defined as in evo, over
+localized frames, without alignment; RPE leaves out steps across other frames. A query with
+"answerable": false is correct if it is not localized.
+Queries that can't be read and --results without a query are named on stderr; the others are still evaluated,
+and the exit code is 3.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    group = parser.add_argument_group("what")
+    group = parser.add_argument_group("input and output")
     option(group, "--scenes FOLDER ...", "scenes with true poses")
-    option(group, "--variants NAME ...", "only these splits", default=[])
+    option(group, "--variants NAME ...", "only these splits of the data", default=[])
     kind = group.add_mutually_exclusive_group(required=True)
-    option(kind, "--out JSONL", "begin this run, or resume it")
-    option(kind, "--results JSONL", "results of localize.py")
-    option(kind, "--compare JSONL", "two runs, side by side", nargs=2)
-    option(group, "--force", "take --results of another scan than a scene's cloud too")
-    option(group, "--cache FOLDER", "of prepared maps (default the user's)")
+    option(kind, "--out JSONL", "file of the run, which is begun or resumed")
+    option(kind, "--results JSONL", "evaluate these results of localize.py instead of running it")
+    option(kind, "--compare JSONL", "compare two runs", nargs=2)
+    option(group, "--force", "also take --results of other clouds than the scene's")
+    option(group, "--cache FOLDER", CACHE_TEXT)
     group = parser.add_argument_group("tables and plots")
-    option(group, "--max-distance M", "correct is under", default=0.1)
-    option(group, "--max-angle DEG", "and under", default=5.0)
-    option(group, "--csv FILE", "a line a query; - is stdout, as for the others")
-    option(group, "--markdown FILE", "the tables, here too")
-    option(group, "--errors PNG", "plot: fraction of queries under each error, and recall over thresholds")
-    option(group, "--risk PNG", "plot: fraction wrong over fraction accepted, as the min. confidence falls")
+    option(group, "--max-distance M", "position error below which a pose is correct [m]", default=0.1)
+    option(group, "--max-angle DEG", "rotation error below which a pose is correct", default=5.0)
+    option(group, "--csv FILE", "write a line per query; - is stdout, also for the other files")
+    option(group, "--markdown FILE", "write the tables to this file too")
+    option(group, "--errors PNG", "plot: fraction of queries below each error, and recall over thresholds")
+    option(
+        group, "--risk PNG", "plot: fraction wrong over fraction accepted, for decreasing minimum confidence"
+    )
     add_cloud_reading_options(parser.add_argument_group("clouds"))
     add_panorama_reading_options(parser.add_argument_group("panoramas"))
     add_method_options(parser)
@@ -96,7 +99,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def check_usage(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go together, and values that are wrong whatever the files hold."""
     if (arguments.scenes is None) == (arguments.compare is None):
-        raise UsageError("--scenes goes with --out or --results; --compare stands alone")
+        raise UsageError("--scenes: needed with --out and --results, not with --compare")
     if arguments.compare and (arguments.csv or arguments.risk):
         raise UsageError("--csv, --risk: not with --compare, they show one run")
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
@@ -256,7 +259,7 @@ class Evaluation:
                 try:
                     result = wait().result
                 except WorkerLostError as error:
-                    result = localizer.lost(task, error, None).result
+                    result = localizer.answer_of_lost(task, error, None).result
                 self.record(scene, query, result, is_inside)
 
     def select_labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:

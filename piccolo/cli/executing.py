@@ -45,7 +45,7 @@ def choose_exit_code(statuses: Collection[str]) -> int:
 def check_execution(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
     if is_remote(arguments) and arguments.jobs not in (None, 1):
-        raise UsageError(f"--jobs: not with --dask {arguments.dask}, whose scheduler knows its workers")
+        raise UsageError(f"--jobs: not with --dask {arguments.dask}, whose scheduler starts the workers")
     if is_remote(arguments) and arguments.mask and not arguments.mask.is_absolute():
         raise UsageError(f"--mask {arguments.mask}: wanted an absolute path with --dask {arguments.dask}")
 
@@ -131,11 +131,11 @@ def at_the_workers(
     is_shared = cluster.has_files([here / path for path in localizer.paths])
     if is_shared and is_kept:
         return replace(localizer, folder=here)
-    where = f"--dask {arguments.dask}: not all workers see {scan.name}"
+    where = f"--dask {arguments.dask}: not all workers can read {scan.name}"
     if not isinstance(scan.prepared, ScanMap):
-        raise InputError(f"{where}; the preset paper needs it in a folder that they share")
+        raise InputError(f"{where}; the preset paper needs it in a shared folder")
     if arguments.mask and not is_shared:
-        raise InputError(f"{where}; --mask needs a folder that they share")
+        raise InputError(f"{where}; --mask needs a shared folder")
     with TemporaryDirectory(prefix="piccolo-") as folder:
         path = Path(folder) / f"{Path(folder).name}.piccolo-map"
         save_map(scan.prepared, path)
@@ -182,7 +182,7 @@ class Interruption:
         self.number = self.number or number
         if is_second or not self.is_at_work:
             raise Stopped
-        os.write(2, f"\n{SIGNALS[number]}: the photo at work is finished; again to stop now\n".encode())
+        os.write(2, f"\n{SIGNALS[number]}: the current photo will be finished; repeat to stop now\n".encode())
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""Write the poses of localize.py as files of other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
+"""Write the poses of localize.py for other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
 
 import argparse
 import json
@@ -27,35 +27,43 @@ examples:
   python tools/export_poses.py --results poses.jsonl --format colmap --images photos --out model
   python tools/export_poses.py --results poses.jsonl --format geojson --crs EPSG:25832 --out poses.geojson
 
-Results that are not localized are left out and counted on stderr; so are pictures that a format can't hold,
-as one with a blank in its name for colmap, or a sphere that is stored turned for nerfstudio. A path that
-begins as a formula does has an apostrophe before it in csv. docs/CONVENTIONS.md has axes and angles.
-A file at --out is replaced; - is stdout. One JSON object on stdout, on stderr if the poses are there.
+Results that are not localized are left out and counted on stderr, and so are pictures that a format can't
+hold: for example with a blank in the name (colmap), or a sphere stored rotated (nerfstudio). In csv, a path
+that a spreadsheet would take for a formula gets a leading apostrophe. Axes and angles: docs/CONVENTIONS.md.
+A file at --out is replaced; - is stdout. Prints one JSON object to stdout (to stderr if the poses go there).
 """
 EXIT_LEFT_OUT = 1
-EXIT_CODES = "0 done, 1 done but for pictures that the format can't hold"
+EXIT_CODES = "0 done, 1 pictures that the format can't hold were left out"
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options. One that is not given stays None, and keeps its default."""
     source = parser.add_mutually_exclusive_group(required=True)
-    option(source, "--results FILE ...", "JSON lines of localize.py", default=[])
-    option(source, "--scenes FOLDER ...", "scenes whose true poses are written, as a reference", default=[])
-    option(parser, "--format", "see below", choices=FORMATS, required=True)
-    option(parser, "--out FILE", "a new folder for colmap and gpano", required=True)
-    option(parser, "--images FOLDER", "pictures' names are relative to it (default: as in the results)")
-    option(parser, "--all", "write ambiguous and not localized poses too")
+    option(source, "--results FILE ...", "results of localize.py, JSON lines", default=[])
+    option(source, "--scenes FOLDER ...", "write the true poses of these scenes, as a reference", default=[])
+    option(parser, "--format", "format of the poses, see below", choices=FORMATS, required=True)
+    option(parser, "--out FILE", "file of the poses; for colmap and gpano a new folder", required=True)
+    option(
+        parser, "--images FOLDER", "write picture names relative to this folder (default: as in the results)"
+    )
+    option(parser, "--all", "also write poses that are ambiguous or not localized")
     option(parser, "--cloud PATH ...", "only results of these clouds", default=[])
-    option(parser, "--force", "take results of other content than --cloud has")
-    group = parser.add_argument_group("of some formats")
-    option(group, "--size W H", f"of all pictures, not read from each ({_takers('size')})")
-    option(group, "--offset X Y Z", f"subtracted from positions, written beside ({_takers('offset')})")
-    text = "optical (default): right, down, forward; piccolo: forward, left, up"
+    option(parser, "--force", "also take results of clouds with other contents than --cloud")
+    group = parser.add_argument_group("options of some formats")
+    option(group, "--size W H", f"size of all pictures, which are then not opened ({_takers('size')})")
+    option(
+        group,
+        "--offset X Y Z",
+        f"subtract this from positions, and write it to a file next to --out ({_takers('offset')})",
+    )
+    text = "camera axes: optical (default): right, down, forward; piccolo: forward, left, up"
     option(group, "--axes", f"{text} ({_takers('axes')})", choices=CAMERA_AXES)
-    text = "index (default): 0, 1, ...; name: the number that is the picture's name; walk: of the frame"
+    text = (
+        "index (default): 0, 1, ...; name: the number that is the picture's name; walk: times of the frames"
+    )
     option(group, "--timestamps", f"{text} ({_takers('timestamps')})", choices=["index", "name", "walk"])
-    option(group, "--crs EPSG", f"of the cloud's coordinates, such as EPSG:25832 ({_takers('crs')})")
+    option(group, "--crs EPSG", f"coordinate system of the cloud, such as EPSG:25832 ({_takers('crs')})")
 
 
 def _takers(option: str) -> str:
@@ -82,7 +90,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         reasons = ", ".join(f"{count} {reason}" for reason, count in selection.left_out.items())
         yield f"left out {num_left_out} of {num_left_out + len(selection.results)} results: {reasons}"
     if (num_clouds := len(selection.clouds)) > 1:
-        yield f"poses in {num_clouds} clouds are taken as in one coordinate system; --cloud chooses"
+        yield f"poses in {num_clouds} clouds are assumed to be in one coordinate system; --cloud selects"
 
 
 def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:

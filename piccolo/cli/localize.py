@@ -46,7 +46,7 @@ from .executing import (
 )
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 from .outputs import check_distinct, check_suffix
-from .progress import progress_bar, shown, warn_once
+from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
 from .walking import check_plan, check_walk_options, run_walk, walk_inputs
 
@@ -122,8 +122,8 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
 
 def note_unused_priors(arguments: argparse.Namespace, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
-    if localizer.priors and (unused := localizer.priors.unused):
-        note = f"{len(unused)} names of no panorama here, such as {unused[0]}"
+    if localizer.priors and (names := localizer.priors.names_without_panorama):
+        note = f"{len(names)} names without a panorama, such as {names[0]}"
         print_note(arguments, f"warning: {localizer.priors.path}: {note}")
 
 
@@ -189,13 +189,13 @@ def localize_all(
     bar = {"desc": "panoramas", "total": run.total, "initial": records.counts.total(), "unit": ""}
     values = executor.values(map(run.localizer.task, left))
     with interruptible() as interruption:
-        pairs = shown(values, is_quiet, **bar)
+        pairs = show_progress(values, is_quiet, **bar)
         # behind the photo after which a signal has ended it come those that are done already
         for task, wait in pairs if run.total == 1 else interruption.each(pairs, values.take_finished()):
             try:
                 answer = wait()
             except WorkerLostError as error:
-                answer = run.localizer.lost(task, error, run.cloud_sha256)
+                answer = run.localizer.answer_of_lost(task, error, run.cloud_sha256)
             record(run, answer, write)
     return interruption
 
@@ -211,12 +211,18 @@ def finish(
         num_dropped = records.finish(file, keeps_others=run.total is None)
     if run.total != 1 or run.left_out or num_dropped:
         words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
-        again = ", which the same command tries again" if counts[FAILED] else ""
+        again = ", which the same command will try again" if counts[FAILED] else ""
         note = f"{counts.total()} panoramas in {seconds:.0f} s: {words}{again}"
-        dropped = f"dropped {num_dropped} results of panoramas not named any more" if num_dropped else ""
+        dropped = (
+            f"dropped {num_dropped} results of panoramas that are no longer given" if num_dropped else ""
+        )
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
     if interruption.number:
-        how = "the same command goes on from here" if file else "with --out FILE the same command goes on"
+        how = (
+            "the same command continues from here"
+            if file
+            else "with --out FILE the same command would continue"
+        )
         return interruption.stop(arguments, f"{counts.total()} results", how)
     if run.total is None:
         note_unused_priors(arguments, run.localizer)

@@ -1,4 +1,4 @@
-"""Draw the sampling loss over a plan of the cloud: its least value over height and rotation at each place."""
+"""Draw the sampling loss on a plan of the cloud: its minimum over height and rotation at each position."""
 
 import argparse
 import json
@@ -31,11 +31,11 @@ EPILOG = """\
 example:
   python tools/loss_surface.py --cloud scan.ply --pano a.jpg --truth queries.json --out surface.png
 
-At each place of a grid the least sampling loss (Eq. 2 of the paper) over heights and rotations is taken, over
-the points seen from there. If a pose is known, the rotations are its own, turned evenly, and the heights are
-about its own. z is up, or what --up or a prepared map says. Places too near to a point or outside of the
-cloud are computed too, and drawn pale; the lowest place and the minima are of the others. One JSON object on
-stdout.
+Shows at each position of a horizontal grid the minimum of the sampling loss (Eq. 2 of the paper) over heights
+and rotations, for the points visible from there. If a pose is given, the rotations are evenly spaced around
+its own, and the heights are near its own. z is up unless --up or a prepared map says otherwise. Positions
+too close to a point or outside of the cloud are drawn pale and are not counted among the minima. Prints one
+JSON object to stdout.
 """
 MAX_CELLS = 1_000_000
 WIDTH = 256  # of the panorama [px]
@@ -47,13 +47,19 @@ HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
+    add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     option(parser, "--pano FILE", "the panorama", required=True)
-    option(parser, "--result FILE", "JSON lines of localize.py: pose found")
-    option(parser, "--truth FILE", "queries.json: true pose")
-    option(parser, "--out PNG", "the picture; - is stdout", required=True)
-    option(parser, "--step M", "of the grid", default=0.2)
-    option(parser, "--gravity", "yaws, or all of SO(3)", choices=["known", "unknown"], default="known")
+    option(parser, "--result FILE", "result of localize.py with the estimated pose")
+    option(parser, "--truth FILE", "queries.json with the true pose")
+    option(parser, "--out PNG", "write the picture here; - is stdout", required=True)
+    option(parser, "--step M", "spacing of the grid", default=0.2)
+    option(
+        parser,
+        "--gravity",
+        "known: rotations about z only; unknown: all of SO(3)",
+        choices=["known", "unknown"],
+        default="known",
+    )
 
 
 def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:

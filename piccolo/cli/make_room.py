@@ -1,4 +1,4 @@
-"""Make a seeded furnished room: a coloured scan of it, and panoramas with true poses."""
+"""Make a synthetic furnished room from a seed: a coloured scan, and panoramas with true poses."""
 
 import argparse
 import itertools
@@ -52,44 +52,65 @@ examples:
   python tools/make_room.py --out walk --rooms 64 --storeys 2 --twins 0.3 --walk 300 --people 3 --blur
 
 Writes FOLDER/cloud.ply, FOLDER/images/VARIANT_K.jpg and FOLDER/queries.json with the true poses.
-clean: as scanned; tilt: the camera in any orientation; photo: other exposure, white balance, gamma, blur
-and noise; change: furniture moved and added. With --labels the points have a label too, and each panorama
-a picture of labels, FOLDER/labels/VARIANT_K.png. With --camera queries.json has the camera of each picture,
-which evaluate.py takes; the pictures of a rig are a folder. One JSON object a scene on stdout.
-With --storeys the rooms stand along corridors of equal doors between halls with stairs. With --walk a person
-carries the camera through it: FOLDER/images/VARIANT_walk_K_FRAME.jpg with walk and time in queries.json, and
-FOLDER/VARIANT_walk_K_poses.tum (optical axes). Frames of --bad-frames are black, mirrored or of elsewhere,
-each a variant, with "answerable": false: right is to refuse them.
+Variants are clean: as scanned; tilt: camera in any orientation; photo: other exposure, white balance, gamma,
+blur and noise; change: furniture moved and added. With --labels, points have labels, and each panorama has a
+label image, FOLDER/labels/VARIANT_K.png. With --camera, queries.json contains the camera of each picture for
+evaluate.py; the pictures of a rig are a folder. Prints one JSON object per scene to stdout.
+With --storeys, the rooms lie along corridors of identical doors, between halls with stairs. With --walk, a
+person carries the camera through the building: FOLDER/images/VARIANT_walk_K_FRAME.jpg, with walk and time in
+queries.json, and FOLDER/VARIANT_walk_K_poses.tum (optical axes). --bad-frames adds frames that are black,
+mirrored or taken elsewhere, each kind a variant, with "answerable": false: they must not be localized.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    option(parser, "--out FOLDER", "made if it is not there", required=True)
-    option(parser, "--seed N", "equal seeds, equal bits", default=0)
-    text = f"(default {ROOM_POINTS}, in a building {PART_POINTS} a room and stretch of corridor)"
+    option(parser, "--out FOLDER", "folder of the scene; created if missing", required=True)
+    option(parser, "--seed N", "seed; equal seeds give equal files", default=0)
+    text = f"number of points (default {ROOM_POINTS}; in a building {PART_POINTS} per room and corridor part)"
     option(parser, "--points N", text)
-    option(parser, "--panoramas N", "of each variant", default=3)
-    option(parser, "--variants", nargs="+", choices=VARIANTS, default=["clean"])
-    option(parser, "--width PX", "of the panoramas", default=2048)
-    text = "calibration or rig (docs/CAMERAS.md) that takes the pictures, in place of spheres"
+    option(parser, "--panoramas N", "number of panoramas of each variant", default=3)
+    option(
+        parser,
+        "--variants",
+        "variants of the panoramas, see below",
+        nargs="+",
+        choices=VARIANTS,
+        default=["clean"],
+    )
+    option(parser, "--width PX", "width of the panoramas", default=2048)
+    text = "take the pictures with this calibrated camera or rig (docs/CAMERAS.md) instead of panoramas"
     option(parser, "--camera FILE", text)
-    option(parser, "--size X Y Z", "of a room [m]", default=[6.0, 5.0, 2.7])
-    option(parser, "--rooms N", "at most 256", default=1)
-    option(parser, "--labels", "label points and pixels by their kind of surface, for localize.py --labels")
-    option(parser, "--scenes N", "write N scenes, FOLDER/000 on, of the seeds from --seed on", default=0)
+    option(parser, "--size X Y Z", "size of a room [m]", default=[6.0, 5.0, 2.7])
+    option(parser, "--rooms N", "number of rooms, at most 256", default=1)
+    option(
+        parser, "--labels", "also write a semantic label of each point and pixel, for localize.py --labels"
+    )
+    option(
+        parser,
+        "--scenes N",
+        "write N scenes, FOLDER/000 and so on, with consecutive seeds from --seed",
+        default=0,
+    )
     group = parser.add_argument_group("buildings and walks")
-    text = "a building: corridors, halls and stairs join the rooms (1 with --walk)"
+    text = (
+        "number of storeys of a building, where corridors, halls and stairs connect the rooms (1 with --walk)"
+    )
     option(group, "--storeys N", text, default=0)
-    option(group, "--twins FRACTION", "of a building's rooms that are exact copies of others", default=0.0)
-    text = "in place of panoramas, a walk of this length through a building [m]"
+    option(
+        group,
+        "--twins FRACTION",
+        "fraction of a building's rooms that are exact copies of others",
+        default=0.0,
+    )
+    text = "make walks of this length [m] through a building instead of single panoramas"
     option(group, "--walk M", text, default=0.0)
-    option(group, "--walks N", "of each variant, which are clean or photo", default=1)
-    option(group, "--frame-rate HZ", "frames a second", default=2.0)
-    option(group, "--people N", "who walk the same way", default=0)
-    option(group, "--blur", "of the camera's motion while the shutter is open")
-    option(group, "--bad-frames FRACTION", f"that are {', '.join(BAD_KINDS)}", default=0.0)
-    option(group, "--video", "FOLDER/VARIANT_walk_K.mp4 too")
+    option(group, "--walks N", "number of walks of each variant (clean or photo)", default=1)
+    option(group, "--frame-rate HZ", "frames per second", default=2.0)
+    option(group, "--people N", "number of people who walk along with the camera", default=0)
+    option(group, "--blur", "add motion blur")
+    option(group, "--bad-frames FRACTION", f"fraction of bad frames: {', '.join(BAD_KINDS)}", default=0.0)
+    option(group, "--video", "also write FOLDER/VARIANT_walk_K.mp4")
 
 
 def is_building(arguments: argparse.Namespace) -> bool:
@@ -101,14 +122,14 @@ def check_usage(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
     check_least(arguments, panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
     if arguments.twins and not is_building(arguments):
-        raise UsageError("--twins: goes with --storeys or --walk")
+        raise UsageError("--twins: only with --storeys or --walk")
     if is_building(arguments) and "change" in arguments.variants:
-        raise UsageError("--variants: found change, which a building has not")
+        raise UsageError("--variants: found change, wanted others in a building")
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
     given = [name for name in OF_WALKS if getattr(arguments, name)]
     if given and not arguments.walk:
-        raise UsageError(f"--{given[0].replace('_', '-')}: goes with --walk")
+        raise UsageError(f"--{given[0].replace('_', '-')}: only with --walk")
     if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
     if arguments.walk and (arguments.labels or arguments.camera):
@@ -185,14 +206,14 @@ def write_scene(
     size = np.array(arguments.size)
     with checking_options():
         if arguments.width < 128 or arguments.width % 2:
-            raise UsageError(f"width: {arguments.width} is not an even number of at least 128")
+            raise UsageError(f"--width: found {arguments.width}, wanted an even number of at least 128")
         if is_building(arguments):
             office = make_office(seed, size, arguments.rooms, max(1, arguments.storeys), arguments.twins)
         world = office.world if office else make_world(seed, size, arguments.rooms)
         usual = PART_POINTS * len(world.rooms) if office else ROOM_POINTS
         num_points = usual if arguments.points is None else arguments.points
         if num_points < MIN_POINTS * len(world.rooms):
-            raise UsageError(f"points: {num_points} are too few, use at least {MIN_POINTS} a room")
+            raise UsageError(f"--points: found {num_points}, wanted at least {MIN_POINTS} per room")
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors, labels = scan_world(world, num_points, workers)
     rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)

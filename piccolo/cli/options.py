@@ -23,7 +23,7 @@ from ..scan_map.prior import Prior
 from ..walk.frames import MAX_SPEED
 from .command import check_least, option
 
-DESCRIPTION = "Find where in a coloured point cloud 360-degree panoramas were taken."
+DESCRIPTION = "Find the camera poses of 360-degree panoramas in a coloured point cloud."
 EPILOG = """\
 examples:
   python localize.py --cloud scan.ply --pano query.jpg
@@ -35,12 +35,13 @@ examples:
   python localize.py --cloud scan.ply --video walk.mp4 --every 0.5s --out walk.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
 
-output: one JSON object a panorama, one a line, in the order given (docs/RESULT.md); messages and progress go
-to stderr. Ctrl-C ends a batch after the photo at work, a second one at once.
+output: one JSON object per panorama and line, in the order given (docs/RESULT.md); messages and progress go
+to stderr. Ctrl-C lets the current photo finish and then stops a batch; a second Ctrl-C stops it at once.
 """
 PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
 ONLY_DEFAULT = ("near", "height", "heading", "within", "refine_focal")
 NONE = "none"
+CACHE_TEXT = f"folder of prepared maps (default: in the user's cache); {NONE}: prepare the map again"
 PHOTOS_OF_A_JOB = 8  # as many are localized while a process starts and opens a map
 DEFAULT_EVERY = "0.5s"
 
@@ -49,26 +50,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
     text = (
-        "coloured scan in any format of docs/USAGE.md, one file or several; or a map by tools/prepare_map.py"
+        "one or several files of a coloured scan (formats: docs/USAGE.md), or a map of tools/prepare_map.py"
     )
     add_cloud_options(parser, text)
     group = parser.add_argument_group("panorama")
     text = (
-        "JPEG, PNG, TIFF, WebP, HEIC: 2:1, a crop with Photo Sphere metadata, a photo with a focal length; "
-        "a folder of six cube faces, or with --rig of the pictures of one instant; "
-        "or a folder of pictures, @FILE with a path a line, or - for paths on stdin, answered as they come"
+        "pictures (JPEG, PNG, TIFF, WebP, HEIC): full spheres (2:1), crops with Photo Sphere metadata, or "
+        "photos with a known focal length; a folder of six cube faces, or, with --rig, of the pictures taken "
+        "at one instant; a folder of pictures; @FILE, a text file with one path per line; or - to read paths "
+        "from stdin and answer each at once"
     )
     group.add_argument("--pano", nargs="+", default=[], help=text)
     add_panorama_reading_options(group)
     group = parser.add_argument_group("files")
-    option(group, "--out FILE", "append each JSON line here; the same command goes on where it stopped")
-    option(group, "--overwrite", "begin --out again, whatever is in it")
-    text = "panorama, cloud at the pose, checkerboard of both; of several panoramas a folder of PNGs"
-    option(group, "--overlay PNG", text)
-    text = "of the photo's size: white what contradicts the scan, grey what was not scanned, else black; "
-    option(group, "--occlusion-mask PNG", text + "of several a folder")
-    text = f"of prepared maps (default the user's); {NONE}: prepare the map again, and do not keep it"
-    option(group, "--cache FOLDER", text)
+    option(group, "--out FILE", "append the JSON lines to this file; a repeated command continues")
+    option(group, "--overwrite", "replace the file of --out instead of continuing it")
+    folder = "a folder if there are several panoramas"
+    text = "picture of the panorama, the cloud seen from its pose, and a checkerboard of both; "
+    option(group, "--overlay PNG", text + folder)
+    text = "mask of the photo's size: white contradicts the scan, grey was not scanned, black elsewhere; "
+    option(group, "--occlusion-mask PNG", text + folder)
+    option(group, "--cache FOLDER", CACHE_TEXT)
     add_method_options(parser)
     add_prior_options(parser)
     add_walk_options(parser)
@@ -84,14 +86,14 @@ def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
 
 def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     """Add the options of reading a cloud's files."""
-    text = f"of the cloud's coordinates: {', '.join(METRES)}, or a number of metres (default m)"
+    text = f"unit of the cloud's coordinates: {', '.join(METRES)}, or its length in metres (default m)"
     option(group, "--units UNIT", text, type=_metres_of, default=None)
-    text = "up axis of the cloud; auto is the file's: z, in glTF y (default auto; preset default)"
+    text = "axis of the cloud that points up; auto: z, or y in glTF (default auto; with preset default only)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
-    option(group, "--intensity-as-gray", "of clouds without colours")
-    text = "semantic labels in place of colours: of the points (PLY, LAS, LAZ, PCD), PNG panoramas of labels"
+    option(group, "--intensity-as-gray", "use the intensities of clouds without colours as gray values")
+    text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
     option(group, "--labels", text)
-    option(group, "--ignore-labels N ...", "labels left out of the cloud, and masked in panoramas")
+    option(group, "--ignore-labels N ...", "remove points with these labels, and mask their pixels")
 
 
 def _metres_of(text: str) -> float:
@@ -99,88 +101,108 @@ def _metres_of(text: str) -> float:
     try:
         return METRES[text] if text in METRES else float(text)
     except ValueError:
-        wanted = f"wanted one of {', '.join(METRES)}, or metres a unit"
+        wanted = f"wanted one of {', '.join(METRES)}, or a length in metres"
         raise argparse.ArgumentTypeError(f"found {text!r}, {wanted}") from None
 
 
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     """Add what the files of the panoramas do not say."""
-    text = "horizontal field of view, of a part of the sphere about the horizon or as --projection says"
+    text = "horizontal field of view: of a crop of the sphere centred on the horizon, or with --projection"
     option(group, "--fov DEG", text)
-    text = "of the picture (default equirectangular; of a photo with EXIF's focal length pinhole)"
+    text = "projection of the picture (default equirectangular; pinhole if EXIF has a focal length)"
     group.add_argument("--projection", choices=get_args(Projection), help=text)
-    option(group, "--focal PX", "of a pinhole photo, in its own pixels, known to 1 %%", type=float)
-    text = "the focal length is a guess, within 20 %%: find it, and k1 if the model has it; takes three times"
+    option(
+        group, "--focal PX", "focal length of a pinhole photo, in its pixels, accurate to 1 %%", type=float
+    )
+    text = (
+        "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times as long"
+    )
     option(group, "--refine-focal", text)
-    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md"
+    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON as in docs/CAMERAS.md"
     option(group, "--camera FILE", text)
-    text = "cameras whose pictures, a folder, are one query: COLMAP's rig_config.json, or our JSON"
+    text = (
+        "calibration of a rig: COLMAP's rig_config.json, or JSON as in docs/CAMERAS.md; a query is a folder"
+    )
     option(group, "--rig FILE", text)
-    text = "down, in the camera's axes (+x image centre, +y left, +z up), of any length: 0 0 -1 is upright"
+    text = "down in camera axes (+x image centre, +y left, +z up), of any length; 0 0 -1: upright camera"
     option(group, "--gravity-vector X Y Z", text)
-    text = "white where the panorama is to be ignored; or a folder of masks with the panoramas' names"
+    text = "mask whose white pixels are ignored; or a folder of masks, named like the panoramas"
     option(group, "--mask FILE", text)
-    text = "ignore the cap of this half angle straight down: tripod, car roof"
+    text = "ignore a cap of this half angle around straight down, with the tripod or the car"
     group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
-    text = "the cloud's system, such as EPSG:25832, for photos with GPS, which are searched about it first"
-    default = f"(default: what LAS, LAZ or E57 say); {NONE}: leave GPS positions aside"
+    text = "coordinate system of the cloud, such as EPSG:25832; photos with GPS are searched near there first"
+    default = f"(default: the one in LAS, LAZ or E57 files); {NONE}: ignore GPS"
     option(group, "--crs CRS", f"{text} {default}")
 
 
 def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add the preset and its settings."""
     group = parser.add_argument_group("method")
-    text = "default: prepared views, all positions searched; paper: Kim et al., ICCV 2021, Algorithm 1; then "
-    text += "its settings by name, such as solver=lbfgs loss=photometric (docs/API.md)"
+    text = (
+        "default: search of all positions on prepared views; paper: Kim et al., ICCV 2021, Algorithm 1; then "
+    )
+    text += "settings as NAME=VALUE, such as solver=lbfgs (docs/API.md)"
     group.add_argument("--preset", nargs="+", default=["default"], metavar="NAME", help=text)
-    text = "known: camera upright, the cloud's z up; unknown: any rotation; auto: both (default auto)"
+    text = "known: the camera was upright and z of the cloud is up; unknown: any rotation; auto: try both "
+    text += "(default auto)"
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
-    text = f"a pose with less is not called localized (default {CoarseToFineSettings().min_confidence})"
+    text = f"confidence from which a pose is localized (default {CoarseToFineSettings().min_confidence})"
     option(group, "--min-confidence X", text)
 
 
 def add_prior_options(parser: argparse.ArgumentParser) -> None:
     """Add what the user knows beforehand."""
-    title = "prior knowledge (preset default); a pose that contradicts it is not localized"
+    title = "prior knowledge (preset default only); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
-    text = "CSV: name and any of x, y, z, radius, heading, tolerance, height, within; before the options here"
+    text = (
+        "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, within; "
+    )
+    text += "they take precedence over the following options"
     option(group, "--priors FILE", text)
-    option(group, "--near X Y Z RADIUS", "the camera is within RADIUS of this position [m]")
-    option(group, "--height MIN MAX", "above the floor [m]")
-    option(group, "--heading DEG", "of the image centre, clockwise from the cloud's +y, within 20 degrees")
-    text = "only in these scans of a map that tools/prepare_map.py --add has put together"
+    option(group, "--near X Y Z RADIUS", "the camera was within RADIUS of this position [m]")
+    option(group, "--height MIN MAX", "height of the camera above the floor [m]")
+    option(
+        group,
+        "--heading DEG",
+        "heading of the image centre, clockwise from the cloud's +y; within 20 degrees",
+    )
+    text = "the camera was in one of these scans of a map made with tools/prepare_map.py --add"
     option(group, "--within NAME ...", text)
 
 
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks."""
     group = parser.add_argument_group("walks")
-    text = "the panoramas are frames of one walk, in this order, each of which narrows the others"
+    text = "the panoramas are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
-    option(group, "--video FILE", "a walk's video, in place of --pano")
-    text = f"of a video, such as 0.5s or 1m: the sharpest frame each time (default {DEFAULT_EVERY})"
+    option(group, "--video FILE", "video of a walk, instead of --pano")
+    text = (
+        f"take the sharpest frame of every step of a video, 0.5s or 1m for example (default {DEFAULT_EVERY})"
+    )
     option(group, "--every STEP", text)
-    text = f"of the frames: {EXIF}, {NAMES} (the last number in each, seconds), {ORDER}, or a CSV file with "
-    text += f"columns name and time [s] (default {EXIF} if it tells them apart, else {ORDER})"
+    text = (
+        f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file with "
+    )
+    text += f"the columns name and time [s] (default {EXIF} if its times differ, else {ORDER})"
     option(group, "--times SOURCE", text)
-    text = f"of the camera [m/s] (default {MAX_SPEED:g}); where only the order of the frames is known, [m] "
-    option(group, "--max-speed X", text + "from one to the next (default by what is found of them)")
-    text = "the path on the scan from above, coloured by its frames' confidence: .png, .svg, .pdf or .dxf"
+    text = f"maximum speed of the camera [m/s] (default {MAX_SPEED:g}); if only the order is known, "
+    option(group, "--max-speed X", text + "maximum distance between frames [m] (default: estimated)")
+    text = "write the path on a plan of the scan, coloured by confidence: .png, .svg, .pdf or .dxf"
     option(group, "--plan FILE", text)
 
 
 def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | None = None) -> None:
     """Add the options of processes, threads and memory; by default as many processes as are worth it."""
     group = parser.add_argument_group("execution")
-    text = "1"
+    text = ""
     if default_jobs is None:
-        text = f"one a core, where memory is enough and each has {PHOTOS_OF_A_JOB} photos or more; "
-        text += "1 with names on stdin or --threads"
-    option(group, "--jobs N", f"processes over one prepared map (default {text})", default=default_jobs)
-    text = "work on a Dask cluster: its scheduler's address or file, or local, of --jobs processes here"
+        text = f" (default one per core, if memory suffices and each gets {PHOTOS_OF_A_JOB} photos or more; "
+        text += "1 with paths on stdin or --threads)"
+    option(group, "--jobs N", f"processes that use one prepared map{text}", default=default_jobs)
+    text = "run on a Dask cluster: address or file of its scheduler; or local: --jobs workers on this machine"
     option(group, "--dask ADDRESS", text)
-    option(group, "--threads N", "of each process (default the cores, divided among --jobs)")
-    text = "that may be taken in all; with --dask ADDRESS by each worker (default 80 %% of what is free)"
+    option(group, "--threads N", "threads of each process (default: the cores divided by --jobs)")
+    text = "memory limit of all processes, or of each --dask worker (default 80 %% of the free memory)"
     option(group, "--max-memory GB", text)
 
 

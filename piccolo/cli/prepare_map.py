@@ -1,4 +1,4 @@
-"""Prepare a cloud once: the map file that localize.py takes in place of the cloud."""
+"""Prepare the map of a cloud: a file that localize.py takes instead of the cloud."""
 
 import argparse
 import json
@@ -21,19 +21,19 @@ example:
   python tools/prepare_map.py --add house.map --cloud 2.e57 --name "Storey 2" --out house.map
   python localize.py --cloud house.map --pano query.jpg --within "Storey 2"
 
-localize.py prepares and caches a map by itself; this tool is for maps that are copied, or made beforehand.
-One JSON object on stdout describes the map.
+localize.py prepares and caches maps by itself; use this tool to keep a map as a file, or to make it earlier.
+Prints one JSON object that describes the map to stdout.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    add_cloud_options(parser, "coloured scan, as for localize.py")
-    text = "put the scan into this map, whose coordinates it has; only what it changes is prepared again"
+    add_cloud_options(parser, "coloured scan as for localize.py")
+    text = "add the scan to this map with the same coordinate system; only changed parts are prepared again"
     option(parser, "--add FILE", text)
-    text = "of the scan: building, storey, room; for results and --within (default the file's stem)"
+    text = "name of the scan (building, storey, room), for results and --within (default: the file's name)"
     option(parser, "--name NAME", text)
-    option(parser, "--out FILE", "the map; - is stdout", required=True)
+    option(parser, "--out FILE", "file of the map; - is stdout", required=True)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)

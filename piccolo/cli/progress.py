@@ -20,8 +20,8 @@ STEPS = {"find free space": 1, "render views": 2, "find features": 3, "sort feat
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 
 
-def shown(values: Iterable[Any], is_quiet: bool, **form: Any) -> Iterator[Any]:
-    """Values with a progress bar on stderr, where that is a terminal."""
+def show_progress(values: Iterable[Any], is_quiet: bool, **form: Any) -> Iterator[Any]:
+    """Yield the values, with a progress bar on stderr if that is a terminal."""
     yield from tqdm(values, disable=True if is_quiet else None, file=sys.stderr, **form)
 
 
@@ -31,7 +31,7 @@ def progress_bar(is_quiet: bool) -> Progress:
     def show(values: Iterator[Any], total: int | None, label: str) -> Iterator[Any]:
         title = f"prepare, {STEPS[label]} of {len(STEPS)}: {label}" if label in STEPS else label
         form = {"bar_format": UNCOUNTED if total is None else COUNTED, "delay": DELAY, "leave": False}
-        return shown(values, is_quiet, desc=title, total=total, **form)
+        return show_progress(values, is_quiet, desc=title, total=total, **form)
 
     return show
 
@@ -65,7 +65,7 @@ class LogHandler(logging.Handler):
 
 
 @contextmanager
-def log_shown(is_quiet: bool) -> Iterator[None]:
+def showing_log(is_quiet: bool) -> Iterator[None]:
     """Within this, what the package logs is printed, warnings once, or nothing at all."""
     log = logging.getLogger("piccolo")
     handler = LogHandler(is_quiet)

@@ -50,11 +50,12 @@ examples:
   python tools/render_pose.py --cloud scan.ply --at 3 2 1.5 --heading 90 --out east.png
   python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif
 
-Angles as in docs/CONVENTIONS.md, Exports: heading clockwise from the world's +y. Each point is a disc over
-its nearest neighbours; what no disc covers is filled from around. --depth: range along the ray. PNG: 16 bit,
-millimetres, 0 where nothing is seen, 65535 for 65.535 m and farther. NPY: float32, metres, inf where nothing
-is seen. --mask-out: white where nothing is seen, as --mask of localize.py takes it.
-An output - is stdout: PNG, of --animate GIF. One JSON object a picture on stdout, or stderr if that is taken.
+Angles: docs/CONVENTIONS.md, Exports; heading is clockwise from the world's +y. Each point is drawn as a disc
+that reaches its nearest neighbours; pixels without a disc are interpolated. --depth is the range along the
+ray. PNG: 16 bit, millimetres, 0 without scan, 65535 for 65.535 m and farther. NPY: float32, metres,
+inf without scan. --mask-out: white without scan, a mask for --mask of localize.py.
+An output - is stdout (PNG; GIF of --animate). Prints one JSON object per picture to stdout, or to stderr if
+stdout is an output.
 """
 MAX_WIDTH = 32_768
 MIN_WIDTH = 16
@@ -82,24 +83,28 @@ class Shot(NamedTuple):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
+    add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     group = parser.add_argument_group("pose, one of")
     one = group.add_mutually_exclusive_group(required=True)
-    option(one, "--result FILE", "JSON lines of localize.py")
+    option(one, "--result FILE", "results of localize.py, JSON lines")
     option(one, "--queries FILE", "queries.json with true poses")
-    option(one, "--pose FILE", "text file, 4 x 4 numbers of T_world_from_cam")
-    option(one, "--at X Y Z", "position in the world [m]")
-    option(group, "--pano NAME", "the pose of this panorama (file name); needed if --queries has several")
+    option(one, "--pose FILE", "text file with the 4 x 4 numbers of T_world_from_cam")
+    option(one, "--at X Y Z", "position in world coordinates [m]")
+    option(
+        group, "--pano NAME", "choose the pose of this panorama (file name); needed if --queries has several"
+    )
     for angle in ("heading", "pitch", "roll"):
-        option(group, f"--{angle} DEG", "with --at (default 0)")
+        option(group, f"--{angle} DEG", f"{angle} with --at (default 0)")
     group = parser.add_argument_group("picture")
-    option(group, "--out FILE", ".png or .jpg; of several poses a new folder of .png, named as the panoramas")
-    option(group, "--width PX", "of a sphere twice the height", default=2048)
-    text = "draw what this camera sees (docs/CAMERAS.md; default: that of --result, or else the sphere)"
+    option(
+        group, "--out FILE", ".png or .jpg; for several poses a new folder of .png, named like the panoramas"
+    )
+    option(group, "--width PX", "width of a spherical picture, twice its height", default=2048)
+    text = "render the view of this camera (docs/CAMERAS.md; default: that of --result, else a sphere)"
     option(group, "--camera FILE", text)
-    option(group, "--depth FILE", ".png or .npy, see below")
-    option(group, "--mask-out PNG", "where nothing is seen")
-    text = ".gif or .mp4 (extra video): the descent on a panorama's sampling loss from near its pose"
+    option(group, "--depth FILE", "range of each pixel, .png or .npy, see below")
+    option(group, "--mask-out PNG", "mask of the pixels without scan, see below")
+    text = "animate a descent on a panorama's sampling loss towards its pose: .gif or .mp4 (extra video)"
     option(group, "--animate FILE", text)
 
 
@@ -109,7 +114,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not (arguments.out or arguments.animate):
         raise InputError("give --out, --animate or both")
     if (arguments.depth or arguments.mask_out) and (not arguments.out or is_folder(arguments.out)):
-        raise InputError("--depth, --mask-out: work with a single picture only, --out FILE")
+        raise InputError("--depth, --mask-out: only with a single picture, --out FILE")
     if not MIN_WIDTH <= arguments.width <= MAX_WIDTH or arguments.width % 2:
         raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
     for name, path in outputs_of(arguments).items():
@@ -252,7 +257,7 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
     """Write the descent towards the pose; one JSON line."""
     ((name, pose, camera),) = poses
     if camera is not None:
-        raise InputError(f"{name}: found a photo by the model {camera.model}, --animate wanted a sphere")
+        raise InputError(f"{name}: found the camera model {camera.model}, wanted a sphere for --animate")
     panorama = shrink(read_panorama(find_photo(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
     start = perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)

@@ -1,4 +1,4 @@
-"""Write a page of results: plans of the storeys, the photos as spheres, and the scan from the poses found."""
+"""Write a web page of results: plans of the storeys, photos as spheres, the scan seen from their poses."""
 
 import argparse
 import json
@@ -17,7 +17,7 @@ from ..report.site import check_folder
 from ..scan_map.open_map import open_map
 from .command import check_least, command, option, print_warnings
 from .errors import UsageError, checking_options
-from .options import NONE, add_cloud_options, cache_from, cloud_settings_from
+from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
 from .outputs import check_distinct, check_suffix, print_report
 from .progress import progress_bar, warn_once
 
@@ -29,31 +29,30 @@ examples:
   python tools/report.py --results poses.jsonl --cloud scan.ply --out report.html --self-contained
   python tools/report.py --results poses.jsonl --cloud scan.ply --plan plan.dxf
 
-FOLDER/index.html opens from disk in any browser, without a server or the net. The same command goes on where
-it was stopped, and makes again only what has changed. Without a browser: --plan, of the camera positions.
+FOLDER/index.html opens from disk in any browser, without a server or internet access. A repeated command
+continues where it was stopped and writes only changed parts. --plan writes plans that need no browser.
 Control points of --own-plan: a CSV file with the columns u, v (pixels of the image) and x, y (metres, in the
-scan's coordinates), and two rows or more. One JSON object on stdout.
+scan's coordinates), and two rows or more. Prints one JSON object to stdout.
 """
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    option(parser, "--results FILE ...", "JSON lines of localize.py", required=True)
-    add_cloud_options(parser, "coloured scan, as for localize.py, or a map by tools/prepare_map.py")
-    option(parser, "--out FOLDER", "the report; new, empty, or an earlier report")
-    option(parser, "--self-contained", "--out is one HTML file, of at most 50 photos")
-    option(parser, "--title TEXT", "of the page (default: the scan's name)")
-    option(parser, "--storeys NAME ...", "names of the storeys found, the lowest first", default=[])
-    option(parser, "--images FOLDER", "of the photos, where they are no more at the results' paths")
-    option(parser, "--full-size", f"spheres as wide as the photos (default: {WIDTH} px at most)")
-    text = "in place of the plan of a storey (1: the lowest): an image, and its control points, see below"
+    option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
+    add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
+    option(parser, "--out FOLDER", "folder of the report: new, empty, or an earlier report")
+    option(parser, "--self-contained", "write one HTML file to --out; at most 50 photos")
+    option(parser, "--title TEXT", "title of the page (default: the scan's name)")
+    option(parser, "--storeys NAME ...", "names of the storeys, the lowest first", default=[])
+    option(parser, "--images FOLDER", "folder of the photos, if they have been moved since")
+    option(parser, "--full-size", f"keep the size of the photos (default: at most {WIDTH} px wide)")
+    text = "show this image as the plan of storey K (1: the lowest); control points in CSV, see below"
     option(parser, "--own-plan K IMAGE CSV", text, type=str, nargs=3, action="append", default=[])
-    option(parser, "--crs EPSG", "the scan's coordinate system, for an arrow to grid north, if it names none")
-    option(parser, "--plan FILE", "the camera positions on the plans: .png, .svg, .pdf or .dxf")
-    option(parser, "--force", "show results of another scan too; the page says so")
-    option(parser, "--jobs N", "photos worked on at a time", default=num_cores())
-    text = f"of prepared maps (default the user's); {NONE}: prepare the map again, and do not keep it"
-    option(parser, "--cache FOLDER", text)
+    option(parser, "--crs EPSG", "coordinate system of a scan that names none, for the north arrow")
+    option(parser, "--plan FILE", "write the camera positions on the plans: .png, .svg, .pdf or .dxf")
+    option(parser, "--force", "show results of another scan too, with a note on the page")
+    option(parser, "--jobs N", "photos that are processed at the same time", default=num_cores())
+    option(parser, "--cache FOLDER", CACHE_TEXT)
 
 
 def settings_from(arguments: argparse.Namespace) -> ReportSettings:

@@ -1,4 +1,4 @@
-"""The paper's experiments on scenes with true poses: a table beside the paper's figures."""
+"""Run the paper's experiments on scenes with true poses, and compare the results with its figures."""
 
 import argparse
 import tempfile
@@ -34,18 +34,20 @@ examples:
 experiments:
 {_EXPERIMENTS}
 
-Writes OUT/NAME.md and OUT/NAME/CONDITION_PRESET.jsonl, runs that tools/evaluate.py compares.
-The same command resumes an experiment that was stopped. Changed clouds and images are temporary.
+Writes the table OUT/NAME.md and the runs OUT/NAME/CONDITION_PRESET.jsonl, for tools/evaluate.py --compare.
+A repeated command resumes a stopped experiment. Modified clouds and images are temporary files.
 """
 PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser.add_argument("names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="see below")
-    option(parser, "--scenes FOLDER ...", required=True)
-    option(parser, "--out FOLDER", "made if it is not there", required=True)
-    option(parser, "--variants NAME ...", "only these splits", default=[])
+    parser.add_argument(
+        "names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="experiments, see below"
+    )
+    option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
+    option(parser, "--out FOLDER", "folder of the tables and runs; created if missing", required=True)
+    option(parser, "--variants NAME ...", "only these splits of the data", default=[])
     option(parser, "--presets", nargs="+", choices=PRESETS, default=list(PRESETS))
     add_execution_options(parser, default_jobs=1)
     parser.set_defaults(mask=None)
@@ -62,7 +64,8 @@ def run_condition(
 ) -> tuple[list[QueryResult], int]:
     """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
-    reading = CloudSettings(labels=labels), ReadOptions(labels=labels)
+    cloud_settings = CloudSettings(labels=labels)
+    read_options = ReadOptions(labels=labels)
     transformed = []
     num_failed = 0
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
@@ -74,7 +77,8 @@ def run_condition(
             except InputError as error:
                 print_error(arguments, str(error), EXIT_BAD_INPUT)
                 num_failed += len(scene.queries)
-        config = Localizer((), condition.settings, *reading, CachePolicy(True, Path(temporary)))
+        cache = CachePolicy(True, Path(temporary))
+        config = Localizer((), condition.settings, cloud_settings, read_options, cache)
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         path = out / file_name(condition)
         rows, num_failed_later = run_scenes(arguments, path, config, transformed, variants)

@@ -37,7 +37,7 @@ from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY
 from .outputs import check_suffix
-from .progress import progress_bar, shown
+from .progress import progress_bar, show_progress
 
 EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
 ONLY_WITH = ("every", "times", "max_speed", "plan")
@@ -75,7 +75,7 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
         "--walk, --video: wanted --walk with --pano, or --video alone": is_video == bool(arguments.pano),
         "--walk: found names on stdin, wanted files or folders": is_from_stdin(arguments.pano),
         "--every: only with --video": not is_video and arguments.every is not None,
-        "--times: not with --video, which knows its times": is_video and arguments.times is not None,
+        "--times: not with --video, which contains its times": is_video and arguments.times is not None,
     }
     for name in NOT_WITH:
         wrong[f"--{name.replace('_', '-')}: not with a walk"] = getattr(arguments, name) not in (None, False)
@@ -116,7 +116,7 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
     with temporary_folder() as folder:
         found = frames_of(arguments.video, seconds, folder)
         bar = {"desc": "read the video", "unit": " frames", "leave": False}
-        shots = shown(found, arguments.quiet, **bar)
+        shots = show_progress(found, arguments.quiet, **bar)
         frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
         yield WalkInputs(frames, motion, metres)
 
@@ -141,7 +141,9 @@ def run_walk(
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
         if interruption.number:
             how = (
-                "the same command goes on" if frames_file(arguments.out) else "with --out FILE it would go on"
+                "the same command continues"
+                if frames_file(arguments.out)
+                else "with --out FILE it would continue"
             )
             return interruption.stop(arguments, f"{len(walk.taken)} frames", how)
         results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
@@ -201,7 +203,7 @@ def follow_all(
         # each is prepared while the one before it is followed
         prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.path, frame.name), left, 2)
         with interruptible() as interruption:
-            pairs = shown(prepared, arguments.quiet, **bar)
+            pairs = show_progress(prepared, arguments.quiet, **bar)
             for frame, wait in interruption.each(pairs) if file else pairs:
                 result = walk.follow(wait(), frame.time)
                 if result.error is not None:
@@ -219,7 +221,7 @@ def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, key: str, i
     lines = whole_lines(path, size)
     first = next(lines, b"")
     if first.strip() not in (b"", key.encode()):
-        raise InputError(f"{path}: of a walk with other settings, another scan or version; {WAYS}")
+        raise InputError(f"{path}: found a walk with other settings, another scan or version; {WAYS}")
     kept = len(first)
     for frame, line in zip(frames, lines, strict=False):
         try:

@@ -87,8 +87,8 @@ def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
         return (f"{label}: the cloud spans {size} m; if its unit is the millimetre, set `units` to mm",)
     farthest = float(np.abs(points).max())
     if farthest > FAR:
-        blur = f"blur the rest to {np.spacing(np.float32(farthest)):.2g} m"
-        return (f"{label}: points {2 * farthest:.0f} m apart {blur}; remove the outliers",)
+        limit = f"limit the precision of the rest to {np.spacing(np.float32(farthest)):.2g} m"
+        return (f"{label}: points {2 * farthest:.0f} m apart {limit}; remove the outliers",)
     return ()
 
 

@@ -89,7 +89,7 @@ class ArrayArchive:
             raise ValueError(f"arrays of {size} bytes")
 
     def _begin(self, info: zipfile.ZipInfo) -> int:
-        """Where in the file a member's content begins."""
+        """Return the byte of the file at which a member's content begins."""
         head = self.content[info.header_offset : info.header_offset + LOCAL_HEADER.size]
         magic, name_size, extra_size = LOCAL_HEADER.unpack(head)
         begin = info.header_offset + LOCAL_HEADER.size + int(name_size) + int(extra_size)

@@ -79,7 +79,7 @@ def _target_of(path: Path) -> Path:
 
 
 def temporary_prefix(name: str) -> str:
-    """How the names begin under which a file of this name is written; 16 hexadecimal digits follow."""
+    """Return the beginning of a file's temporary names; 16 hexadecimal digits follow."""
     return f".{name[:40]}."
 
 

@@ -64,12 +64,12 @@ def cache_root() -> Path:
             raise FileNotFoundError
         if is_own(make_writable(root).stat(), WRITABLE):
             return root
-        log.warning("%s: others may write to it, and nothing there is trusted; chmod go-w it", root)
+        log.warning("%s: other users may write to it, so it is not used; run chmod go-w on it", root)
     fallback = temporary / f"piccolo-{os.getuid()}"
     fallback.mkdir(PRIVATE, exist_ok=True)
     # One look, at the entry itself: where only its owner may rename it, what is found stays true.
     if not is_own(fallback.lstat(), OPEN) or temporary.stat().st_mode & (WRITABLE | stat.S_ISVTX) == WRITABLE:
-        raise PermissionError(errno.EACCES, "others may write to it", str(fallback))
+        raise PermissionError(errno.EACCES, "other users may write to it", str(fallback))
     return make_writable(fallback)
 
 

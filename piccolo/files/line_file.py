@@ -30,7 +30,7 @@ def whole_size(path: Path, begins: bytes, what: str) -> int:
             end = begin
     torn = torn[torn.rfind(b"\n") + 1 :]
     if torn[: len(begins)] != begins[: len(torn)]:
-        raise InputError(f"{path}: its end is no line of {what}")
+        raise InputError(f"{path}: its last line does not belong to {what}")
     return size - len(torn)
 
 

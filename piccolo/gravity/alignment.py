@@ -123,7 +123,7 @@ def find_up(octree: Octree) -> tuple[Array, float, str, Planes]:
     across = places @ np.linalg.eigh(np.cov(places.T))[1][:, 0]
     height, width = (np.ptp(np.quantile(x, [0.01, 0.99])) for x in (heights, across))
     if aligned_areas[largest] < MIN_ALIGNED:
-        return axis, 0.0, "too many planes are neither level nor upright", planes
+        return axis, 0.0, "too many planes are neither horizontal nor vertical", planes
     if height > 0.75 * width:
         return axis, 0.0, f"{height:.1f} m high and {width:.1f} m wide, a wall may be the floor", planes
     return axis, *find_sense(cloud, find_levels(planes, axis), axis, heights, places), planes
@@ -183,7 +183,7 @@ def find_sense(
     # the least lesser cue: in high storeys, whose trusses look like tables, both cues must agree
     least = 0.3 if np.diff(levels).max() > 4.0 else -0.5
     is_plain = sense * cues.sum() > 1.0 and (sense * cues).min() > least
-    reason = "furniture {:+.1f}, free ways {:+.1f}".format(*sense * cues)
+    reason = "furniture {:+.1f}, free space {:+.1f}".format(*sense * cues)
     return (sense, reason) if is_plain else (0.0, f"floor and ceiling look alike: {reason}")
 
 

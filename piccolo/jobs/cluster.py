@@ -170,7 +170,7 @@ class Cluster:
             count = error.allowed_failures + 1
             raise WorkerLostError(f"each of {count} workers of the cluster was lost at work on it") from error
         except (self._distributed.client.FutureCancelledError, CancelledError) as error:
-            text = f"`dask` {self.address}: the scheduler was lost; the same command goes on from here"
+            text = f"`dask` {self.address}: the scheduler was lost; the same command continues from here"
             raise InputError(text) from error
 
 

@@ -32,7 +32,7 @@ def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
     room = memory_left()
     if num_bytes > room:
         needs = f"{purpose} needs {num_bytes / GB:.2g} GB of memory"
-        left = f"{max(room, 0.0) / GB:.2g} GB may be taken"
+        left = f"{max(room, 0.0) / GB:.2g} GB may be used"
         raise ResourceError(f"{needs}, {left}; {advice}, or raise `max_memory`")
 
 

@@ -96,7 +96,9 @@ class Processes:
                 continue
             self._own.worker = pool, child
             return pool, child
-        raise InputError(f"`jobs`: a process {end} while it opened the scan; wanted fewer, or more memory")
+        raise InputError(
+            f"`jobs`: a process {end} while it opened the scan; use fewer processes or more memory"
+        )
 
     def _end_of(self, child: BaseProcess) -> str:
         """Return how a process ended; raises CancelledError if that was by `close`."""

@@ -64,12 +64,12 @@ ProgressCallback = Callable[[str, int, int | None], None]
 def report_progress(callback: ProgressCallback) -> Progress:
     """Progress that a callback is told of."""
 
-    def watched(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
+    def watch(values: Iterator[Value], total: int | None, label: str) -> Iterator[Value]:
         for done, value in enumerate(values, start=1):
             callback(label, done, total)
             yield value
 
-    return watched
+    return watch
 
 
 def ignore_warning(warning: str) -> None:
@@ -87,7 +87,7 @@ class Workers:
     def __post_init__(self) -> None:
         """Refuse a count that means nothing."""
         if not 1 <= self.num_threads <= MAX_THREADS:
-            raise InputError(f"num_threads: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
+            raise InputError(f"`num_threads`: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 
     def map(self, function: Callable[[Item], Value], items: Sequence[Item], label: str) -> list[Value]:
         """Return function(item) of each item, in order; within another call's function one after another.

@@ -55,7 +55,7 @@ def kernel_folder() -> Path | None:
         folder = own_folder(cache_root() / "kernels", NAME, PRIVATE)
         if is_own(folder.stat(), WRITABLE):
             return folder
-        reason = f"{folder}: others may write to it; delete it"
+        reason = f"{folder}: other users may write to it; delete it"
     except OSError as error:
         reason = in_words(error)
     warn_not_kept(reason)
@@ -65,13 +65,13 @@ def kernel_folder() -> Path | None:
 @cache
 def warn_not_kept(reason: str) -> None:
     """Warn once that the next run has to compile again."""
-    log.warning("%s; compiled code is not kept, and each run takes half a minute more", reason)
+    log.warning("%s; compiled code is not kept, and each run takes half a minute longer", reason)
 
 
 @cache
 def warn_damaged(folder: Path) -> None:
     """Warn once, however many files are damaged."""
-    log.warning("%s: damaged compiled code; it is compiled anew", folder)
+    log.warning("%s: damaged compiled code; it is compiled again", folder)
 
 
 @cache
@@ -102,7 +102,7 @@ class Compiling:
         now = time.monotonic()
         if now - self.quiet_since >= QUIET_S:
             self.quiet_since = now
-            log.info("compiling kernels, once: %d so far, half a minute in all", self.count)
+            log.info("compiling kernels (only once): %d so far, half a minute in total", self.count)
 
 
 compiling = Compiling()
@@ -148,9 +148,9 @@ def rebuild(
     wrappers = description.llvm_cpython_wrapper_name, description.llvm_cfunc_wrapper_name
     names = description.llvm_func_name, *wrappers
     stand_in = llvm.parse_assembly("".join(f'define void @"{each}"() {{ ret void }}\n' for each in names))
-    parts = (name, kind, (machine_code, stand_in.as_bitcode())), description
+    stub_library = (name, kind, (machine_code, stand_in.as_bitcode()))
     make: Callable[..., Any] = compiler.CompileResult._rebuild  # Numba gives it no type
-    compiled = make(target_context, *parts, *others)
+    compiled = make(target_context, stub_library, description, *others)
     compiled.library._get_module_for_linking = cache(partial(llvm.parse_bitcode, bitcode))
     return compiled
 

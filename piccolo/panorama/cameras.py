@@ -26,7 +26,7 @@ TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
     6: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1),
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
-HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole say it exactly"
+HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole set it exactly"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
 # standard deviations of the logarithm of a focal length: a first guess, a number of pixels, a field of view
 OF_GUESS = 0.2
@@ -78,7 +78,9 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
             )
         return Cameras()
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
-    note = f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px by {found.source}"
+    note = (
+        f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px from {found.source}"
+    )
     return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, (note + HOW,))
 
 

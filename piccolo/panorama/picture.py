@@ -174,7 +174,7 @@ def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
         raise
     except Exception as error:  # Pillow's readers raise whatever their formats bring
         words = " ".join(str(error).split())
-        why = f"the {kind.format} is cut off, damaged or of a rare kind ({words})"
+        why = f"the {kind.format} is cut off, damaged or of an unsupported kind ({words})"
         raise InputError(f"{path}: {why}, {WANTED}") from error
 
 

@@ -99,7 +99,7 @@ def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
     panorama = _on_sphere(folder, shots, options, None)
     if rig.extent <= MAX_OFFSET:
         return panorama
-    note = f"the rig's cameras are up to {rig.extent:.2f} m from its origin: near things come out displaced"
+    note = f"the rig's cameras are up to {rig.extent:.2f} m from its origin: near objects appear displaced"
     return replace(panorama, warnings=(*panorama.warnings, note))
 
 
@@ -141,7 +141,7 @@ def panorama_size(path: Path) -> tuple[int, int]:
     """
     if not path.is_dir():
         if (orientation := picture_orientation(path)) not in (None, 1):
-            turned = f"found it stored turned (EXIF orientation {orientation})"
+            turned = f"found it stored rotated (EXIF orientation {orientation})"
             raise InputError(f"{path}: {turned}, wanted it upright")
         return picture_size(path)
     size, _ = picture_size(face_paths(path)["f"])
@@ -176,13 +176,13 @@ def _region_of(
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
     if region is None and is_two_to_one:
         region = CropRegion()
-        notes = ["the crop in the metadata makes no sense or has another shape: read as uncropped"]
+        notes = ["the crop in the metadata is invalid or has another shape; read as a full sphere"]
     if region is None or (region.is_full and not is_two_to_one):
         wrong = " and a crop in the metadata that does not fit it" if region is None else ""
         raise InputError(f"{path}: found {width} x {height}{wrong}, {WANTED}")
     if region.is_full and is_dual_fisheye(picture.rgb):
         found = "two fisheye pictures side by side, wanted their calibration as `camera` (docs/CAMERAS.md)"
-        raise InputError(f"{path}: {found}, or that the camera's program stitches them first")
+        raise InputError(f"{path}: {found}, or a panorama that the camera's program has stitched")
     return region, notes
 
 
@@ -252,14 +252,14 @@ def read_photo(
     """
     if not isinstance(panorama, np.ndarray):
         if is_masked is not None:
-            raise InputError("mask: an array goes with a panorama that is an array; give a picture's path")
+            raise InputError("mask: found an array and a panorama's path, wanted a picture's path as mask")
         return read_panorama(Path(panorama), options)
     if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[2] != 3 or not panorama.size:
         found = f"{panorama.dtype} of shape {panorama.shape}"
         raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, W, 3)")
     is_crop = options.fov_deg is not None and options.projection not in ("pinhole", "fisheye")
     if options.mask or options.mask_nadir_deg or options.cube_order or options.rig or is_crop:
-        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg, rig and a mask's path go with files")
+        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg, rig and a mask's path need a file")
     is_valid = np.ones(panorama.shape[:2], np.bool_)
     if is_masked is not None:
         if is_masked.shape != is_valid.shape or is_masked.dtype != np.bool_:

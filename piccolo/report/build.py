@@ -43,7 +43,7 @@ MAKERS = ("report", "views", "confidence", "panorama", "camera")  # folders whos
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """What a report is to show, beside results and scan."""
+    """Settings of a report, apart from its results and its scan."""
 
     title: str = ""  # of the page; by default the scan's name
     storey_names: tuple[str, ...] = ()  # the lowest first; by default they are numbered
@@ -56,7 +56,7 @@ class ReportSettings:
 
 
 class Report(NamedTuple):
-    """What was made."""
+    """A report that has been written."""
 
     page: Path  # the page
     document: dict[str, Any]  # what it shows

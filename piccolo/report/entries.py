@@ -143,7 +143,7 @@ def pose_document(pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
 
 
 def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict[str, Any]:
-    """How far the pose may be off: the ellipse on the plan that holds 95 % [m], deviations, in words."""
+    """Describe the pose's uncertainty: its 95 % ellipse on the plan [m], standard deviations, and words."""
     level = (R_map_from_world @ covariance.matrix[3:, 3:] @ R_map_from_world.T)[:2, :2]
     variances, axes = np.linalg.eigh(level)
     half = np.sqrt(np.maximum(variances, 0.0) * CHI_SQUARE_95)

@@ -52,7 +52,7 @@ FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
 
 
 def read_options_of(result: Result) -> ReadOptions:
-    """How the photo of a result is to be read: as it was when it was localized."""
+    """Return the options with which the photo of a result was read when it was localized."""
     how: Any = result.settings.get("panorama") or {}
     labels = Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
     if result.cameras:
@@ -101,7 +101,7 @@ def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
 
 
 def measure_reach(view: View) -> NDArray[np.uint8]:
-    """How far one can see (h, w) [0.1 m], on a small sphere; 255 for 25.5 m and more, or nothing scanned."""
+    """Return the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned."""
     tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
     return np.asarray(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA), np.uint8)
 

@@ -49,7 +49,7 @@ class Line(NamedTuple):
 
 
 class Ellipse(NamedTuple):
-    """Where a camera lies with 95 %."""
+    """The region in which a camera lies with a probability of 95 %."""
 
     center: Array  # (3,) [m]
     half_axes: tuple[float, float]  # [m]

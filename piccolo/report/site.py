@@ -59,7 +59,7 @@ def begin_folder(out: Path) -> None:
 
 
 def picture_path(out: Path, folder: str, key: str) -> Path:
-    """Where a file of a photo or plan lies."""
+    """Return the path of a photo's or plan's file."""
     return out / folder / f"{key}{FOLDERS[folder]}"
 
 

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from .. import __version__
 from ..cloud.octree import Octree
-from ..cloud.readers.npz import damage_named
+from ..cloud.readers.npz import naming_damage
 from ..errors import InputError
 from ..files.array_archive import ArrayArchive, write_archive
 from ..files.atomic import replacing
@@ -34,7 +34,7 @@ NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
-WANTED = "wanted a whole map by tools/prepare_map.py"
+WANTED = "wanted a whole map of tools/prepare_map.py"
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
@@ -105,7 +105,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
     All of it is read and checked; with `remembers` only once, as long as the file is unchanged.
     """
     what = f"checked as {FORMAT} by {__version__}"
-    with damage_named(path, WANTED), hold_unchanged(path, remembers) as place:
+    with naming_damage(path, WANTED), hold_unchanged(path, remembers) as place:
         archive = ArrayArchive(place or path, is_mapped=place is not None)
         if "format" in archive.members and (found := str(archive.array("format"))) != FORMAT:
             text = f"a map of format {found[:40]!r}, but this version reads {FORMAT}; prepare it again"

@@ -129,7 +129,7 @@ def check_arrays(path: Path, arrays: Arrays) -> None:
 
 
 def _refuse(path: Path, found: str) -> None:
-    raise InputError(f"{path}: found {found}, wanted a map by tools/prepare_map.py; prepare it again")
+    raise InputError(f"{path}: found {found}, wanted a map of tools/prepare_map.py; prepare it again")
 
 
 def _reach(arrays: Arrays) -> float:

@@ -47,7 +47,7 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
     names = scan_map.scan_names
     if within and not names:
         raise InputError(
-            "`within`: found a scan without names, wanted a map by tools/prepare_map.py with `name`"
+            "`within`: found a scan without names, wanted a map of tools/prepare_map.py with `name`"
         )
     for name in within:
         if name not in names:

@@ -102,11 +102,11 @@ def extend_map(
     """Return a prepared map with another scan added; a scan without a name is named after the map's file."""
     if not find_prepared_map([map_path]):
         found = "no prepared map" if map_path.exists() else "no such file"
-        raise InputError(f"{map_path}: found {found}, wanted a map by tools/prepare_map.py")
+        raise InputError(f"{map_path}: found {found}, wanted a map of tools/prepare_map.py")
     if path := find_prepared_map(paths):
         raise InputError(f"{path}: found a prepared map, wanted the files of a scan to add")
     if cloud_settings.up != "auto":
-        raise InputError("`up`: found beside `add`, wanted without; a scan is added in the map's axes")
+        raise InputError("`up`: not with `add`; a scan is added in the axes of the map")
     with watch.stage("read"):
         old = load_map(map_path)
         cloud = open_cloud(paths, cloud_settings, workers.show)
@@ -114,7 +114,7 @@ def extend_map(
         crs = read_crs(paths)
     check_labels(map_path, old, cloud_settings)
     if crs and old.crs and crs != old.crs:
-        workers.warn(f"{paths[0]}: names another coordinate system than the map, whose is taken for both")
+        workers.warn(f"{paths[0]}: names another coordinate system than the map; the map's is used")
     old = add_features(old, workers)
     old = old if old.scan_names else name_scan(old, map_path.stem)
     both = "\n".join(sorted([old.scan_sha256, digest]))
@@ -167,9 +167,9 @@ def open_cached_map(
                 scan_map = load_map(path, remembers=True)
             if scan_map.scan_sha256 == scan_sha256:
                 return keep_when_made(scan_map, path), ""
-            warning = f"{path}: found the map of another scan; it is made anew"
+            warning = f"{path}: found the map of another scan; it is prepared again"
     except InputError as error:
-        warning = f"{error}; it is made anew"
+        warning = f"{error}; it is prepared again"
     except OSError as error:
         return build(), f"{in_words(error)}; the prepared map is not kept"
     scan_map = build()

@@ -25,7 +25,7 @@ class Prior:
         if not all(math.isfinite(number) for number in numbers if number is not None):
             raise InputError("`near_world`, `height`, `heading`: found nan or inf, wanted finite numbers")
         if (self.near_world is None) != (self.radius is None):
-            raise InputError("near_world, radius: found one of them, wanted both or none")
+            raise InputError("`near_world`, `radius`: found one of them, wanted both or none")
         if self.radius is not None and self.radius <= 0.0:
             raise InputError(f"radius: found {self.radius}, wanted metres above 0")
         if self.height is not None and not self.height[0] < self.height[1]:

@@ -44,7 +44,7 @@ class Candidates(NamedTuple):
     is_new: NDArray[np.bool_]  # (N,) more of the sphere shows the new scan in front than the others
 
     @property
-    def changed(self) -> NDArray[np.int64]:
+    def rows_to_render(self) -> NDArray[np.int64]:
         """Indices of the candidates whose views must be made again."""
         return np.flatnonzero(self.fraction > LEAST_CHANGED)
 
@@ -154,7 +154,7 @@ def join_views(
     known[old.sparse] = np.arange(len(old.sparse))
     place = np.full(len(found.centers), -1)
     place[: len(found.rows)] = known[found.rows]
-    place[found.changed] = -1
+    place[found.rows_to_render] = -1
     is_kept = place[sparse] >= 0
     added = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
 
@@ -190,7 +190,7 @@ def join_features(old: ScanMap, octree: Octree, found: Candidates, workers: Work
     has_place = gap == 0.0  # it is that of a candidate which stays
     is_kept = has_place.copy()
     is_kept[has_place] = found.fraction[place[has_place]] <= LEAST_FOR_FEATURES
-    looked_at = np.concatenate([place[has_place], found.changed])
+    looked_at = np.concatenate([place[has_place], found.rows_to_render])
     centers = found.centers[looked_at]
     num_known = int(np.count_nonzero(has_place))
     more = view_positions(centers, make_range_lookup(octree, centers), SEARCH_VIEW.num_rings, num_known)

@@ -190,7 +190,7 @@ EXPERIMENTS = {
         _paper_setting("num_rotations", {n: f"N_r = {n}" for n in (2, 4, 8, 16, 32)}),
     ),
     "initialization": Experiment(
-        "how starts are chosen",
+        "choice of the start poses",
         "K2 by the loss alone, or by the loss and then histograms",
         _paper_setting("initialization", {"loss-only": "loss alone", "two-stage": "loss, then histograms"}),
     ),
@@ -200,7 +200,7 @@ EXPERIMENTS = {
         _paper_setting("loss", {"photometric": "photometric loss", "sampling": "sampling loss"}),
     ),
     "gravity": Experiment(
-        "gravity, images upside down, clouds turned",
+        "gravity, images upside down, clouds rotated",
         "what is known of the vertical is varied",
         _each_preset(GRAVITY_CASES),
     ),
@@ -217,11 +217,13 @@ EXPERIMENTS = {
         _each_preset(LABEL_CASES),
     ),
     "runtime": Experiment(
-        "seconds by the number of points",
+        "run time over the number of points",
         "points are left out at random; search + refinement",
         _each_preset(RUNTIME_CASES),
     ),
-    "variants": Experiment("splits of the data: changed scenes, light", "a line a split", _variants),
+    "variants": Experiment(
+        "splits of the data, such as changed scenes or light", "a line a split", _variants
+    ),
 }
 
 

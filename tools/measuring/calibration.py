@@ -1,4 +1,4 @@
-"""Learn the confidence from trials, and check it, and the covariances, on others."""
+"""Fit the confidence to trials, and check it and the covariances on others."""
 
 import argparse
 import json
@@ -35,9 +35,10 @@ EPILOG = """\
 example:
   python tools/benchmark.py calibration --fit trials.jsonl --check others.jsonl bench.jsonl
 
-Files are those of tools/benchmark.py confidence. The weights printed go into
-piccolo/confidence/confidence.py; the tables show how reliable the probabilities are on each set, by the model
-just learnt or else the one in use, and the fraction of true poses in the region of the covariance.
+The files are those of tools/benchmark.py confidence. Prints the fitted weights, to be copied to
+piccolo/confidence/confidence.py, and tables for each set of trials: how reliable the probabilities of the
+fitted model are (without --fit, of the model in use), and the fraction of true poses inside the confidence
+regions of the covariance.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 Array = NDArray[np.float64]
@@ -164,8 +165,8 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add all options."""
-    option(parser, "--fit FILE ...", "trials to learn from", default=[])
-    option(parser, "--check FILE ...", "other trials", default=[])
+    option(parser, "--fit FILE ...", "trials to which the weights are fitted", default=[])
+    option(parser, "--check FILE ...", "other trials, on which they are checked", default=[])
     option(parser, "--without CASE ...", "leave these cases out", default=[])
 
 

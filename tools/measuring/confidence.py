@@ -37,9 +37,10 @@ EPILOG = """\
 example:
   python tools/benchmark.py confidence --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
 
-Seeds make rooms, and places that look the same from several positions; scenes are folders with cloud.ply,
-queries.json and images, each panorama tried in each cloud. A false answer is a pose called localized that is
-over 0.1 m or 5 degrees off. Trials are lines of JSON for tools/benchmark.py calibration; a table on stdout.
+A seed makes rooms, and places that look the same from several positions. Scenes are folders with cloud.ply,
+queries.json and images; each panorama is localized in each cloud. A false answer is a pose with the status
+localized that is more than 0.1 m or 5 degrees off. Writes the trials as JSON lines for tools/benchmark.py
+calibration, and prints a table.
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
@@ -268,11 +269,17 @@ def pose_json(pose: Pose) -> dict[str, object]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add all options."""
-    option(parser, "--seeds FIRST END", required=True)
-    option(parser, "--kinds KIND ...", "alike places", choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
-    option(parser, "--scenes FOLDER ...", default=[])
-    option(parser, "--out FILE", "JSON lines, written as they come", required=True)
-    option(parser, "--threads N", default=num_cores())
+    option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", required=True)
+    option(
+        parser,
+        "--kinds KIND ...",
+        "kinds of places that look alike",
+        choices=ALIKE_KINDS,
+        default=list(ALIKE_KINDS),
+    )
+    option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
+    option(parser, "--out FILE", "append a JSON line per trial", required=True)
+    option(parser, "--threads N", "number of threads", default=num_cores())
 
 
 def run(arguments: argparse.Namespace) -> int:

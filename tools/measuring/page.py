@@ -1,4 +1,4 @@
-"""Measure accuracy, damage, phone photos, time and memory, and write all of it as one page of Markdown."""
+"""Measure accuracy, damage, phone photos, time and memory, and write them as one page of Markdown."""
 
 import argparse
 import datetime
@@ -43,8 +43,8 @@ examples:
   python tools/benchmark.py all --scenes BENCH/house --only kernels
 
 A folder has cloud.ply, images, and queries.json with true poses. If it has cameras/, its pictures are photos,
-each with a calibration cameras/NAME.camera.json; else they are panoramas. Damage and phone photos are made of
-the panoramas of the variant clean, or of all if there is none.
+each with a calibration cameras/NAME.camera.json; else they are panoramas. Damaged pictures and phone photos
+are made from the panoramas of the variant clean, or of all if there is none.
 """
 ROOT = Path(__file__).resolve().parents[2]
 PAPER_SETTINGS = PaperSettings()
@@ -358,13 +358,17 @@ def page_head(arguments: argparse.Namespace) -> str:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
-    option(parser, "--only PART ...", "measure these parts alone", choices=PARTS, default=list(PARTS))
-    option(parser, "--damaged N", "panoramas of each scene that are damaged", default=4)
-    option(parser, "--photos N", "phone photos cut out of the panoramas of each scene", default=12)
+    option(parser, "--only PART ...", "measure only these parts", choices=PARTS, default=list(PARTS))
+    option(parser, "--damaged N", "number of panoramas of each scene to damage", default=4)
+    option(
+        parser, "--photos N", "number of phone photos to cut out of the panoramas of each scene", default=12
+    )
     sizes = [10_000, 100_000, 1_000_000]
-    option(parser, "--points N ...", "of the first scene, resampled", nargs="*", default=sizes)
-    option(parser, "--rooms N ...", "made rooms, 1 to 256", nargs="*", default=[1, 16, 64])
-    option(parser, "--out FILE", "the page; by default it is printed")
+    option(parser, "--points N ...", "sizes to which the first scene is resampled", nargs="*", default=sizes)
+    option(
+        parser, "--rooms N ...", "sizes of synthetic scenes, 1 to 256 rooms", nargs="*", default=[1, 16, 64]
+    )
+    option(parser, "--out FILE", "write the page here (default: print it)")
 
 
 def run(arguments: argparse.Namespace) -> int:

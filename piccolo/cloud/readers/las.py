@@ -91,10 +91,8 @@ class LasHeader(NamedTuple):
         fields["class"] = ("u1", CLASS_BYTE_OLD if self.point_format < 6 else CLASS_BYTE)
         if self.has_colors:
             fields["rgb"] = ("3<u2", COLORS_BYTE[self.point_format])
-        kinds, begins = zip(*fields.values(), strict=True)
-        return np.dtype(
-            {"names": [*fields], "formats": kinds, "offsets": begins, "itemsize": self.record_size}
-        )
+        kinds, at = zip(*fields.values(), strict=True)
+        return np.dtype({"names": [*fields], "formats": kinds, "offsets": at, "itemsize": self.record_size})
 
     @property
     def has_colors(self) -> bool:
@@ -129,14 +127,15 @@ def read_header(path: Path) -> LasHeader:
         wrong = f"records of {record_size} bytes, wanted {least} or more in point format {point_format}"
         raise InputError(f"{path}: {wrong if least else f'unknown point format {point_format}, {WANTED}'}")
     if not (np.isfinite([scales, offsets]).all() and scales.all()):
-        found = f"scales {scales} and offsets {offsets}"
-        raise InputError(f"{path}: {found}, wanted finite ones and no scale of 0")
+        raise InputError(f"{path}: scales {scales} and offsets {offsets}, wanted finite ones and no scale 0")
     room = (size - points_offset) // record_size
     if num_points == 0 or (num_points > room and not is_compressed):
         promised = f"promises {num_points} points of {record_size} bytes, found room for {room}"
         raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
-    sizes = size, header_size, points_offset, num_vlrs, point_format, record_size, num_points
-    return LasHeader(path, *sizes, scales, offsets, is_compressed)
+    return LasHeader(
+        path, size, header_size, points_offset, num_vlrs, point_format, record_size, num_points,
+        scales, offsets, is_compressed,
+    )  # fmt: skip
 
 
 class LasLayout(NamedTuple):
@@ -307,7 +306,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         path,
         lambda: (_read_colors(header, records, is_8_bit) for records in _chunks(header, layout)),
         header.num_points,
-        (f"{note} (largest value {brightest} in {num_samples} points looked at)",) if is_8_bit else (),
+        (f"{note} (largest value {brightest} in {num_samples} points checked)",) if is_8_bit else (),
     )
 
 
@@ -315,12 +314,12 @@ def _gray_source(
     header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
 ) -> PointSource:
     if not options.intensity_as_gray:
-        why = f"red green blue are 0 in all {num_samples} points looked at"
+        why = f"red green blue are 0 in all {num_samples} points checked"
         if not header.has_colors:
             why = f"point format {header.point_format} has intensity only"
         largest, num_samples = _largest(header, layout, "intensity")
         if largest == 0:
-            why += f"; its intensity is 0 in all {num_samples} points looked at"
+            why += f"; its intensity is 0 in all {num_samples} points checked"
             raise InputError(f"{header.path}: has neither colours nor intensity: {why}, {WANTED}")
         raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
     read_chunks = intensity_reader(header.path, lambda: _read_scalar(header, layout, "intensity"))

@@ -61,7 +61,7 @@ class ArrayInFile(NamedTuple):
             row = np.dtype((self.dtype, self.shape[1:]))
             yield from read_records(self.path, self.offset, self.shape[0], row)
             return
-        with damage_named(self.path), _open(self.path, self.member) as file:
+        with naming_damage(self.path), _open(self.path, self.member) as file:
             file.read(self.offset)  # not seek, so that the checksum covers all
             content = file.read(math.prod(self.shape) * self.dtype.itemsize)
             order: Literal["F", "C"] = "F" if self.is_fortran else "C"
@@ -105,7 +105,7 @@ def has_npz_magic(head: bytes) -> bool:
 
 
 @contextmanager
-def damage_named(path: Path, wanted: str = WANTED) -> Iterator[None]:
+def naming_damage(path: Path, wanted: str = WANTED) -> Iterator[None]:
     """Turn the errors of zipfile, zlib and NumPy's header parser on damaged files into an InputError."""
     try:
         yield
@@ -127,7 +127,7 @@ def _open(path: Path, member: str | None) -> IO[bytes]:
 
 def _members(path: Path) -> list[zipfile.ZipInfo]:
     """Return an archive's arrays of points and of colours."""
-    with damage_named(path), zipfile.ZipFile(path) as archive:
+    with naming_damage(path), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
     names = [name for names in (POINTS_NAMES, COLORS_NAMES) for name in names if name in members]
     if [name in COLORS_NAMES for name in names] != [False, True]:
@@ -147,7 +147,7 @@ def _members(path: Path) -> list[zipfile.ZipInfo]:
 
 def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     """Return the array in a file or member of `size` bytes, by its header."""
-    with damage_named(path), _open(path, member) as file:
+    with naming_damage(path), _open(path, member) as file:
         shape, is_fortran, dtype, offset = read_header(file.read(MAX_HEAD_SIZE))
     array = ArrayInFile(path, member, shape, is_fortran, dtype, offset)
     if dtype.hasobject or dtype.itemsize == 0 or any(count < 0 for count in shape):

@@ -39,7 +39,7 @@ DATASETS = {
     stanford.NAME: Dataset("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.list_scenes),
     research.OMNISCENES: Dataset("OmniScenes, all splits", research.list_omniscenes),
     research.MPO: Dataset(
-        "MPO scans with panoramas, moved at random as in the PICCOLO paper", research.list_mpo
+        "MPO scans with panoramas, moved randomly as in the PICCOLO paper", research.list_mpo
     ),
     research.MATTERPORT: Dataset("Matterport3D skyboxes and house meshes", research.list_matterport),
     research.LOC360: Dataset("360Loc 360-degree queries, with a cloud of your own", research.list_360loc),

@@ -46,7 +46,7 @@ class Check(NamedTuple):
         """A line for the user that says what is wrong."""
         (best, count), *_ = Counter(check.best for check in self.panoramas).most_common()
         scores = ", ".join(f"{check.score:.2f}" for check in self.panoramas)
-        text = f"the poses don't fit the panoramas: scores {scores}, wanted {MIN_SCORE} and more"
+        text = f"the poses don't fit the panoramas: scores {scores}, wanted {MIN_SCORE} or more"
         if best != AS_GIVEN and 2 * count > len(self.panoramas):
             found = np.median([check.best_score for check in self.panoramas if check.best == best])
             return f"{text}; {found:.2f} if {best}"

@@ -122,7 +122,7 @@ def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
     direction = row.get("direction", options.direction)
     for name, value, known in (("axes", axes, AXES), ("direction", direction, DIRECTIONS)):
         if value not in known:
-            wanted = f"wanted one of {', '.join(known)} in the list or by --{name}"
+            wanted = f"wanted one of {', '.join(known)} in the list, or as `{name}`"
             raise InputError(f"{where}: found the {name} {value}, {wanted}")
     try:
         numbers = np.array([float(row[name]) for name in NUMBERS])

@@ -90,8 +90,10 @@ def _pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
         for path in sorted(rgb.glob("camera_*_rgb.png")):
             if room := PICTURE.match(path.name):
                 stem = path.name.removesuffix("_rgb.png")
-                files = (pose / f"{stem}_pose.json", semantic / f"{stem}_semantic.png")
-                pictures[match[1], room[1]].append(Picture(path, match[1] + match[2], *files))
+                pose_file = pose / f"{stem}_pose.json"
+                labels_file = semantic / f"{stem}_semantic.png"
+                picture = Picture(path, match[1] + match[2], pose_file, labels_file)
+                pictures[match[1], room[1]].append(picture)
     return pictures
 
 
@@ -107,7 +109,7 @@ def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[Clo
     found = _glob(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
     if found and not usable:
-        text = f"found a cloud of the {ALIGNED}, whose rooms are turned one by one"
+        text = f"found a cloud of the {ALIGNED}, whose rooms are rotated one by one"
         raise InputError(f"{found[0]}: {text}, wanted those of Stanford3dDataset_v1.2")
     if not has_labels:
         return tuple(CloudPart(path) for path in usable[:1])

@@ -86,11 +86,13 @@ class QueryResult:
         with document_of(text, FORMAT, "evaluation") as row:
             distance = row["position_error"]
             angle_deg = row["rotation_error_deg"]
-            words = str(row["scene"]), str(row["image"]), str(row["variant"])
+            scene = str(row["scene"])
+            image = str(row["image"])
+            variant = str(row["variant"])
             position_error = np.inf if distance is None else float(distance)
             rotation_error = np.inf if angle_deg is None else float(np.radians(angle_deg))
             result = Result.from_json(json.dumps(row["result"]))
-            return cls(*words, row["is_in_box"], position_error, rotation_error, result)
+            return cls(scene, image, variant, row["is_in_box"], position_error, rotation_error, result)
 
 
 def make_query_result(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:

@@ -98,9 +98,18 @@ def summarize_walk(frames: Sequence[Frame], thresholds: Thresholds = PAPER_THRES
         if a.sure_pose and b.sure_pose
     ]
     sure_times = [_time(frame) - _time(frames[0]) for frame in frames if frame.is_localized]
-    counts = len(frames), sum(is_correct), sum(is_sure), num_wrong, len(bad), num_refused
     squared_steps = np.array(steps).reshape(-1, 2) ** 2
-    return WalkSummary(*counts, np.array(squared), squared_steps, min(sure_times, default=None))
+    return WalkSummary(
+        len(frames),
+        sum(is_correct),
+        sum(is_sure),
+        num_wrong,
+        len(bad),
+        num_refused,
+        np.array(squared),
+        squared_steps,
+        min(sure_times, default=None),
+    )
 
 
 def summarize_all(summaries: Sequence[WalkSummary]) -> WalkSummary:

@@ -319,15 +319,15 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
 OFFSET = frozenset({"offset"})
 MODEL = OFFSET | {"size"}
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; `out` is a new folder"
-NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder that `images` names"
-POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder that `images` names"
+NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder of `images`"
+POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder of `images`"
 # a blank ends a name, for COLMAP as for the readers in Python
 COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=rf"\s|{NO_UTF8}", cameras="own")
 NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL, cameras="spheres")
 OPENSFM_TEXT = "reconstruction.json of OpenSfM"
 OPENSFM = Format("opensfm", OPENSFM_TEXT, write_opensfm, MODEL, cameras="spheres", check=_check_shape)
 CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
-TRAJECTORY = "trajectory for evo and others"
+TRAJECTORY = "trajectory for evo and other tools"
 TUM = Format("tum", TRAJECTORY, write_tum, OFFSET | {"axes", "timestamps"}, forbidden="")
 KITTI = Format("kitti", TRAJECTORY, write_kitti, OFFSET | {"axes"}, forbidden="")
 NOT_IN_POTREE = rf"[\"\t\n\r]|{NO_UTF8}"

@@ -55,7 +55,7 @@ def write(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     names = [image.name if options.images else Path(image.name).name for image in images]
     if len(set(names)) < len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{twice}: two pictures have this name; `images` FOLDER tells them apart")
+        raise InputError(f"{twice}: two pictures have this name; use `images` FOLDER to distinguish them")
     with replacing_folder(out) as folder:
         for name, image in zip(names, images, strict=True):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)

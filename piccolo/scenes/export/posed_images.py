@@ -141,7 +141,7 @@ def select_images(
             key = image.name if form.has_unique_names else str(index)
             if key in posed:
                 clouds = f"{posed[key].result.cloud_name}, {result.cloud_name}"
-                raise InputError(f"{key}: has two results (clouds {clouds}); `cloud` chooses one")
+                raise InputError(f"{key}: has two results (clouds {clouds}); choose one with `cloud`")
             posed[key] = image
     if not posed:
         reason, names = next(iter(left_out.items()))
@@ -190,7 +190,7 @@ def _pictures(result: Result, form: Format) -> list[tuple[Path, Mount | None]]:
     if not mounts or form.cameras == "any":
         return [(path, None)]
     if form.cameras == "spheres":
-        found = f"found a photo by the model {mounts[0].camera.model}"
+        found = f"found a photo with the camera model {mounts[0].camera.model}"
         raise InputError(f"{path}: {found}, wanted a sphere for {form.name}; the format colmap has cameras")
     if mounts[0].image is not None:
         return list(zip(Calibration(str(path), mounts).images_in(path), mounts, strict=True))

@@ -101,20 +101,20 @@ class Plan(NamedTuple):
         return Door(1, False, max(0.9, 0.3 * float(self.size[0])))
 
     def slots(self) -> list[Slot]:
-        """The places of the rooms, each storey's as far as it has rooms."""
+        """Return the places of the rooms, storey by storey; of the last storey only those with a room."""
         per_storey = -(-self.num_rooms // self.num_storeys)
         places = itertools.product(range(self.num_corridors), range(self.num_columns), (True, False))
         own = list(itertools.islice(places, per_storey))
         return [(storey, *place) for storey in range(self.num_storeys) for place in own][: self.num_rooms]
 
     def corner(self, slot: Slot) -> Array:
-        """The corner (3,) of a slot's room [m]."""
+        """Return the corner (3,) of a slot's room [m]."""
         storey, corridor, column, is_south = slot
         y = corridor * self.depth + (0.0 if is_south else self.size[1] + CORRIDOR_WIDTH + 2.0 * BETWEEN)
         return np.array([column * (self.size[0] + BETWEEN), y, storey * self.height])
 
     def flight(self, storey: int) -> Flight:
-        """The stairs from a storey to the next, on alternate sides of the west hall."""
+        """Return the stairs from a storey to the next, on alternate sides of the west hall."""
         middle = 0.8 + FLIGHT_WIDTH / 2
         x = -BETWEEN - HALL_WIDTH + (middle if storey % 2 == 0 else HALL_WIDTH - middle)
         run = TREAD * np.ceil(self.height / RISE)
@@ -134,30 +134,30 @@ class Office:
 
 
 def plan_building(size: Array, num_rooms: int, num_storeys: int) -> Plan:
-    """The plan of a building; InputError if there can be none."""
+    """Plan a building; InputError if no such building is possible."""
     size = np.asarray(size, float)
     if not ((size >= MIN_ROOM) & (size <= MAX_SIZE)).all():
         wanted = f"wanted {list(MIN_ROOM)} to {MAX_SIZE} m in a building"
-        raise InputError(f"size: found {size.tolist()}, {wanted}")
+        raise InputError(f"`size`: found {size.tolist()}, {wanted}")
     if not 1 <= num_storeys <= MAX_STOREYS:
-        raise InputError(f"storeys: found {num_storeys}, wanted 1 to {MAX_STOREYS}")
+        raise InputError(f"`storeys`: found {num_storeys}, wanted 1 to {MAX_STOREYS}")
     if not num_storeys <= num_rooms <= MAX_ROOMS:
-        raise InputError(f"rooms: found {num_rooms}, wanted one a storey to {MAX_ROOMS}")
+        raise InputError(f"`rooms`: found {num_rooms}, wanted one per storey to {MAX_ROOMS}")
     per_storey = -(-num_rooms // num_storeys)
     num_corridors = -(-per_storey // (2 * COLUMNS))
     plan = Plan(size, num_rooms, num_storeys, num_corridors, -(-per_storey // (2 * num_corridors)))
     if num_storeys > 1 and 2.0 * FLIGHT_BEGIN + plan.flight(0).run > plan.num_corridors * plan.depth:
         raise InputError(
-            f"size: rooms of {size.tolist()} m are too high for stairs in the halls between them"
+            f"`size`: rooms of {size.tolist()} m are too high for stairs in the halls between them"
         )
     return plan
 
 
 def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins: float) -> Office:
-    """A building of rooms of `size` (3,) [m], of which a fraction `twins` are exact copies of others."""
+    """Make a building of rooms of `size` (3,) [m]; a fraction `twins` of them are exact copies of others."""
     plan = plan_building(size, num_rooms, num_storeys)
     if not 0.0 <= twins < 1.0:
-        raise InputError(f"twins: found {twins}, wanted at least 0 and less than 1")
+        raise InputError(f"`twins`: found {twins}, wanted at least 0 and less than 1")
     rng = np.random.default_rng([seed, 50])
     copies = np.arange(num_rooms)
     order = rng.permutation(num_rooms)
@@ -182,7 +182,7 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
 
 
 def place(room: Room, corner: Array, is_turned: bool) -> Room:
-    """A room whose corner is the origin, moved to `corner` (3,), turned by half a turn if asked."""
+    """Move a room from the origin to `corner` (3,), turned by 180 degrees if `is_turned`."""
     sign = np.ones(3)
     shift = np.array(corner)
     if is_turned:
@@ -195,7 +195,7 @@ def place(room: Room, corner: Array, is_turned: bool) -> Room:
 
 
 def _room_of(b: RoomBuilder, size: Array) -> Room:
-    """The room that was built, each box lit by the nearest of the lamps along the longer side."""
+    """Return the finished room; the nearest of the lamps along its longer side lights each box."""
     along = int(np.argmax(size[:2]))
     num_lamps = max(1, round(size[along] / LAMP_DISTANCE))
     lamps = np.tile(size * [0.5, 0.5, 0.93], (num_lamps, 1))
@@ -207,7 +207,7 @@ def _room_of(b: RoomBuilder, size: Array) -> Room:
 
 
 def _parts(room: Room) -> Iterator[Room]:
-    """A long room in parts of about LAMP_DISTANCE."""
+    """Yield a long room in parts of about LAMP_DISTANCE."""
     along = int(np.argmax(room.size[:2]))
     num_parts = max(1, round(room.size[along] / LAMP_DISTANCE))
     for k in range(num_parts):
@@ -254,7 +254,7 @@ def corridors(seed: int, plan: Plan, are_alike: bool) -> Iterator[Room]:
 
 
 def halls(seed: int, plan: Plan) -> Iterator[Room]:
-    """The halls at both ends of the corridors of every storey, all different."""
+    """Yield the halls at both ends of the corridors of every storey, all different."""
     y = plan.num_corridors * plan.depth - BETWEEN
     for storey, is_east in itertools.product(range(plan.num_storeys), (False, True)):
         left = plan.length + BETWEEN if is_east else -BETWEEN - HALL_WIDTH
@@ -282,7 +282,7 @@ def halls(seed: int, plan: Plan) -> Iterator[Room]:
 
 
 def _around(b: RoomBuilder, flight: Flight) -> tuple[Array, Array]:
-    """A flight of stairs with what is walked on before and after it, relative to the builder's corner."""
+    """Return the box (low, high) of stairs and landings, relative to the builder's corner."""
     aside = np.array([FLIGHT_WIDTH / 2 + 0.1, 1.1, 1.0])
     return flight.foot - aside - b.corner, flight.top + aside + [0.0, 0.0, 1.0] - b.corner
 
@@ -290,7 +290,7 @@ def _around(b: RoomBuilder, flight: Flight) -> tuple[Array, Array]:
 def _put_slab(
     b: RoomBuilder, size: Array, ends: tuple[float, float], hole: Flight | None, paint: Array
 ) -> None:
-    """A floor or ceiling between two heights, open above a flight of stairs."""
+    """Add a floor or ceiling between two heights, open above a flight of stairs."""
     d = WALL_THICKNESS
     east = size[0] + d
     north = size[1] + d
@@ -307,7 +307,7 @@ def _put_slab(
 
 
 def _put_steps(b: RoomBuilder, flight: Flight) -> None:
-    """Steps of stairs, solid down to the floor."""
+    """Add the steps of stairs, solid down to the floor."""
     foot = flight.foot - b.corner
     height = flight.top[2] - flight.foot[2]
     num_steps = round(flight.run / TREAD)

@@ -22,7 +22,7 @@ Integer = int | np.int64  # in a kernel
 
 @inline_kernel
 def hash_unit(i: Integer, j: Integer, seed: Integer) -> float:
-    """A number in [0, 1) that looks random, of two integers and a seed."""
+    """Hash two integers and a seed to a pseudo-random number in [0, 1)."""
     h = (i * 374761393 + j * 668265263 + seed * 2147483647) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
     h = ((h ^ (h >> 15)) * 1911520717) & 0x7FFFFFFF

@@ -33,7 +33,7 @@ class RoomBuilder:
     clear: list[tuple[Array, Array]] = field(default_factory=list)  # low, high (3,) of places to be left free
 
     def paint(self, patterns: tuple[int, ...], low: float, high: float) -> Array:
-        """A row of Room.materials: a random pattern in two related colours with channels in [low, high]."""
+        """Draw a row of Room.materials: a pattern in two related colours with channels in [low, high]."""
         base = self.rng.uniform(low, high, 3)
         base = base.mean() + 0.5 * (base - base.mean())  # paints are paler than colours drawn at random
         other = np.clip(base * self.rng.uniform(0.55, 0.9) + self.rng.normal(0, 0.05, 3), 0, 1)
@@ -74,7 +74,7 @@ class RoomBuilder:
                 return
 
     def room(self, size: Array, light: Array) -> "Room":
-        """The room of `size` (3,) [m] of all boxes, its lamp at `light` (3,) [m]."""
+        """Return the room of `size` (3,) [m] of all boxes, its lamp at `light` (3,) [m]."""
         boxes = np.stack(self.boxes)
         return Room(self.corner, size, boxes, np.stack(self.materials), light, np.array(self.labels))
 
@@ -145,7 +145,7 @@ def put_walls(b: RoomBuilder, size: Array, doors: Sequence[Door]) -> None:
 def put_wall(
     b: RoomBuilder, size: Array, wall: tuple[int, bool], paint: Array, doors: Sequence[Door]
 ) -> None:
-    """The wall that crosses an axis at its near or far end: pieces beside its doors and above them."""
+    """Add the wall at the near or far end of an axis: pieces next to its doors and above them."""
     axis, is_far = wall
     along = 1 - axis
 
@@ -192,7 +192,7 @@ def put_hangings(b: RoomBuilder, size: Array) -> None:
 
 
 def put_table(b: RoomBuilder, at: Array, yaw: float) -> None:
-    """A table with a thing on it, at (2,) of the floor."""
+    """Add a table with an object on it, at (2,) of the floor."""
     length, width, height = b.rng.uniform([0.9, 0.6, 0.5], [1.6, 0.9, 0.8])
     wood = b.paint((PLANKS, PLAIN), 0.2, 0.7)
     b.put([*at, height], [length, width, 0.04], wood, yaw)
@@ -203,7 +203,7 @@ def put_table(b: RoomBuilder, at: Array, yaw: float) -> None:
 
 
 def put_shelf(b: RoomBuilder, at: Array, yaw: float) -> None:
-    """A shelf with books, at (2,) of the floor."""
+    """Add a shelf with books, at (2,) of the floor."""
     height = b.rng.uniform(1.2, 2.0)
     frame = b.paint((PLANKS, PLAIN), 0.2, 0.8)
     b.put([*at, height / 2], [0.9, 0.02, height], frame, yaw)
@@ -215,7 +215,7 @@ def put_shelf(b: RoomBuilder, at: Array, yaw: float) -> None:
 
 
 def put_sofa(b: RoomBuilder, at: Array, yaw: float) -> None:
-    """A sofa, at (2,) of the floor."""
+    """Add a sofa, at (2,) of the floor."""
     length = b.rng.uniform(1.2, 2.0)
     cloth = b.paint((PLAIN, STRIPES, CHECKS), 0.15, 0.8)
     b.put([*at, 0.22], [length, 0.8, 0.44], cloth, yaw)
@@ -223,7 +223,7 @@ def put_sofa(b: RoomBuilder, at: Array, yaw: float) -> None:
 
 
 def put_crate(b: RoomBuilder, at: Array, yaw: float) -> None:
-    """A crate, at (2,) of the floor."""
+    """Add a crate, at (2,) of the floor."""
     size = b.rng.uniform([0.3, 0.3, 0.3], [0.7, 0.7, 1.3])
     b.put([*at, size[2] / 2], size, b.paint((PLANKS, CHECKS, PICTURE, PLAIN), 0.15, 0.9), yaw)
 
@@ -231,7 +231,7 @@ def put_crate(b: RoomBuilder, at: Array, yaw: float) -> None:
 def put_furniture(
     b: RoomBuilder, size: Array, moves: np.random.Generator | None = None, area: float = 3.0
 ) -> None:
-    """A rug and about one piece in an area [m2]; half of the pieces go elsewhere if there are `moves`."""
+    """Add a rug and a piece of furniture per `area` [m2]; with `moves` half of them stand elsewhere."""
     num_pieces = max(3, round(size[0] * size[1] / area))
     seeds = b.rng.integers(0, 1 << 30, num_pieces)
     rug = [size[0] * b.rng.uniform(0.3, 0.6), size[1] * b.rng.uniform(0.3, 0.6), 0.01]
@@ -251,7 +251,7 @@ def put_furniture(
 
 
 def make_room(seed: int, size: Array, corner: Array, changed: int = 0, doors: Sequence[Door] = ()) -> Room:
-    """The room of `seed`; the same shell with other furniture and more crates for each `changed` above 0."""
+    """Make the room of `seed`; each `changed` above 0 has the same shell, other furniture and more crates."""
     shell_rng = np.random.default_rng([seed, 0])
     b = RoomBuilder(shell_rng, np.asarray(corner, dtype=float))
     size = np.asarray(size, dtype=float)
@@ -270,7 +270,7 @@ def make_room(seed: int, size: Array, corner: Array, changed: int = 0, doors: Se
 
 
 def join_rooms(rooms: Sequence[Room]) -> Room:
-    """The first of some rooms with the boxes of all, each lit as in its own."""
+    """Return the first of several rooms with the boxes of all, each lit as in its own room."""
     return rooms[0]._replace(
         boxes=np.concatenate([room.boxes for room in rooms]),
         materials=np.concatenate([room.materials for room in rooms]),

@@ -41,13 +41,15 @@ class WalkOptions:
     def __post_init__(self) -> None:
         """Refuse what means nothing."""
         if self.variant not in WALK_VARIANTS:
-            raise InputError(f"variants: found {self.variant}, wanted {' or '.join(WALK_VARIANTS)} in a walk")
+            raise InputError(
+                f"`variants`: found {self.variant}, wanted {' or '.join(WALK_VARIANTS)} in a walk"
+            )
         if not 0.1 <= self.rate <= 120.0:
-            raise InputError(f"frame-rate: found {self.rate}, wanted 0.1 to 120 a second")
+            raise InputError(f"`frame_rate`: found {self.rate}, wanted 0.1 to 120 per second")
         if not 0.0 <= self.bad_fraction <= 1.0:
-            raise InputError(f"bad-frames: found {self.bad_fraction}, wanted 0 to 1")
+            raise InputError(f"`bad_frames`: found {self.bad_fraction}, wanted 0 to 1")
         if not 0 <= self.num_people <= MAX_PEOPLE:
-            raise InputError(f"people: found {self.num_people}, wanted 0 to {MAX_PEOPLE}")
+            raise InputError(f"`people`: found {self.num_people}, wanted 0 to {MAX_PEOPLE}")
 
 
 class Frame(NamedTuple):
@@ -62,7 +64,7 @@ class Frame(NamedTuple):
 def frames_of(
     office: Office, walk: Walk, options: WalkOptions, number: int, workers: Workers
 ) -> Iterator[Frame]:
-    """The frames of the walk of a number in a building, one after another."""
+    """Yield the frames of walk `number` in a building, one after another."""
     seed = office.world.seed
     times = [k / options.rate for k in range(walk.num_frames(options.rate))]
     rng = np.random.default_rng([seed, 54, number])
@@ -86,7 +88,7 @@ def frames_of(
 
 
 def _kinds(count: int, options: WalkOptions, rng: np.random.Generator) -> list[str]:
-    """The kind of each frame: a fraction of them bad, of each bad kind about as many."""
+    """Draw the kind of each frame: a fraction is bad, with about as many of each bad kind."""
     kinds = [options.variant] * count
     for k, frame in enumerate(rng.permutation(count)[: round(options.bad_fraction * count)]):
         kinds[frame] = BAD_KINDS[k % len(BAD_KINDS)]
@@ -94,7 +96,7 @@ def _kinds(count: int, options: WalkOptions, rng: np.random.Generator) -> list[s
 
 
 def _exposures(walk: Walk, time: float) -> list[Pose]:
-    """The camera while the shutter is open."""
+    """Return the poses of the camera while the shutter is open."""
     moments = time + SHUTTER * (np.arange(NUM_EXPOSURES) + 0.5 - NUM_EXPOSURES / 2) / NUM_EXPOSURES
     return [walk.pose(float(moment)) for moment in np.clip(moments, 0.0, walk.duration)]
 
@@ -111,7 +113,7 @@ class Person:
         self.paints = [b.paint(p, 0.1, 0.9) for p in ((PLAIN,), (STRIPES, CHECKS, PLAIN), (PLAIN,))]
 
     def at(self, time: float) -> Room | None:
-        """The boxes of legs, trunk and head, and their lamp; None if not on the way."""
+        """Return the boxes of legs, trunk and head, and their lamp; None if the person is not there."""
         moment = time - self.delay
         if not 0.0 <= moment <= self.walk.duration:
             return None

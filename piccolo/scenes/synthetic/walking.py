@@ -93,18 +93,18 @@ class Floors:
         part |= is_along & (np.abs(c * dy - s * dx) <= box[4] + CELL / 2)
 
     def position(self, cell: int) -> Array:
-        """The middle (3,) of a cell, on the floor [m]."""
+        """Return the middle (3,) of a cell, on the floor [m]."""
         storey, y, x = np.unravel_index(cell, self.clearance.shape)
         return np.array([*(self.origin + CELL * (np.array([x, y]) + 0.5)), self.office.levels[storey]])
 
     def cell(self, position: Array) -> int:
-        """The cell of a position (3,) on a floor."""
+        """Return the cell of a position (3,) on a floor."""
         storey = int(np.abs(self.office.levels - position[2]).argmin())
         x, y = ((position[:2] - self.origin) / CELL).astype(int)
         return int(np.ravel_multi_index((storey, y, x), self.clearance.shape))
 
     def cells_of_room(self, number: int) -> Cells:
-        """The cells of a room that a person can stand on."""
+        """Return the cells of a room that a person can stand on."""
         room = self.office.world.rooms[number]
         storey = int(np.abs(self.office.levels - room.corner[2]).argmin())
         x0, y0 = ((room.corner[:2] - self.origin) / CELL).astype(int)
@@ -113,7 +113,7 @@ class Floors:
         return np.asarray(cells[self.clearance[storey, y0:y1, x0:x1] >= MIN_DISTANCE + CELL])
 
     def reach(self, cell: int) -> Reach:
-        """The cheapest ways from a cell to all others."""
+        """Return the cheapest paths from a cell to all others."""
         return Reach(*dijkstra(self.costs, directed=False, indices=cell, return_predecessors=True))
 
     def way(self, reach: Reach, cell: int) -> Array:
@@ -165,7 +165,7 @@ class Walk:
         return TICK * (len(self.feet) - 1)
 
     def num_frames(self, rate: float) -> int:
-        """The number of frames, `rate` a second from the beginning on."""
+        """Return the number of frames, `rate` a second from the beginning on."""
         return int(self.duration * rate + 1e-9) + 1
 
     def _at(self, values: Array, time: float) -> Array:
@@ -175,11 +175,11 @@ class Walk:
         return np.asarray((1.0 - f) * values[k] + f * values[k + 1])
 
     def foot(self, time: float) -> Array:
-        """The place on which the person stands (3,) [m]."""
+        """Return the position of the person's feet (3,) [m]."""
         return self._at(self.feet, time)
 
     def yaw(self, time: float) -> float:
-        """The heading of the camera [rad]."""
+        """Return the heading of the camera [rad]."""
         return float(self._at(self.yaws, time))
 
     def pose(self, time: float) -> Pose:
@@ -199,7 +199,7 @@ class Walker:
         self.everywhere = self.floors.reach(self.floors.cell(middle))  # but what furniture encloses
 
     def walk(self, length: float, rng: np.random.Generator) -> Walk:
-        """A walk of so many metres through rooms at random."""
+        """Make a walk of `length` [m] through random rooms."""
         return time_legs(smooth_legs(self.floors, self._legs(length, rng), length), rng)
 
     def _legs(self, length: float, rng: np.random.Generator) -> list[Array]:
@@ -219,7 +219,7 @@ class Walker:
         return legs
 
     def _next(self, reach: Reach, seen: set[int], rng: np.random.Generator) -> int:
-        """The next room, mostly one of the nearest that were not seen; all again when all were."""
+        """Draw the next room, mostly one of the nearest not yet visited; start over when all were visited."""
         if len(seen) >= self.office.num_rooms:
             seen.clear()
         unseen = [k for k in range(self.office.num_rooms) if k not in seen]
@@ -228,7 +228,7 @@ class Walker:
         return int(rng.choice(order[:NUM_NEAR] if rng.random() < NEAR_FRACTION else order))
 
     def _reach_cells(self, reach: Reach, number: int) -> Cells:
-        """The cells of a room that can be reached: at least those before its door."""
+        """Return the cells of a room that can be reached: at least those in front of its door."""
         cells = self.floors.cells_of_room(number)
         return cells[np.isfinite(reach.costs[cells])]
 
@@ -251,19 +251,19 @@ def smooth_legs(floors: Floors, ways: Sequence[Array], length: float) -> list[Ar
 
 
 def _clearance(floors: Floors, leg: Array) -> float:
-    """The least clearance of points (N, 3) that are on a floor, not on stairs [m]."""
+    """Return the smallest clearance [m] of those of the points (N, 3) that are on a floor, not on stairs."""
     heights = np.abs(leg[:, 2:] - floors.office.levels).min(axis=1)
     cells = [floors.cell(position) for position in leg[heights < 1e-3]]
     return float(floors.clearance.ravel()[cells].min())
 
 
 def _distances(points: Array) -> Array:
-    """The way (N,) along points (N, 3) [m], level."""
+    """Return the horizontal distance (N,) along a path of points (N, 3) [m]."""
     return np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points[:, :2], axis=0), axis=1))])
 
 
 def _smooth(way: Array, sigma: float) -> Array:
-    """A way (N, 3) evenly spaced, its corners rounded in the plan; its ends stay."""
+    """Resample a path (N, 3) evenly and round its corners in the horizontal plane; its ends stay."""
     distance = _distances(way)
     at = np.linspace(0.0, distance[-1], max(2, int(distance[-1] / SPACING)))
     points = np.column_stack([np.interp(at, distance, way[:, k]) for k in range(3)])
@@ -275,7 +275,7 @@ def _smooth(way: Array, sigma: float) -> Array:
 
 
 def speeds(leg: Array, pace: float) -> Array:
-    """The speed (N,) [m/s] at points (N, 3): slower in turns and on stairs, from slowest to slowest."""
+    """Return the speed (N,) [m/s] at points (N, 3): slower in turns, on stairs and at both ends."""
     distance = _distances(leg)
     step = np.gradient(leg, axis=0)
     headings = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
@@ -289,7 +289,7 @@ def speeds(leg: Array, pace: float) -> Array:
 
 
 def time_legs(legs: Sequence[Array], rng: np.random.Generator) -> Walk:
-    """The legs at a person's speed, with a pause after each but the last."""
+    """Time the legs at a person's speed, with a pause after each but the last."""
     pace = float(rng.uniform(*PACE))
     times = []
     headings = []

@@ -38,7 +38,7 @@ MAX_SIDE = 4096  # [px] of a camera's picture
 
 
 def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, float]) -> Array:
-    """A random position (3,) at least MIN_CLEARANCE from every surface, at a height [m] above the floor.
+    """Draw a position (3,) at least MIN_CLEARANCE from every surface, at a height [m] above the floor.
 
     Raises InputError if the room is so full that none is found.
     """
@@ -48,8 +48,8 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
         position = room.corner + rng.uniform(low, high)
         if room.clearance(position) >= MIN_CLEARANCE:
             return position
-    text = f"has no place {MIN_CLEARANCE} m from everything; use a larger one"
-    raise InputError(f"size: a room of {room.size.tolist()} m {text}")
+    text = f"has no free position {MIN_CLEARANCE} m from everything; use a larger one"
+    raise InputError(f"`size`: a room of {room.size.tolist()} m {text}")
 
 
 def scan_room(
@@ -99,7 +99,7 @@ def photograph(
 
 
 def render_picture(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
-    """The picture (H, W, 3) by a camera of a room, its rig at `pose`; black where it shows nothing."""
+    """Render the picture (H, W, 3) of a room by a camera, its rig at `pose`; black where it shows nothing."""
     camera = mount.camera
     u = (np.arange(SUPERSAMPLING * camera.width) + 0.5) / SUPERSAMPLING
     v = (np.arange(SUPERSAMPLING * camera.height) + 0.5) / SUPERSAMPLING
@@ -113,7 +113,7 @@ def render_picture(mount: Mount, room: Room, pose: Pose, workers: Workers) -> ND
 
 
 def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
-    """The one picture in which cameras have their parts, such as a dual fisheye."""
+    """Render the picture of which each camera has a part, such as a dual fisheye's."""
     width, height = compute_extent(mounts)
     rgb = np.zeros((height, width, 3), np.uint8)
     for mount in mounts:
@@ -126,12 +126,12 @@ def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Wor
 
 
 def blur(image: Array, sigma: float) -> Array:
-    """An equirectangular image (H, W, 3) under a Gaussian [px]."""
+    """Blur an equirectangular image (H, W, 3) by a Gaussian [px]."""
     return np.asarray(gaussian_filter(image, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest")))
 
 
 def change_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """The image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy."""
+    """Return the image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy."""
     gain = rng.uniform(0.7, 1.3) * rng.uniform(0.85, 1.15, 3)
     linear = (rgb / 255.0) ** rng.uniform(0.8, 1.25)
     noisy = blur(linear * gain, 0.8) + rng.normal(0.0, 0.02, rgb.shape)
@@ -157,9 +157,11 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     """`num_rooms` rooms of `size` (3,) [m], all different."""
     size = np.asarray(size, dtype=float)
     if not ((size >= MIN_SIZE) & (size <= MAX_SIZE)).all():  # so that NaN is refused too
-        raise InputError(f"size: {size.tolist()} is not between {MIN_SIZE} and {MAX_SIZE} m each way")
+        raise InputError(
+            f"`size`: found {size.tolist()}, wanted {MIN_SIZE} to {MAX_SIZE} m in each direction"
+        )
     if not 1 <= num_rooms <= MAX_ROOMS:
-        raise InputError(f"rooms: {num_rooms} is not between 1 and {MAX_ROOMS}")
+        raise InputError(f"`rooms`: found {num_rooms}, wanted 1 to {MAX_ROOMS}")
     columns = int(np.ceil(np.sqrt(num_rooms)))
     rooms = []
     for k in range(num_rooms):
@@ -187,9 +189,9 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
 
 
 def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, np.random.Generator]:
-    """The room, the camera in it, and what else is drawn from, of query number `index` of a variant."""
+    """Return room, camera pose and random generator of query number `index` of a variant."""
     if variant not in VARIANTS:
-        raise InputError(f"variant: {variant!r} is not one of {', '.join(VARIANTS)}")
+        raise InputError(f"variant: found {variant!r}, wanted one of {', '.join(VARIANTS)}")
     rng = np.random.default_rng([world.seed, 20, VARIANTS.index(variant), index])
     number = int(rng.integers(len(world.rooms)))
     room = world.rooms[number]
@@ -227,7 +229,7 @@ def check_cameras(cameras: Calibration) -> None:
 def make_photos(
     world: World, index: int, variant: str, cameras: Calibration, workers: Workers
 ) -> tuple[list[tuple[str, NDArray[np.uint8]]], Pose]:
-    """The pictures (H, W, 3) by these cameras of query number `index` of a variant, and their rig's pose.
+    """Render the pictures (H, W, 3) by the cameras of query `index` of a variant; return the rig's pose too.
 
     Each picture has a file name, "" of one that stands alone.
     """
