@@ -13,7 +13,6 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CLEAR_MATCHES
 from ..geometry.pose import Pose
-from ..geometry.rotations import Gravity
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, propose_poses
@@ -25,11 +24,10 @@ from ..scan_map.scan_map import ScanMap
 from .prior import contradictions
 from .query import Query
 from .refinement import FIRST_ITERATIONS, descend_all, refine, refine_matches
-from .search import Starts, search_poses
+from .search import SearchedGravity, Starts, search_poses
 from .selection import is_clear, is_sure
 from .settings import Beam
 
-WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_STARTS = 300  # few are enough for a clear photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
@@ -49,15 +47,18 @@ def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
 
     A first look by whole views (0 halves) may settle a whole upright sphere. Then come poses from feature
     matches, first of one half of the views, then of both, and at last searches by whole views: with gravity
-    `auto` as known, then as unknown (briefly, for a whole sphere).
+    `auto` as known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly
+    taken about level: this is searched first, as what gravity `known` means for them.
     """
     method = query.method
     looks_first = method.uses_features and method.uses_search and is_whole(query)
     attempts: list[tuple[int, Attempt]] = [(0, look_first)] if looks_first else []
     if method.uses_features:
         attempts += [(num_halves, search_matches) for num_halves in (1, ALL_HALVES)]
-    if method.uses_search and query.settings.gravity != "unknown":
-        attempts.append((ALL_HALVES, search_views))
+    is_partial = query.photo.is_partial
+    if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
+        upright: SearchedGravity = "level" if is_partial else "known"
+        attempts.append((ALL_HALVES, partial(search_views, gravity=upright)))
     if method.uses_search and query.settings.gravity != "known":
         with_any_tilt = partial(search_views, gravity="unknown", is_brief=looks_first)
         attempts.append((ALL_HALVES, with_any_tilt))
@@ -95,7 +96,7 @@ def search_views(
     query: Query,
     known: list[Hypothesis],
     watch: Stopwatch,
-    gravity: Gravity = "known",
+    gravity: SearchedGravity,
     is_brief: bool = False,
 ) -> Found:
     """Search by whole views and refine; True if the result is sure."""
@@ -131,7 +132,7 @@ def match_poses(query: Query) -> list[Pose]:
 
 def is_whole(query: Query) -> bool:
     """Return True if the photo shows nearly the whole sphere, upright or at a known tilt."""
-    return query.settings.gravity != "unknown" and query.photo.small.valid_share >= WHOLE
+    return query.settings.gravity != "unknown" and not query.photo.is_partial
 
 
 def brief_query(query: Query) -> Query:

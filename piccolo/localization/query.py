@@ -28,6 +28,7 @@ from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
 
 COMPARED_WIDTH = 256  # [px]
 MAX_WIDTH = 4096  # [px] of the photo for the loss: more costs seconds and gains nothing
+WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
 MOST_SHARE = 0.98  # of the sphere: a photo that shows more counts as showing all cells
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
 VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
@@ -63,6 +64,11 @@ class Photo:
     colors: Once[Texels]  # at the size at which the loss is taken
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
+
+    @property
+    def is_partial(self) -> bool:
+        """True if the photo shows a part of the sphere."""
+        return self.small.valid_share < WHOLE
 
     def find_shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Return a mask (N,) of the grid cells around a pose that the photo shows."""

@@ -74,7 +74,8 @@ FINE_LIMITS = Limits(FINE_LOSS, 12, 1e-4)
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     """Refine the starts by successive halving to a few distinct poses on fine cells, best first."""
     workers = query.workers
-    coarse = descend_prepared(query, starts, FIRST_ITERATIONS, beam.num_coarse)
+    first = SECOND_ITERATIONS if query.photo.is_partial else FIRST_ITERATIONS
+    coarse = descend_prepared(query, starts, first, beam.num_coarse)
     coarse = descend_prepared(query, coarse, SECOND_ITERATIONS, beam.num_middle)
     middle = workers.map(partial(descend_middle, query), coarse.poses(), "descend")
     narrowed = narrow(middle, beam.num_fine)

@@ -28,6 +28,8 @@ from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 
 NUM_BLOCKS = len(make_grid(BLOCK_RINGS))
+NUM_MOMENTS = 10
+FLAT = 6.0  # [levels] a smaller deviation of a block's channels counts as this
 CHANCE = 0.35  # a block's correlation that wrong poses reach
 ZERO = np.float32(ZERO_LEVEL)
 
@@ -124,10 +126,13 @@ def correlate(
     center_world: Array,
     sums: Array,
 ) -> None:
-    """Write product, energies and shared weight (B, 4) of the points' and the image's channels by block."""
+    """Write the SUMS of the points' channels a and the image's channels b by block (B, 10), weighted.
+
+    They are the products a b, a^2 and b^2 over all channels, the weight, and a and b of each channel.
+    """
     sums[:] = 0.0
     p = make_projected()
-    found = np.empty((4, CHUNK), np.float32)
+    found = np.empty((NUM_MOMENTS, CHUNK), np.float32)
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
         part = slice(lo, hi)
@@ -151,9 +156,15 @@ def correlate(
             found[1, n] = w * (a0 * a0 + a1 * a1 + a2 * a2)
             found[2, n] = w * (b0 * b0 + b1 * b1 + b2 * b2)
             found[3, n] = w
+            found[4, n] = w * a0
+            found[5, n] = w * a1
+            found[6, n] = w * a2
+            found[7, n] = w * b0
+            found[8, n] = w * b1
+            found[9, n] = w * b2
         for n in range(hi - lo):
             s = sums[blocks[lo + n]]
-            for k in range(4):
+            for k in range(NUM_MOMENTS):
                 s[k] += found[k, n]
 
 
@@ -173,10 +184,19 @@ def score(
     The weights are solid angles as fractions of the sphere, `blocks` (N,) the block of each point. An
     occluder costs the area that it hides and no more.
     """
-    sums = np.empty((NUM_BLOCKS, 4))
+    sums = np.empty((NUM_BLOCKS, NUM_MOMENTS))
     correlate(points, channels, weights, blocks, texels, width, R_cam_from_world, center_world, sums)
     total = 0.0
     for b in range(NUM_BLOCKS):
-        correlation = sums[b, 0] / math.sqrt(max(sums[b, 1] * sums[b, 2], 1e-12))
-        total += beyond_chance(correlation) * sums[b, 3]
+        s = sums[b]
+        if s[3] <= 0.0:
+            continue
+        product, energy, other = s[0], s[1], s[2]
+        for k in range(4, 7):
+            product -= s[k] * s[k + 3] / s[3]
+            energy -= s[k] * s[k] / s[3]
+            other -= s[k + 3] * s[k + 3] / s[3]
+        least = FLAT * FLAT * s[3]
+        correlation = product / math.sqrt(max(energy, least) * max(other, least))
+        total += beyond_chance(correlation) * s[3]
     return total
