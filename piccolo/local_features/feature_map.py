@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
-from ..geometry.pose import Array
+from ..geometry.pose import Array, Pose
 from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
 from ..jobs.threads import Workers
@@ -77,7 +77,8 @@ NO_FEATURES = FeaturesOfView(
 
 def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> FeaturesOfView:
     """Find the features seen from a centre (3,) [m] whose ray meets the scan within MAX_RANGE."""
-    image = render_gray(octree, center_map, VIEW_WIDTH)
+    is_drawn = np.ones((VIEW_WIDTH // 2, VIEW_WIDTH), np.bool_)
+    image = render_gray(octree, Pose(np.eye(3), center_map), is_drawn)
     found = find_keypoints(image.gray, image.is_filled)
     ranges = image.ranges[compute_indices(found.rays, VIEW_WIDTH)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))

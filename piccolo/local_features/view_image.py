@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree, collect, find_level
-from ..geometry.pose import Array
+from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel
+from ..geometry.vectors import rotate
 from ..kernels.jit import F0, F1, HALF, kernel
 from ..views.view import thread_scratch
 
@@ -28,7 +29,7 @@ Floats = NDArray[np.floating[Any]]
 
 
 class ViewImage(NamedTuple):
-    """The scan seen from a position, equirectangular, in the map's axes."""
+    """The scan seen from a pose, equirectangular, in the camera's axes."""
 
     gray: NDArray[np.uint8]  # (H, W)
     is_filled: NDArray[np.bool_]  # (H, W) where the grey means something
@@ -39,6 +40,8 @@ class ViewImage(NamedTuple):
 def draw_voxels(
     tree: Octree,
     center: Array,
+    R_cam_from_map: NDArray[np.float32],
+    is_drawn: NDArray[np.bool_],
     found: NDArray[np.int32],
     directions: NDArray[np.float32],
     ranges: NDArray[np.float32],
@@ -46,7 +49,7 @@ def draw_voxels(
 ) -> None:
     """Write the nearest range (H, W), and sums (H, W, 2) of weighted grey and of weights near that range.
 
-    `found` (N,) and `directions` (3, N) are scratch for `collect`.
+    Voxels whose middle is not in `is_drawn` (H, W) are left out. `found` (N,) and `directions` (3, N) are scratch for `collect`.
     """
     height, width = ranges.shape
     count = collect(tree, center, VOXEL_PER_RANGE, found, directions)
@@ -56,9 +59,7 @@ def draw_voxels(
     px_per_rad = np.float32(width / (2.0 * math.pi))
     for is_second in range(2):
         for k in range(count):
-            x = directions[0, k]
-            y = directions[1, k]
-            z = directions[2, k]
+            x, y, z = rotate(R_cam_from_map, (directions[0, k], directions[1, k], directions[2, k]))
             rho: Any = math.sqrt(x * x + y * y)  # compiled, float32
             r: Any = math.sqrt(x * x + y * y + z * z)
             node = tree.nodes[found[k]]
@@ -69,6 +70,8 @@ def draw_voxels(
             reach = min(max(reach, LEAST_REACH), MOST_REACH)
             across = min(reach * r / max(rho, np.float32(1e-3)), np.float32(0.25) * W)
             u, v = direction_to_pixel(x, y, z, rho, W)
+            if not is_drawn[min(int(v), height - 1), min(int(u), width - 1)]:
+                continue
             gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
             top: Any = max(np.int32(math.ceil(v - reach - HALF)), 0)
             bottom: Any = min(np.int32(math.floor(v + reach - HALF)), height - 1)
@@ -130,13 +133,14 @@ def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
-def render_gray(octree: Octree, center_map: Array, width: int) -> ViewImage:
-    """Draw the scan seen from a centre (3,) [m] on `width` x width / 2 pixels."""
+def render_gray(octree: Octree, pose: Pose, is_drawn: NDArray[np.bool_]) -> ViewImage:
+    """Draw the scan at a pose in the map, where the mask (H, 2 H) says so, and a little beyond."""
     scratch = thread_scratch()
-    ranges = np.empty((width // 2, width), np.float32)
-    sums = np.empty((width // 2, width, 2), np.float32)
-    center = np.asarray(center_map, np.float64)
-    draw_voxels(octree, center, scratch.nodes, scratch.directions, ranges, sums)
+    ranges = np.empty(is_drawn.shape, np.float32)
+    sums = np.empty((*is_drawn.shape, 2), np.float32)
+    center = np.asarray(pose.center_world, np.float64)
+    R = np.asarray(pose.R_cam_from_world, np.float32)
+    draw_voxels(octree, center, R, is_drawn, scratch.nodes, scratch.directions, ranges, sums)
     weight = is_in_front(ranges).astype(np.float32)
     gray = weight * sums[..., 0] / np.maximum(sums[..., 1], np.float32(1e-6))
     filled, is_filled = fill_gaps(gray, weight)

@@ -21,12 +21,14 @@ from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.prior import NOTHING_KNOWN
 from ..scan_map.scan_map import ScanMap
+from .comparison import score_pose
 from .prior import contradictions
 from .query import Query
 from .refinement import FIRST_ITERATIONS, descend_all, refine, refine_matches
 from .search import SearchedGravity, Starts, search_poses
-from .selection import is_clear, is_sure
+from .selection import is_clear, is_sure, rank
 from .settings import Beam
+from .verification import verify
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_STARTS = 300  # few are enough for a clear photo
@@ -35,6 +37,8 @@ FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
 NUM_SCORED = 64  # starts, if only the best score is needed
 ALL_HALVES = len(HALVES)
+NUM_VERIFIED = 7  # alternatives of the best pose that are verified
+CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NUM_MATCHED = 6  # poses from matches that are refined
 
 Found = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
@@ -87,7 +91,7 @@ def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> F
         is_half = query.num_halves < ALL_HALVES
         if is_half and (not poses or count_matches(query.matches, poses[0]) < CLEAR_MATCHES):
             return known, False
-        found = known + refine_matches(query, poses)
+        found = known + add_verified(query, refine_matches(query, poses))
         is_enough = is_sure(query, found)
         return known if is_half and not is_enough else found, is_enough
 
@@ -104,8 +108,20 @@ def search_views(
     with watch.stage("search"):
         starts = search_poses(asked, gravity)
     with watch.stage("refine"):
-        found = known + refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
+        found = refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
+        found = known + add_verified(query, found)
         return found, is_sure(query, found)
+
+
+def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
+    """Verify the hypotheses of a photo of a part of the sphere; add poses refined on many matches."""
+    if not query.photo.is_partial or not hypotheses:
+        return hypotheses
+    found = rank(hypotheses, NUM_VERIFIED)
+    poses = [h.pose for h in (found.best, *found.alternatives)]
+    verified = query.workers.map(partial(verify, query), poses, "verify")
+    refined = [v.pose for v in verified if v.num_matches > CHANCE_MATCHES]
+    return [*hypotheses, *query.workers.map(partial(score_pose, query), refined, "compare")]
 
 
 def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:

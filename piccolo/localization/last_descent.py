@@ -7,7 +7,6 @@ from functools import partial
 
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
-from ..local_features.hypotheses import count_matches
 from .comparison import mask_occluders, score_pose
 from .query import Query
 from .refinement import (
@@ -21,6 +20,7 @@ from .refinement import (
     refine_by_perturbation,
 )
 from .selection import SURE_MATCHES, Selection, rank, select
+from .verification import count_agreeing
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
 FAINT_SCORE = 0.1  # a pose with less, and fewer matches than the next line, is never localized
@@ -51,11 +51,11 @@ def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selecti
         found = select(query, rank([best, *found.alternatives]))
         if is_faint(query, found):
             return found
-    least = max(NEAR_MATCHES * count_matches(query.matches, found.best.pose), SURE_MATCHES)
+    least = max(NEAR_MATCHES * count_agreeing(query, found.best.pose), SURE_MATCHES)
     near: list[Hypothesis] = []
     far: list[Hypothesis] = []
     for h in found.alternatives:
-        is_near = h.score > NEAR_SCORE * found.best.score or count_matches(query.matches, h.pose) >= least
+        is_near = h.score > NEAR_SCORE * found.best.score or count_agreeing(query, h.pose) >= least
         (near if is_near and len(near) < MAX_REFINED else far).append(h)
     if not near:
         best = refine_unoccluded(query, found.best.pose)[1]
@@ -68,7 +68,7 @@ def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selecti
 def is_faint(query: Query, found: Selection) -> bool:
     """Return True if the best pose and all alternatives have a low score and few matches."""
     return all(
-        h.score < FAINT_SCORE and count_matches(query.matches, h.pose) < FAINT_MATCHES
+        h.score < FAINT_SCORE and count_agreeing(query, h.pose) < FAINT_MATCHES
         for h in (found.best, *found.alternatives)
     )
 

@@ -9,10 +9,10 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
 from ..confidence.confidence import CLEAR_MATCHES, CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
-from ..local_features.hypotheses import count_matches
 from .comparison import compare
 from .prior import contradictions
 from .query import Query
+from .verification import count_agreeing
 
 MAX_COMPARED = 8  # alternatives of the best pose
 SURE_SCORE = 0.05  # least score of the best pose
@@ -65,7 +65,7 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     standings = []
     for h, wrong in zip(hypotheses, is_wrong, strict=True):
-        num_matches = count_matches(query.matches, h.pose) if query.num_halves else CLEAR_MATCHES
+        num_matches = count_agreeing(query, h.pose) if query.num_halves else CLEAR_MATCHES
         standings.append(Standing(1.0, h.score, num_matches, log_prior if wrong else 0.0))
     return standings
 
@@ -98,7 +98,7 @@ def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
     found = select(query, rank(hypotheses))
     if found.best.score < SURE_SCORE or found.margin < SURE_MARGIN:
         return False
-    return count_matches(query.matches, found.best.pose) >= SURE_MATCHES
+    return count_agreeing(query, found.best.pose) >= SURE_MATCHES
 
 
 def is_clear(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:

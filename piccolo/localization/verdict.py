@@ -12,7 +12,7 @@ from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..local_features.hypotheses import count_matches, propose_poses
+from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
@@ -23,6 +23,7 @@ from .focal_length import FocalFit
 from .prior import contradictions
 from .query import Query
 from .selection import SURE_MATCHES, Selection, assess_poses
+from .verification import count_agreeing
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 MIRROR_RATIO = 1.2  # least ratio of matches, mirrored photo to photo
@@ -101,7 +102,7 @@ def collect_evidence(
     query: Query, found: Selection, agreement: Agreement, fractions: tuple[float, float]
 ) -> Evidence:
     """Collect the evidence for the best pose, from the fractions explained and contradicted."""
-    num_matches = [count_matches(query.matches, h.pose) for h in (found.best, *found.alternatives)]
+    num_matches = [count_agreeing(query, h.pose) for h in (found.best, *found.alternatives)]
     return Evidence(
         score=found.best.score,
         margin=found.margin,
