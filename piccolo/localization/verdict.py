@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..confidence.alternatives import MAX_ALTERNATIVES
+from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..local_features.hypotheses import propose_poses
+from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
@@ -60,7 +60,7 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     standings = assess_poses(query, found.best, reported)
     probabilities = posterior(standings, covariance)
     warnings = contradictions(query.scan_map, pose, settings.prior)
-    if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, evidence):
+    if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
     if warnings or (fit is not None and fit.conflict > MOST_CONFLICT):
         probabilities = np.append(np.zeros(len(standings)), 1.0)
@@ -115,14 +115,15 @@ def collect_evidence(
     )
 
 
-def is_mirrored(query: Query, evidence: Evidence) -> bool:
+def is_mirrored(query: Query, best: Hypothesis) -> bool:
     """Return True if the mirrored photo's features agree with a pose better than the photo's.
 
     Symmetric scenes match in a mirror too, but no better. The test is skipped for a pose that explains nearly
     all of the photo, and after a first look, which has compared the mirrored photo itself.
     """
-    if evidence.score >= ENOUGH_EXPLAINED or evidence.num_matches is None:
+    if best.score >= ENOUGH_EXPLAINED or not query.num_halves:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
     found = propose_poses(matches, None, 1, query.workers)
-    return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * evidence.num_matches, SURE_MATCHES)
+    num_matches = count_matches(query.matches, best.pose)
+    return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * num_matches, SURE_MATCHES)

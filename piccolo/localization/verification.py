@@ -27,6 +27,8 @@ COS_ELSEWHERE = math.cos(math.radians(2.0))
 REFINED_WITHIN = (4.0, 1.5, 0.8)  # [deg] matches that the pose is refined with, round by round
 AGREE = math.radians(0.5)  # matches with a smaller error agree
 SCALE = math.radians(0.3)  # of the loss
+NEAR = 0.3  # [m] matches with which a pose moves farther are another pose's
+NEAR_TURN = math.radians(5.0)
 LEAST_PAIRS = 4  # with which a pose is refined
 REFINEMENTS = 8  # steps
 TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
@@ -52,9 +54,10 @@ def count_agreeing(query: Query, pose: Pose) -> int:
     Features of a photo of a part of the sphere are matched with the scan drawn at the pose, those of others
     with the map's features.
     """
-    if query.photo.is_partial and query.num_halves:
-        return verify(query, pose).num_matches
-    return count_matches(query.matches, pose)
+    if not (query.photo.is_partial and query.num_halves):
+        return count_matches(query.matches, pose)
+    verified = verify(query, pose)
+    return verified.num_matches if is_near(verified.pose, pose) else 0
 
 
 def verify(query: Query, pose: Pose) -> Verified:
@@ -63,12 +66,17 @@ def verify(query: Query, pose: Pose) -> Verified:
     R = pose.R_cam_from_world.copy()
     t = pose.center_world.copy()
     for limit in REFINED_WITHIN:
-        is_near = compute_errors(pairs, R, t) < math.radians(limit)
-        if is_near.sum() >= LEAST_PAIRS:
-            near = (pairs.rays[is_near], pairs.points[is_near], SCALE)
-            descend_matches(near, REFINEMENTS, TOLERANCE, R, t)
+        fits = compute_errors(pairs, R, t) < math.radians(limit)
+        if fits.sum() >= LEAST_PAIRS:
+            descend_matches((pairs.rays[fits], pairs.points[fits], SCALE), REFINEMENTS, TOLERANCE, R, t)
     agreeing = pairs.rays[compute_errors(pairs, R, t) < AGREE]
     return Verified(Pose(R, t), len(np.unique(agreeing, axis=0)))
+
+
+def is_near(pose: Pose, other: Pose) -> bool:
+    """Return True if two poses are so near each other that they are one place."""
+    turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
+    return bool(turn < NEAR_TURN and math.dist(pose.center_world, other.center_world) < NEAR)
 
 
 def compute_errors(pairs: Pairs, R_cam_from_map: Array, center_map: Array) -> Array:
