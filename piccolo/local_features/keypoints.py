@@ -95,9 +95,9 @@ def find_keypoints(
     def find(k: int) -> Keypoints:
         view = views[k]
         shown = cv2.remap(mask, view.columns, view.rows, cv2.INTER_NEAREST)
+        shown = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
         if not shown.any():
             return _nothing()
-        shown = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
         image = cv2.remap(picture, view.columns, view.rows, cv2.INTER_LINEAR)
         sift = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
         found, shares = sift.detectAndCompute(image, shown)

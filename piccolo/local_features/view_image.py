@@ -49,7 +49,8 @@ def draw_voxels(
 ) -> None:
     """Write the nearest range (H, W), and sums (H, W, 2) of weighted grey and of weights near that range.
 
-    Voxels whose middle is not in `is_drawn` (H, W) are left out. `found` (N,) and `directions` (3, N) are scratch for `collect`.
+    Voxels whose middle is not in `is_drawn` (H, W) are left out. `found` (N,) and `directions` (3, N) are
+    scratch for `collect`.
     """
     height, width = ranges.shape
     count = collect(tree, center, VOXEL_PER_RANGE, found, directions)

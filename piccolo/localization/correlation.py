@@ -149,30 +149,72 @@ def center_correlation(
     """Turn sums of products (views, rotations) into correlations with the means subtracted.
 
     `values` and `fractions` are those of `unpack_views`, energies (views, rotations) sums of squares. On a
-    part of the sphere the channels' means are not 0, and any two plain surfaces would correlate. Deviations
-    below FLAT count as FLAT. The correlation is multiplied by the root of the fraction that the view sees of
-    what the photo shows, and is 0 if that is less than LEAST_SEEN.
+    part of the sphere the channels' means are not 0, and any two plain surfaces would correlate. The photo's
+    means are those over all that it shows, a view's over what it shows of that.
     """
     num_cells = len(panorama.area)
-    most_seen = np.float32(panorama.most_seen)
+    num_views = len(values)
     area_scale = whole_scale(1.0, 255, num_cells)
-    sample_scale = whole_scale(MOST_LEVEL, 127, 3 * num_cells)
     shown = panorama.validity * np.rint(panorama.area * area_scale)
-    weight = fractions @ shown.T / most_seen
-    seen_fraction = weight / np.maximum(shown.sum(axis=1), F1)
-    weight = np.maximum(weight / area_scale, np.float32(1e-3))
-    scores /= sample_scale
-    view_energy = view_energy / whole_scale(MOST_ENERGY, 1, num_cells)
-    photo_energy = photo_energy / (whole_scale(MOST_ENERGY, panorama.most_seen, num_cells) * most_seen)
-    for k in range(3):
-        of_view = values[:, k * num_cells : (k + 1) * num_cells] @ shown.T / area_scale
-        of_photo = fractions @ panorama.samples[:, k].T / (sample_scale * most_seen)
-        scores -= of_view * of_photo / weight
-        view_energy -= of_view * of_view / weight
-        photo_energy -= of_photo * of_photo / weight
-    least = np.float32(FLAT * FLAT) * weight
-    scores /= np.sqrt(np.maximum(view_energy, least) * np.maximum(photo_energy, least))
-    scores *= np.where(seen_fraction < LEAST_SEEN, F0, np.sqrt(np.minimum(seen_fraction, F1)))
+    weight = fractions @ shown.T
+    of_view = values.reshape(3 * num_views, num_cells) @ shown.T
+    shown_area = np.maximum(shown.sum(axis=1), F1)
+    means = (panorama.samples.sum(axis=2) * area_scale / shown_area[:, None]).T
+    units = (
+        whole_scale(MOST_LEVEL, 127, 3 * num_cells),
+        whole_scale(MOST_ENERGY, 1, num_cells),
+        whole_scale(MOST_ENERGY, panorama.most_seen, num_cells) * np.float32(panorama.most_seen),
+        area_scale,
+        np.float32(panorama.most_seen),
+    )
+    subtract_means(
+        of_view.reshape(num_views, 3, -1),
+        np.ascontiguousarray(means),
+        view_energy,
+        photo_energy,
+        weight,
+        shown_area,
+        units,
+        scores,
+    )
+
+
+@kernel
+def subtract_means(
+    of_view: Samples,
+    means: Samples,
+    view_energy: Samples,
+    photo_energy: Samples,
+    weight: Samples,
+    shown_area: Samples,
+    units: tuple[np.float32, np.float32, np.float32, np.float32, np.float32],
+    scores: Samples,
+) -> None:
+    """Write correlations from sums over the shared cells, see `center_correlation`.
+
+    `of_view` (views, 3, rotations) are sums of the views' channels, `means` (3, rotations) the photo's,
+    `units` the factors that made whole numbers: of samples, view and photo energies, areas and fractions.
+    Deviations below FLAT count as FLAT. The correlation is multiplied by the root of the fraction that a view
+    sees of what the photo shows, and is 0 if that is less than LEAST_SEEN.
+    """
+    per_sample, per_view, per_photo, per_area, most_seen = units
+    least = np.float32(FLAT * FLAT)
+    for i in range(len(scores)):
+        for r in range(scores.shape[1]):
+            seen = weight[i, r] / (shown_area[r] * most_seen)
+            area = max(weight[i, r] / (per_area * most_seen), np.float32(1e-3))
+            product = scores[i, r] / per_sample
+            of_squares = view_energy[i, r] / per_view
+            squares = photo_energy[i, r] / per_photo
+            for k in range(3):
+                total = of_view[i, k, r] / per_area
+                mean = means[k, r] / per_sample
+                product -= total * mean
+                of_squares -= total * total / area
+                squares -= mean * mean * area
+            norm = math.sqrt(max(of_squares, least * area) * max(squares, least * area))
+            fraction = math.sqrt(min(seen, F1)) if seen > np.float32(LEAST_SEEN) else F0
+            scores[i, r] = product / norm * fraction
 
 
 @kernel

@@ -17,13 +17,15 @@ from ..confidence.alternatives import (
     suppress_near,
 )
 from ..geometry.pose import Array, Pose, orthonormal
+from ..geometry.sphere import pixel_rays
 from ..geometry.suppression import non_maximum_suppression
+from ..geometry.vectors import dot, rotate
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
-from ..panorama.texels import Texels
+from ..panorama.texels import Texels, find_valid
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW, Views
 from ..views.view import Cells, ViewArrays, ViewConfig
@@ -51,6 +53,7 @@ MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the l
 NUM_FOUND = 12  # poses of a search, at most
 PLAIN_SCORE = 0.2  # if the best has this score, poses with less than FAINT_PART of it are dropped
 FAINT_PART = 0.25
+CONE_MARGIN = math.radians(20.0)  # that a camera turns in a descent, at most
 SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
 SAME_ANGLE = math.radians(5.0)  # and this are one
 CLOSE_DISTANCE = 0.1  # [m] SAME_DISTANCE after the descent on middle cells
@@ -97,6 +100,22 @@ def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
         return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
 
     return sort_by_score(query.workers.map(refine_match, poses, "descend"))
+
+
+class Cone(NamedTuple):
+    """A cone in the camera's frame."""
+
+    axis_cam: Array  # (3,) unit vector
+    cos_angle: float  # of its half angle; -2 for the whole sphere
+
+
+def find_cone(image: Texels) -> Cone:
+    """Return the cone around what an image shows, wider by CONE_MARGIN."""
+    rays = pixel_rays(image.width)[find_valid(image)]
+    axis = rays.sum(axis=0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-9)
+    angle = math.acos(np.clip((rays @ axis).min(initial=1.0), -1.0, 1.0)) + CONE_MARGIN
+    return Cone(axis, math.cos(angle) if angle < math.pi else -2.0)
 
 
 def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:
@@ -198,12 +217,16 @@ def descend_starts(
     image: Texels,
     scale: float,
     num_iterations: int,
+    cone: Cone,
     row: NDArray[np.int64],
     R_cam_from_map: Array,
     center_map: Array,
     scores: Array,
 ) -> None:
-    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its row (n,) of the views."""
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its row (n,) of the views.
+
+    Cells outside of the cone around what the photo shows, as seen from the start, are left out.
+    """
     centers, offsets, unit, features, is_seen = views
     solid_angle = view.solid_angle
     blocks = view.blocks
@@ -212,22 +235,37 @@ def descend_starts(
     R = R_cam_from_map
     t = center_map
     n = len(solid_angle)
-    points = np.empty((3, n), np.float32)
-    levels = np.empty((3, n), np.float32)
+    room = np.empty(3 * n, np.float32)
+    more_room = np.empty(3 * n, np.float32)
     weights = np.empty(n, np.float32)
+    own_blocks = np.empty(n, np.int32)
+    kept = np.empty(n, np.int64)
     for k in range(len(row)):
         c = row[k]
         for i in range(3):
-            for j in range(n):
-                points[i, j] = np.float32(offsets[c, i, j]) * unit[c]
-                levels[i, j] = np.float32(features[c, i, j]) + np.float32(ZERO_LEVEL)
-        for j in range(n):
-            weights[j] = solid_angle[j] if is_seen[c, j] else F0
-        for i in range(3):
             t[k, i] -= centers[c, i]
-        problem = ChannelProblem(points, levels, weights, texels, width, scale)
+        axis = rotate(R[k].T, cone.axis_cam)
+        num = 0
+        for j in range(n):
+            x = np.float32(offsets[c, 0, j]) * unit[c]
+            y = np.float32(offsets[c, 1, j]) * unit[c]
+            z = np.float32(offsets[c, 2, j]) * unit[c]
+            offset = (x - t[k, 0], y - t[k, 1], z - t[k, 2])
+            if dot(axis, offset) >= cone.cos_angle * math.sqrt(dot(offset, offset)):
+                kept[num] = j
+                num += 1
+        points = room[: 3 * num].reshape(3, num)
+        levels = more_room[: 3 * num].reshape(3, num)
+        for i in range(3):
+            for m in range(num):
+                points[i, m] = np.float32(offsets[c, i, kept[m]]) * unit[c]
+                levels[i, m] = np.float32(features[c, i, kept[m]]) + np.float32(ZERO_LEVEL)
+        for m in range(num):
+            weights[m] = solid_angle[kept[m]] if is_seen[c, kept[m]] else F0
+            own_blocks[m] = blocks[kept[m]]
+        problem = ChannelProblem(points, levels, weights[:num], texels, width, scale)
         descend_channels(problem, num_iterations, START_TOLERANCE, R[k], t[k])
-        scores[k] = score(points, levels, weights, blocks, texels, width, R[k], t[k])
+        scores[k] = score(points, levels, weights[:num], own_blocks[:num], texels, width, R[k], t[k])
         for i in range(3):
             t[k, i] += centers[c, i]
 
@@ -288,10 +326,13 @@ def descend_all(
     row, views = scan_map.views.at(starts.candidate, workers)
     view = SEARCH_VIEW.arrays
     scale = COARSE_LOSS * LEVELS_PER_UNIT
+    cone = find_cone(image)
 
     def run(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        descend_starts(views, view, image, scale, num_iterations, row[part], R[part], t[part], scores[part])
+        descend_starts(
+            views, view, image, scale, num_iterations, cone, row[part], R[part], t[part], scores[part]
+        )
 
     workers.map(run, range(0, len(t), BATCH), "descend")
     order = np.argsort(-scores, kind="stable")

@@ -125,6 +125,8 @@ def best_poses_wide(
     """
     area = wider_cells(WIDE_RINGS)[1]
     wide_samples, wide_validity = widen_samples(samples, validity, workers)
+    if is_centered:
+        wide_samples *= wide_validity[:, None]
     panorama = weigh_by_area(wide_samples, wide_validity, area, 255)
     num_views = views_at_once(len(samples))
     least = LOWEST

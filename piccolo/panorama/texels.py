@@ -44,6 +44,12 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
     return Texels(padded.reshape(-1), width, share)
 
 
+def find_valid(image: Texels) -> NDArray[np.bool_]:
+    """Return the mask (H, W) of the pixels that count."""
+    padded = image.rgbx.reshape(-1, image.width + 2)
+    return np.asarray((padded[1:-1, 1:-1] >> 24) & 1 == 1)
+
+
 @inline_kernel
 def channel(texel: np.int32, shift: int) -> np.float32:
     """Return the 8-bit channel of a texel as float32; shift 0, 8 or 16."""
