@@ -125,5 +125,5 @@ def is_mirrored(query: Query, best: Hypothesis) -> bool:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
     found = propose_poses(matches, None, 1, query.workers)
-    num_matches = count_matches(query.matches, best.pose)
+    num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
     return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * num_matches, SURE_MATCHES)

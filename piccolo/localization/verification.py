@@ -1,8 +1,8 @@
 """Verify poses by view synthesis: draw the scan at a pose, and match the photo with that picture.
 
 A narrow photo looks like many places. Only at the right one do its local features lie where those of the
-drawn scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2015), and InLoc's verification
-of poses (Taira et al., CVPR 2018).
+drawn scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2015), and InLoc's
+verification of poses (Taira et al., CVPR 2018).
 """
 
 import math

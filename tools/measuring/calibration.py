@@ -76,7 +76,7 @@ def read_outcome(line: str) -> Outcome | None:
         return None
     standings = [Standing(*standing) for standing in trial["standings"]]
     matrix = trial["covariance"]
-    covariance = None if matrix is None else PoseCovariance(np.array(matrix), "")
+    covariance = None if matrix is None else PoseCovariance(np.array(matrix), "", trial["std_of_fit"])
     error = np.full(6, np.nan)
     right = len(poses)
     if trial["truth"] is not None:
