@@ -21,7 +21,7 @@ class Standing(NamedTuple):
 
     ratio: float  # what it explains, divided by what the best pose does, over what both views show
     score: float  # [0, 1] what the photo's blocks explain beyond chance
-    num_matches: int  # local features that agree with it
+    num_matches: int | None  # local features that agree with it; None: whole views alone were compared
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
 
 
@@ -37,23 +37,32 @@ MOST_STD = 0.3  # [m] and those above this
 LEAST_SCORE = 0.02
 LEAST_RATIO = 0.1
 MOST_RATIO = 1.2
-CLEAR_MATCHES = 40  # as many as a clear whole view of an upright sphere is worth, see docs/METHOD.md
 CONTRADICTED = 0.01  # odds of what the user says to be wrong
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
-FEATURES = ("log of the ratio", "log of the score", "log of the matches")
+FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
-MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))
+VIEWS_MODEL = ChoiceModel((5.75, 0.43), (4.04, 3.82))  # of whole spheres by whole views alone
+MATCHES_MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))  # where local features were asked
+
+
+def choose_model(standing: Standing) -> ChoiceModel:
+    """Return the model for a pose's kind of evidence."""
+    return VIEWS_MODEL if standing.num_matches is None else MATCHES_MODEL
 
 
 def pose_features(standing: Standing) -> Array:
-    """Return the features (3,) of a pose's odds, as FEATURES names them."""
+    """Return the features of a pose's odds, as FEATURES names them; without matches the first two."""
     ratio = min(max(standing.ratio, LEAST_RATIO), MOST_RATIO)
-    return np.log([ratio, max(standing.score, LEAST_SCORE), standing.num_matches + NOISE_MATCHES])
+    of_views = [ratio, max(standing.score, LEAST_SCORE)]
+    if standing.num_matches is None:
+        return np.log(of_views)
+    return np.log([*of_views, standing.num_matches + NOISE_MATCHES])
 
 
-def log_odds(standing: Standing, model: ChoiceModel = MODEL) -> float:
-    """Return the logarithm of a pose's odds, up to a constant."""
+def log_odds(standing: Standing, model: ChoiceModel | None = None) -> float:
+    """Return the logarithm of a pose's odds, up to a constant; by default with the model of its evidence."""
+    model = model or choose_model(standing)
     return float(pose_features(standing) @ np.array(model.weights)) + standing.log_prior
 
 
@@ -66,13 +75,15 @@ def none_features(covariance: PoseCovariance | None) -> Array:
 
 
 def posterior(
-    standings: Sequence[Standing], covariance: PoseCovariance | None, model: ChoiceModel = MODEL
+    standings: Sequence[Standing], covariance: PoseCovariance | None, model: ChoiceModel | None = None
 ) -> Array:
     """Return the probabilities (K + 1,) that each of K poses, best first, is right, and that none of them is.
 
-    Right is within 0.1 m and 5 degrees. They hold where half of all queries have an answer, as in the trials
-    from which they were learnt. None is more likely if the best pose's deviation makes 0.1 m doubtful.
+    The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees. They hold where half
+    of all queries have an answer, as in the trials from which they were learnt. None is more likely if the
+    best pose's deviation makes 0.1 m doubtful.
     """
+    model = model or choose_model(standings[0])
     logits = [log_odds(standing, model) for standing in standings]
     logits.append(float(none_features(covariance) @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))

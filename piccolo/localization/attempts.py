@@ -11,7 +11,6 @@ from functools import partial
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import CLEAR_MATCHES
 from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
@@ -38,6 +37,7 @@ FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searche
 NUM_SCORED = 64  # starts, if only the best score is needed
 ALL_HALVES = len(HALVES)
 NUM_VERIFIED = 7  # alternatives of the best pose that are verified
+ENOUGH_MATCHES = 40  # of half of the features: the other half is not asked
 CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NUM_MATCHED = 6  # poses from matches that are refined
 
@@ -89,7 +89,7 @@ def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> F
     with watch.stage("match"):
         poses = match_poses(query)
         is_half = query.num_halves < ALL_HALVES
-        if is_half and (not poses or count_matches(query.matches, poses[0]) < CLEAR_MATCHES):
+        if is_half and (not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES):
             return known, False
         found = known + add_verified(query, refine_matches(query, poses))
         is_enough = is_sure(query, found)

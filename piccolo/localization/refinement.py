@@ -19,9 +19,9 @@ from ..confidence.alternatives import (
 from ..geometry.pose import Array, Pose, orthonormal
 from ..geometry.sphere import pixel_rays
 from ..geometry.suppression import non_maximum_suppression
-from ..geometry.vectors import dot, rotate
+from ..geometry.vectors import rotate
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, kernel
+from ..kernels.jit import F0, inline_kernel, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
@@ -210,6 +210,29 @@ def keep_comparable(ranked: Sequence[Fit]) -> list[Fit]:
     return [f for f in ranked if f.score >= least]
 
 
+@inline_kernel
+def select_cells(
+    offsets: NDArray[np.int16],
+    unit: np.float32,
+    cone: Cone,
+    R_cam_from_map: Array,
+    center: Array,
+    kept: NDArray[np.int64],
+) -> int:
+    """Write the indices of the cells with offsets (3, N) that lie in a cone; return their number."""
+    axis = rotate(R_cam_from_map.T, cone.axis_cam)
+    num = 0
+    for j in range(offsets.shape[1]):
+        x = np.float32(offsets[0, j]) * unit - center[0]
+        y = np.float32(offsets[1, j]) * unit - center[1]
+        z = np.float32(offsets[2, j]) * unit - center[2]
+        along = axis[0] * x + axis[1] * y + axis[2] * z
+        if along >= cone.cos_angle * math.sqrt(x * x + y * y + z * z):
+            kept[num] = j
+            num += 1
+    return num
+
+
 @kernel
 def descend_starts(
     views: Views,
@@ -244,16 +267,7 @@ def descend_starts(
         c = row[k]
         for i in range(3):
             t[k, i] -= centers[c, i]
-        axis = rotate(R[k].T, cone.axis_cam)
-        num = 0
-        for j in range(n):
-            x = np.float32(offsets[c, 0, j]) * unit[c]
-            y = np.float32(offsets[c, 1, j]) * unit[c]
-            z = np.float32(offsets[c, 2, j]) * unit[c]
-            offset = (x - t[k, 0], y - t[k, 1], z - t[k, 2])
-            if dot(axis, offset) >= cone.cos_angle * math.sqrt(dot(offset, offset)):
-                kept[num] = j
-                num += 1
+        num = select_cells(offsets[c], unit[c], cone, R[k], t[k], kept)
         points = room[: 3 * num].reshape(3, num)
         levels = more_room[: 3 * num].reshape(3, num)
         for i in range(3):

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
-from ..confidence.confidence import CLEAR_MATCHES, CONTRADICTED, Standing, log_odds
+from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
 from .comparison import compare
 from .prior import contradictions
@@ -58,14 +58,13 @@ def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
 def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
     """Return the evidence for each of several poses by itself.
 
-    Poses that contradict the prior share the odds that the prior is wrong. Without features, each pose counts
-    as having CLEAR_MATCHES matches.
+    Poses that contradict the prior share the odds that the prior is wrong.
     """
     is_wrong = [bool(contradictions(query.scan_map, h.pose, query.settings.prior)) for h in hypotheses]
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     standings = []
     for h, wrong in zip(hypotheses, is_wrong, strict=True):
-        num_matches = count_agreeing(query, h.pose) if query.num_halves else CLEAR_MATCHES
+        num_matches = count_agreeing(query, h.pose) if query.num_halves else None
         standings.append(Standing(1.0, h.score, num_matches, log_prior if wrong else 0.0))
     return standings
 

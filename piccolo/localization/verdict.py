@@ -66,10 +66,9 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
         probabilities = np.append(np.zeros(len(standings)), 1.0)
     if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
         warnings += explain_doubts(query.photo.given, fit)
-    matches = [s.num_matches if query.num_halves else None for s in standings[1:]]
     alternatives = tuple(
-        Alternative(query.scan_map.to_world(h.pose), h.score, num_matches, float(p))
-        for h, num_matches, p in zip(reported, matches, probabilities[1:-1], strict=True)
+        Alternative(query.scan_map.to_world(h.pose), h.score, s.num_matches, float(p))
+        for h, s, p in zip(reported, standings[1:], probabilities[1:-1], strict=True)
     )
     return Localization(
         classify(probabilities, settings.min_confidence),

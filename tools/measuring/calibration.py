@@ -17,7 +17,6 @@ from piccolo.confidence.confidence import (
     FEATURES,
     LOCALIZED,
     MIN_CONFIDENCE,
-    MODEL,
     NONE_FEATURES,
     ChoiceModel,
     Standing,
@@ -55,8 +54,13 @@ class Outcome(NamedTuple):
     is_refused: bool  # as mirrored: no choice was made
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
 
-    def probabilities(self, model: ChoiceModel) -> Array:
-        """Return the probability of each pose, and of none (K + 1,)."""
+    @property
+    def has_matches(self) -> bool:
+        """True if local features were asked."""
+        return self.standings[0].num_matches is not None
+
+    def probabilities(self, model: ChoiceModel | None) -> Array:
+        """Return the probability of each pose, and of none (K + 1,); by default with the model in use."""
         if self.is_refused:
             return np.append(np.zeros(len(self.standings)), 1.0)
         return posterior(self.standings, self.covariance, model)
@@ -111,7 +115,7 @@ def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
             gradient = gradient + np.append(p[:-1] @ features, p[-1] * none) / deviations
         return float(total), gradient
 
-    bounds = [(0.0, None)] * len(FEATURES) + [(None, None), (0.0, None)]
+    bounds = [(0.0, None)] * poses[0].shape[1] + [(None, None), (0.0, None)]
     v = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds).x / deviations
     return ChoiceModel(tuple(v[:-2].tolist()), (float(v[-2]), float(v[-1])))
 
@@ -180,15 +184,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     learnt = read(arguments.fit)
     sets = {"learnt from": learnt, "others": read(arguments.check)}
-    model = MODEL
-    if arguments.fit:
-        model = fit(learnt)
+    models: dict[bool, ChoiceModel] = {}  # by whether features were asked
+    for has_matches in sorted({o.has_matches for o in learnt}):
+        models[has_matches] = model = fit([o for o in learnt if o.has_matches == has_matches])
+        print("with local features:" if has_matches else "by whole views alone:")
         for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
-            print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=True)))
+            print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=False)))
     for name, outcomes in sets.items():
         if not outcomes:
             continue
-        stated = [o.probabilities(model) for o in outcomes]
+        stated = [o.probabilities(models.get(o.has_matches)) for o in outcomes]
         right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
         called = [classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
