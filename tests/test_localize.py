@@ -103,10 +103,10 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
         ({"status": "localized"}, []),
         ({"status": "ambiguous", "confidence": 0.05}, ["  to decide, give --near or --heading"]),
         ({"confidence": 0.1}, ["  to be sure, look at the --overlay, give --near"]),
-        ({"confidence": 0.09}, ["  nearly nothing fits: another scan, or bare walls?"]),
+        ({"confidence": 0.09}, ["  it fits nowhere well: another scan, or bare walls?"]),
         (
             {"confidence": 0.09, "cameras": (Mount(pinhole(4, 3, 4.0)),)},
-            ["  nearly nothing fits: .* focal length"],
+            ["  it fits nowhere well: .* focal length"],
         ),
         ({"confidence": 0.0}, []),  # a warning says why
         ({"confidence": 0.5, "probability_none": None}, []),  # of the preset paper

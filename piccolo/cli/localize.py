@@ -179,7 +179,7 @@ def advise(result: Result) -> list[str]:
         if result.cameras
         else "another scan, or bare walls"
     )
-    return [f"  nearly nothing fits: {causes}?"]
+    return [f"  it fits nowhere well: {causes}?"]
 
 
 def record(run: Run, answer: Answer, write: Write) -> None:

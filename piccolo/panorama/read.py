@@ -188,7 +188,8 @@ def _region_of(
         region = CropRegion()
         notes = ["the crop in the metadata is invalid or has another shape; read as a full sphere"]
     if region is None or (region.is_full and not is_two_to_one):
-        wrong = "a crop in the metadata that does not fit it" if region is None else "no focal length in EXIF"
+        wrong = "no field of view is given" if options.projection else "no focal length in EXIF"
+        wrong = "a crop in the metadata that does not fit it" if region is None else wrong
         found = f"found a picture of {width} x {height}, which is no full panorama (2:1), and {wrong}"
         raise InputError(f"{path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
     if region.is_full and is_dual_fisheye(picture.rgb):
