@@ -144,7 +144,7 @@ class Result:
     def summary(self) -> str:
         """Return the result as a few lines of text."""
         if self.best_pose is None:
-            why = self.error or "no place for a camera, or nothing of the panorama counts"
+            why = self.error or "no place for a camera, or nothing of the photo counts"
             return f"{printable(self.pano)}: {self.status}\n  {printable(why)}"
         x, y, z = self.best_pose.center_world
         total = sum(self.seconds.values())
@@ -155,16 +155,17 @@ class Result:
             e = self.evidence
             lines.append(
                 f"  confidence {self.confidence:.3f}, score {e.score:.2f}, margin {e.margin:.2f}, "
-                f"{100.0 * e.explained_fraction:.0f} % of the panorama explained, "
+                f"{100.0 * e.explained_fraction:.0f} % of the photo explained, "
                 f"{100.0 * e.contradicted_fraction:.0f} % contradicted"
             )
         if self.covariance is not None:
             mm = 1000.0 * self.covariance.largest_std
             deg = self.covariance.std_deg.max()
             direction = self.covariance.least_constrained_direction
-            lines.append(f"  one sigma {mm:.1f} mm ({direction}), {deg:.2f} deg")
+            lines.append(f"  one sigma {mm:.1f} mm {direction}, rotation {deg:.2f} deg")
         if self.status == AMBIGUOUS:
-            lines += [f"  or {_place(h)}" for h in self.alternatives]
+            shown = (h for h in self.alternatives if h.probability is None or round(h.probability, 2) > 0.0)
+            lines += [f"  or {_place(h)}" for h in shown]
         return "\n".join(lines)
 
     def to_json(self) -> str:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arguments import check_arguments
-from .camera.files import read_calibration, read_rig
+from .camera.files import open_calibration, read_rig
 from .cloud.soa import PackedPoints
 from .errors import InputError
 from .geometry.pose import Pose
@@ -125,7 +125,8 @@ class Scan:
         focal_px
             Focal length [px] of a pinhole photo in its own pixels, known to 1 %; by default EXIF's.
         camera
-            Calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md.
+            Calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md; or a
+            folder with NAME.camera.json or NAME.json for each photo.
         rig
             Calibration of several cameras; `panorama` is the folder of the pictures of one instant.
         gravity_vector
@@ -375,7 +376,7 @@ class Scan:
         if "camera" in given and "rig" in given:
             raise InputError("`camera`, `rig`: found both, wanted one of them")
         if "camera" in given:
-            reading["calibration"] = read_calibration(Path(given["camera"]))
+            reading["calibration"] = open_calibration(Path(given["camera"]))
         if "rig" in given:
             reading["calibration"] = read_rig(Path(given["rig"]))
         opened = self._opened

@@ -84,7 +84,7 @@ def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
 def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, capsys):
     whole = tmp_path / "whole.jsonl"
     assert _run(scene, whole) == 0
-    assert "3 panoramas in" in (err := capsys.readouterr().err)
+    assert "3 photos in" in (err := capsys.readouterr().err)
     assert "3 localized, 0 ambiguous, 0 not localized, 0 unreadable" in err
     lines = whole.read_bytes().splitlines(keepends=True)
     for torn in (b"", lines[1][:1], lines[1][:20], lines[1][:-1]):
@@ -105,10 +105,13 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, cap
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (["--gravity", "known"], "line 1: made with gravity 'auto', not 'known'"),
-        (["--height", "0.5", "2"], "line 1: made with prior"),
+        (["--gravity", "known"], "line 1: made with --gravity auto, now --gravity known; use"),
+        (["--height", "0.5", "2"], "line 1: made without --height, now --height 0.5 2; use"),
+        (["--focal", "1585"], "line 1: made without --focal, now --focal 1585; use"),
+        (["--preset", "paper"], "line 1: made with --preset default, now --preset paper; use"),
+        (["--crs", "none"], "line 1: made with GPS, now without GPS; use"),
         (["--cloud", "other"], "line 1: made with another scan, or the scan has changed since"),
-        (["--pano", "clean_1.jpg"], "it has no result of the panoramas given"),
+        (["--pano", "clean_1.jpg"], "it has no result of the photos given"),
         (b"some notes of the user\n", "line 1: not a result of localize.py"),
         (b"notes without an end", "its last line does not belong to results"),
         (b'{"format": "piccolo-pose/3"}\n', "line 1: found format 'piccolo-pose/3'"),
@@ -182,7 +185,7 @@ def test_photos_added_removed_or_changed_cost_only_their_own_lines(
     assert written({**first, "a.jpg": images[2], "c.jpg": images[0]})[0] == ["a.jpg", "c.jpg"]
     done, err = written({"d.jpg": images[1], "c.jpg": images[2]})
     assert done == ["c.jpg"]
-    assert "; dropped 2 results of panoramas that are no longer given\n" in err
+    assert "; dropped 2 results of photos that are no longer given\n" in err
     names = [str(photos / name) for name in ("d.jpg", "c.jpg", "d.jpg")]
     assert written({"d.jpg": images[1], "c.jpg": images[2]}, *names)[0] == ["d.jpg"]
     before = _lines(out)
@@ -205,7 +208,7 @@ def test_names_that_come_on_standard_input_take_what_is_done_and_drop_nothing(
             monkeypatch.setattr(sys, "stdin", file)
             assert _run(scene, out, *PAPER, pano=["-"]) < 2
         err = capsys.readouterr().err
-        assert f"{len(given)} panoramas in" in err
+        assert f"{len(given)} photos in" in err
         assert "dropped" not in err
         after = out.read_text().splitlines()
         assert [json.loads(line)["pano"] for line in after] == left
@@ -382,7 +385,7 @@ def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, out, capsy
     table.write_text(f"name,x,y,radius,height\n{rows}")
     assert _run(scene, out, "--priors", str(table), "--height", "0.2", "2.2") == 0
     err = capsys.readouterr().err
-    assert "1 names without a panorama, such as clean_9.jpg" in err.splitlines()[0]  # before the work
+    assert "1 names without a photo, such as clean_9.jpg" in err.splitlines()[0]  # before the work
     assert "%|" not in err  # a bar is for a terminal
     priors = [line["settings"]["prior"] for line in _lines(out)]
     assert priors[0]["near_world"] == [x, y, None]

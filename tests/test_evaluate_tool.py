@@ -96,7 +96,7 @@ def test_other_settings_or_poses_do_not_go_into_the_same_file(scenes, tmp_path, 
     assert _run(scenes / "room", out) == 0
     before = out.read_bytes()
     assert _run(scenes / "room", out, "--preset", *QUICK[2:], "solver=lbfgs") == 3
-    assert "run.jsonl: made with solver 'adam', not 'lbfgs'" in capsys.readouterr().err
+    assert "run.jsonl: made with solver adam, now solver lbfgs" in capsys.readouterr().err
     assert _run(_changed(scenes, tmp_path, move), out) == 3
     assert "made with another true pose or another scene of this name" in capsys.readouterr().err
     assert out.read_bytes() == before

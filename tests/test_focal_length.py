@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -116,7 +117,7 @@ def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
     rgb, _ = _photo(pinhole(640, 480, TRUE))
     result = scan().localize(rgb, focal_px=290.0, gravity="known")
     assert result.status == "not_localized"
-    assert "which contradicts what was given 290 px within 3" in result.warnings[-1]
+    assert "px contradicts the given 290 +- 3 px" in result.warnings[-1]
 
 
 def test_an_exact_calibration_stays_exact():
@@ -161,10 +162,12 @@ def test_only_the_photo_of_one_camera_has_a_focal_length_to_refine():
 
 def test_pictures_of_a_result_are_made_with_the_camera_found():
     found = (Mount(pinhole(640, 480, 321.5)),)
-    options = ReadOptions(focal_px=300.0, refine_focal=True).with_refined_camera(found)
+    options = ReadOptions(focal_px=300.0, refine_focal=True).with_refined_camera(found, Path("a.jpg"))
     assert (options.focal_px, options.calibration.mounts) == (None, found)
     turned = Mount(pinhole(640, 480, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     given = ReadOptions(calibration=Calibration("a.json", (turned,)), refine_focal=True)
-    assert given.with_refined_camera(found).calibration.mounts == (turned.with_camera(found[0].camera),)
+    assert given.with_refined_camera(found, Path("a.jpg")).calibration.mounts == (
+        turned.with_camera(found[0].camera),
+    )
     plain = ReadOptions()
-    assert plain.with_refined_camera(()) is plain
+    assert plain.with_refined_camera((), Path("a.jpg")) is plain

@@ -8,13 +8,17 @@ import re
 import signal
 import subprocess
 import termios
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 from batches import command_of, start_localize
 from rooms import errors, query
+from test_result import RESULT
 
+from piccolo.camera import Mount
+from piccolo.camera.model import pinhole
 from piccolo.cli import localize, prepare_map
 from piccolo.result import Result
 from piccolo.scenes.scene import read_scene
@@ -93,6 +97,27 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
 
 
+@pytest.mark.parametrize(
+    ("change", "advice"),
+    [
+        ({"status": "localized"}, []),
+        ({"status": "ambiguous", "confidence": 0.05}, ["  to decide, give --near or --heading"]),
+        ({"confidence": 0.1}, ["  to be sure, look at the --overlay, give --near"]),
+        ({"confidence": 0.09}, ["  it fits nowhere well: another scan, or bare walls?"]),
+        (
+            {"confidence": 0.09, "cameras": (Mount(pinhole(4, 3, 4.0)),)},
+            ["  it fits nowhere well: .* focal length"],
+        ),
+        ({"confidence": 0.0}, []),  # a warning says why
+        ({"confidence": 0.5, "probability_none": None}, []),  # of the preset paper
+    ],
+)
+def test_a_doubtful_result_says_what_to_do(change, advice):
+    found = localize.advise(replace(RESULT, **{"status": "not_localized", **change}))
+    assert len(found) == len(advice)
+    assert all(map(re.match, advice, found))
+
+
 USAGE = [
     ("--threads 0", "--threads: found 0, wanted at least 1"),
     ("--units -1", "--units: found -1.0"),
@@ -109,7 +134,7 @@ USAGE = [
     ("--height 2 1", "--height: found [2.0, 1.0]"),
     ("--preset default num_yaws=1000000", "num_yaws: found 1000000, wanted 1 to 3600"),
     ("--near nan 0 0 1", "found nan or inf, wanted finite numbers"),
-    ("--overlay x.png --pano a b", "found 2 panoramas, wanted one panorama or a folder"),
+    ("--overlay x.png --pano a b", "found 2 photos, wanted one photo or a folder"),
     ("--occlusion-mask x.jpg", "--occlusion-mask x.jpg: wanted a name that ends with .png"),
     ("--occlusion-mask x.png --overlay x.png", "the same output as --overlay"),
     ("--overwrite", "--overwrite: only with --out"),

@@ -170,6 +170,27 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     main([*cloud, "--pano", str(tmp_path / "phone.jpg")])
     out, err = capsys.readouterr()
     assert json.loads(out)["camera"]["model"] == "SIMPLE_PINHOLE"
-    assert "read as a pinhole photo 115.1 deg wide, focal length 153 px from EXIF's 35 mm equivalent" in err
+    first, *_, last = err.splitlines()  # a warning stands below the line of its photo
+    assert first.startswith(f"{tmp_path / 'phone.jpg'}: localized at")
+    assert last.startswith(
+        "  warning: read as a pinhole photo 115.1 deg wide, focal length 153 px from EXIF's 35 mm"
+    )
     assert main([*cloud, "--pano", str(tmp_path / "phone.jpg"), "--camera", str(rig)]) == 2
     assert "give it as --rig" in capsys.readouterr().err
+
+
+def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
+    photos, cameras = tmp_path / "photos", tmp_path / "cameras"
+    photos.mkdir()
+    cameras.mkdir()
+    rgb = render_picture(Mount(pinhole(480, 360, 150.0)), *place(), Workers(2))
+    for name in ("a", "b", "c"):
+        write(photos / f"{name}.jpg", encoded(rgb, ".jpg"))
+    write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(480, 360, 150.0)),))).encode())
+    write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(480, 360, 160.0)),))).encode())
+    results = list(scan().localize_many(sorted(photos.iterdir()), camera=cameras, gravity="known"))
+    assert [result.cameras[0].camera.focal[0] for result in results[:2]] == [150.0, 160.0]
+    assert results[0].status == "localized"
+    assert results[0].settings["panorama"]["calibration"] == str(cameras)
+    assert results[2].status == "unreadable"
+    assert f"found no calibration of it in {cameras}, wanted c.camera.json or c.json" in results[2].error

@@ -114,9 +114,26 @@ def test_what_the_user_says_goes_before_exif(tmp_path):
         panorama = read_panorama(path, options)
         assert panorama.cameras[0].camera.params[0] == pytest.approx(focal)
         assert panorama.warnings == ()
-    crop = read_panorama(path, ReadOptions(fov_deg=60.0))
-    assert crop.cameras == ()
+    crop = read_panorama(path, ReadOptions(fov_deg=60.0, projection="equirectangular"))
+    assert (crop.cameras, crop.warnings) == ((), ())
     assert crop.rgb.shape == (1440, 2880, 3)
+
+
+@pytest.mark.parametrize("size", [(480, 360), (360, 480), (480, 320), (480, 270), (480, 271)])
+def test_a_field_of_view_alone_makes_no_pinhole_of_a_photo_and_a_warning_says_so(tmp_path, size):
+    panorama = read_panorama(photo(tmp_path / "a.jpg", size=size), ReadOptions(fov_deg=65.0))
+    assert panorama.cameras == ()
+    (warning,) = panorama.warnings
+    assert "part of a panorama" in warning
+    assert "for a photo add `projection` pinhole" in warning
+
+
+def test_a_part_of_a_panorama_is_not_taken_for_a_photo(tmp_path):
+    path = photo(tmp_path / "a.jpg", size=(480, 200))
+    assert read_panorama(path, ReadOptions(fov_deg=65.0)).warnings == ()
+    sphere = with_metadata(encoded(PHOTO, ".jpg"), xmp=xmp_packet({"PosePitchDegrees": 10}))
+    path = write(tmp_path / "b.jpg", sphere)
+    assert read_panorama(path, ReadOptions(fov_deg=65.0)).warnings == ()
 
 
 def test_a_sphere_stays_a_sphere_whatever_its_exif(tmp_path):
@@ -131,7 +148,12 @@ def test_a_sphere_stays_a_sphere_whatever_its_exif(tmp_path):
 
 def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
     path = photo(tmp_path / "a.jpg")
-    assert_refused(r"found 480 x 360, wanted .*\(EXIF, `focal_px`, `camera`\)", read_panorama, path)
+    message = (
+        r"found a picture of 480 x 360, .* no focal length in EXIF\. If a camera .* `fov_deg` 65 `refine"
+    )
+    assert_refused(message, read_panorama, path)
+    upright = photo(tmp_path / "b.jpg", orientation=6)
+    assert_refused("found a picture of 360 x 480, .* `fov_deg` 50 `refine_focal`", read_panorama, upright)
     pinhole_only = ReadOptions(projection="pinhole")
     assert_refused("found no focal length in EXIF, wanted `focal_px`", read_panorama, path, pinhole_only)
     wrong = calibrated([Mount(pinhole(640, 360, 100.0))])

@@ -146,6 +146,12 @@ def test_a_moved_folder_of_photos_and_one_that_is_gone(house, tmp_path, capsys):
     assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(empty)]) == 0
     assert "no pictures of it" in capsys.readouterr().err
     assert {photo["hasPictures"] for photo in _document(tmp_path / "r")["photos"]} == {False}
+    moved = tmp_path / "moved.jsonl"
+    moved.write_text(
+        "".join(replace(r, pano=f"gone/{k}.jpg").to_json() + "\n" for k, r in enumerate(scene.results))
+    )
+    assert report.main(["--results", str(moved), *words[2:], "--out", str(tmp_path / "m")]) == 0
+    assert "; if it is in another folder, give --images FOLDER\n" in capsys.readouterr().err
     assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(tmp_path / "no")]) == 3
 
 

@@ -66,8 +66,10 @@ def test_summary_says_what_a_person_asks_first():
     text = dataclasses.replace(RESULT, status="ambiguous").summary()
     assert "ambiguous with the best guess (500000.123, 4000000.456, 12.000) m" in text
     assert "confidence 0.990" in text
-    assert "one sigma 4.0 mm (up and down)" in text
+    assert "one sigma 4.0 mm up and down, rotation" in text
     assert "or (1.000, 2.000, 3.000) m, probability 0.01" in text
+    tiny = dataclasses.replace(ALTERNATIVE, probability=0.0049)
+    assert "or (" not in dataclasses.replace(RESULT, status="ambiguous", alternatives=(tiny,)).summary()
     by_paper = dataclasses.replace(ALTERNATIVE, probability=None)
     text = dataclasses.replace(RESULT, status="ambiguous", alternatives=(by_paper,)).summary()
     assert "or (1.000, 2.000, 3.000) m, score 0.20" in text

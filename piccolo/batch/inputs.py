@@ -12,7 +12,7 @@ from ..files.json_file import read_bytes
 from ..panorama.cube import SUFFIXES, is_cube
 
 STDIN = "-"
-WANTED_LIST = "wanted a text file, a panorama's path on each line"
+WANTED_LIST = "wanted a text file, a photo's path on each line"
 MAX_KINDS = 5  # of files left out that are named
 
 

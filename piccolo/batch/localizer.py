@@ -156,7 +156,7 @@ class Localizer:
         pose = result.best_pose
         if pose is None:
             return overlay, mask
-        read_options = self.read_options.with_refined_camera(result.cameras)
+        read_options = self.read_options.with_refined_camera(result.cameras, pano)
         if self.makes_overlays:
             panorama = read_panorama(pano, read_options)
             overlay = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)

@@ -13,6 +13,9 @@ from ..result import FAILED, FORMAT
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
+GROUPS = ("prior", "cloud", "panorama")  # of settings, each of which an option sets
+OPTIONS = ("preset", "gravity", "min_confidence")  # of the other settings those that are options
+RENAMED = {"scale": "units", "calibration": "camera"}
 Name = TypeVar("Name", Path, str)
 
 
@@ -34,15 +37,43 @@ def check_as_expected(fields: Mapping[str, Any], expected: Mapping[str, Any], wa
     if different is None:
         return
     found = fields.get(different)
-    wanted = expected[different]
+    text = f"made with {different} {found!r}, not {expected[different]!r}"
     if different == "settings" and isinstance(found, dict):
-        different = next(name for name in sorted({*found, *wanted}) if found.get(name) != wanted.get(name))
-        found = found.get(different)
-        wanted = wanted.get(different)
-    text = f"made with {different} {found!r}, not {wanted!r}"
+        text = f"made {describe_changes(found, expected[different])}"
     if different == "cloud_sha256":
         text = "made with another scan, or the scan has changed since"
     raise InputError(f"{fields['line']}: {text}; {ways}")
+
+
+def describe_changes(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str:
+    """Describe how settings differ, by the names of the options."""
+    old = _by_option(found)
+    new = _by_option(wanted)
+    names = sorted(name for name in {*old, *new} if old.get(name) != new.get(name))
+    names = ["`preset`"] if "`preset`" in names else names
+    return "; ".join(
+        f"{_say(name, old.get(name), 'with ')}, now {_say(name, new.get(name))}" for name in names
+    )
+
+
+def _by_option(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the value of each setting by the name of its option in backticks, or by its own."""
+    values = {name: settings[name] for name in settings if name not in GROUPS}
+    values = {f"`{name}`" if name in OPTIONS else name: value for name, value in values.items()}
+    grouped = {name: value for group in GROUPS for name, value in settings.get(group, {}).items()}
+    return values | {f"`{RENAMED.get(name, name)}`": value for name, value in grouped.items()}
+
+
+def _say(name: str, value: Any, given: str = "") -> str:
+    """Say what an option is, such as "`focal_px` 1585" or "without `focal_px`"."""
+    if isinstance(value, dict):
+        value = value.get("path", True)  # of a calibration
+    if value in (None, False, []):
+        return f"without {name}"
+    if value is True:
+        return f"{given}{name}"
+    parts = value if isinstance(value, list) else [value]
+    return f"{given}{name} {' '.join(f'{p:.10g}' if isinstance(p, float) else str(p) for p in parts)}"
 
 
 class Finished(NamedTuple):
@@ -101,7 +132,7 @@ class Records:
             self._others.setdefault(pano, []).append(line)
             self.size = span[1]
         if self._others and named is not None and named.isdisjoint(self._others):
-            text = f"it has no result of the panoramas given; {WAYS}"
+            text = f"it has no result of the photos given; {WAYS}"
             raise InputError(f"{self.path}: {text}")
 
     def remaining(

@@ -44,6 +44,22 @@ def read_calibration(path: Path) -> Calibration:
     return calibration
 
 
+def open_calibration(path: Path) -> Calibration | Path:
+    """Return the cameras in a file, as `read_calibration`; a folder of such files, for `find_calibration`."""
+    return path.absolute() if path.is_dir() else read_calibration(path)
+
+
+def find_calibration(given: Calibration | Path | None, pano: Path) -> Calibration | None:
+    """Return what is given, or from a folder the file NAME.camera.json or NAME.json of a photo NAME.jpg."""
+    if not isinstance(given, Path):
+        return given
+    names = [f"{pano.stem}{suffix}" for suffix in (".camera.json", ".json")]
+    file = next((given / name for name in names if (given / name).is_file()), None)
+    if file is None:
+        raise InputError(f"{pano}: found no calibration of it in {given}, wanted {' or '.join(names)}")
+    return read_calibration(file)
+
+
 def read_cameras(path: Path) -> Calibration:
     """Return the cameras in a file, told by its content.
 

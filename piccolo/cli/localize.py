@@ -1,4 +1,4 @@
-"""Command line: a coloured scan and 360-degree photos in, camera poses out."""
+"""Command line: a coloured scan and photos in, camera poses out."""
 
 import argparse
 import itertools
@@ -29,7 +29,7 @@ from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..panorama.cube import is_cube
 from ..panorama.photo import sha256_of
-from ..result import FAILED, UNREADABLE
+from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from .command import command
@@ -50,6 +50,7 @@ from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
 from .walking import check_plan, check_walk_options, run_walk, walk_inputs
 
+MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
 Write = Callable[[str], object]
@@ -83,8 +84,8 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
         if path is None or path.is_dir():
             continue
         if total != 1:
-            found = "names on stdin" if total is None else f"{total} panoramas"
-            raise UsageError(f"{option}: found {found}, wanted one panorama or a folder that exists")
+            found = "names on stdin" if total is None else f"{total} photos"
+            raise UsageError(f"{option}: found {found}, wanted one photo or a folder that exists")
         check_suffix(option, path, (".png",))
         check_output(path)
 
@@ -123,7 +124,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
 def note_unused_priors(arguments: argparse.Namespace, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
     if localizer.priors and (names := localizer.priors.names_without_panorama):
-        note = f"{len(names)} names without a panorama, such as {names[0]}"
+        note = f"{len(names)} names without a photo, such as {names[0]}"
         print_note(arguments, f"warning: {localizer.priors.path}: {note}")
 
 
@@ -162,6 +163,25 @@ def take_up_results(run: Run, file: LineFile | None) -> Records:
     return records
 
 
+def advise(result: Result) -> list[str]:
+    """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
+    is_ruled_out = result.best_pose is None or result.confidence == 0.0
+    if result.status == LOCALIZED or is_ruled_out or result.probability_none is None:
+        return []
+    if result.status == AMBIGUOUS:
+        return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
+    if result.confidence >= MIN_FIT:
+        return [
+            "  to be sure, look at the --overlay, give --near, or localize several photos of a walk (--walk)"
+        ]
+    causes = (
+        "another scan, bare walls, or a wrong focal length"
+        if result.cameras
+        else "another scan, or bare walls"
+    )
+    return [f"  it fits nowhere well: {causes}?"]
+
+
 def record(run: Run, answer: Answer, write: Write) -> None:
     """Write the pictures asked for and the result, and say what was found."""
     arguments = run.arguments
@@ -174,8 +194,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
     elif not arguments.quiet:
-        warnings = (f"warning: {for_terminal(printable(warning))}" for warning in answer.warnings)
-        for line in (*warnings, result.summary()):
+        warnings = (f"  warning: {for_terminal(printable(warning))}" for warning in answer.warnings)
+        for line in (result.summary(), *warnings, *advise(result)):
             tqdm.write(line, file=sys.stderr)
     write(result.to_json())
     run.counts[result.status] += 1
@@ -186,7 +206,7 @@ def localize_all(
 ) -> Interruption:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
     is_quiet = run.arguments.quiet or run.total == 1
-    bar = {"desc": "panoramas", "total": run.total, "initial": records.counts.total(), "unit": ""}
+    bar = {"desc": "photos", "total": run.total, "initial": records.counts.total(), "unit": ""}
     values = executor.values(map(run.localizer.task, left))
     with interruptible() as interruption:
         pairs = show_progress(values, is_quiet, **bar)
@@ -212,10 +232,8 @@ def finish(
     if run.total != 1 or run.left_out or num_dropped:
         words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
         again = ", which the same command will try again" if counts[FAILED] else ""
-        note = f"{counts.total()} panoramas in {seconds:.0f} s: {words}{again}"
-        dropped = (
-            f"dropped {num_dropped} results of panoramas that are no longer given" if num_dropped else ""
-        )
+        note = f"{counts.total()} photos in {seconds:.0f} s: {words}{again}"
+        dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
     if interruption.number:
         how = (

@@ -8,7 +8,7 @@ from typing import Any, get_args, get_type_hints
 from .. import __version__
 from ..batch.frame_times import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
-from ..camera.files import read_calibration, read_rig
+from ..camera.files import open_calibration, read_rig
 from ..cloud.crs import check_crs
 from ..cloud.settings import METRES, CloudSettings, UpAxis
 from ..errors import InputError
@@ -23,7 +23,7 @@ from ..scan_map.prior import Prior
 from ..walk.frames import MAX_SPEED
 from .command import check_least, option
 
-DESCRIPTION = "Find the camera poses of 360-degree panoramas in a coloured point cloud."
+DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
 EPILOG = """\
 examples:
   python localize.py --cloud scan.ply --pano query.jpg
@@ -35,7 +35,7 @@ examples:
   python localize.py --cloud scan.ply --video walk.mp4 --every 0.5s --out walk.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
 
-output: one JSON object per panorama and line, in the order given (docs/RESULT.md); messages and progress go
+output: one JSON object per photo and line, in the order given (docs/RESULT.md); messages and progress go
 to stderr. Ctrl-C lets the current photo finish and then stops a batch; a second Ctrl-C stops it at once.
 """
 PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "one or several files of a coloured scan (formats: docs/USAGE.md), or a map of tools/prepare_map.py"
     )
     add_cloud_options(parser, text)
-    group = parser.add_argument_group("panorama")
+    group = parser.add_argument_group("photos")
     text = (
         "pictures (JPEG, PNG, TIFF, WebP, HEIC): full spheres (2:1), crops with Photo Sphere metadata, or "
         "photos with a known focal length; a folder of six cube faces, or, with --rig, of the pictures taken "
@@ -65,8 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("files")
     option(group, "--out FILE", "append the JSON lines to this file; a repeated command continues")
     option(group, "--overwrite", "replace the file of --out instead of continuing it")
-    folder = "a folder if there are several panoramas"
-    text = "picture of the panorama, the cloud seen from its pose, and a checkerboard of both; "
+    folder = "a folder if there are several photos"
+    text = "the photo, the cloud seen from its pose, and a checkerboard of both; "
     option(group, "--overlay PNG", text + folder)
     text = "mask of the photo's size: white contradicts the scan, grey was not scanned, black elsewhere; "
     option(group, "--occlusion-mask PNG", text + folder)
@@ -107,7 +107,7 @@ def _metres_of(text: str) -> float:
 
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     """Add what the files of the panoramas do not say."""
-    text = "horizontal field of view: of a crop of the sphere centred on the horizon, or with --projection"
+    text = "horizontal field of view: of a photo with --projection; alone, of a crop of the sphere"
     option(group, "--fov DEG", text)
     text = "projection of the picture (default equirectangular; pinhole if EXIF has a focal length)"
     group.add_argument("--projection", choices=get_args(Projection), help=text)
@@ -118,7 +118,8 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
         "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times as long"
     )
     option(group, "--refine-focal", text)
-    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON as in docs/CAMERAS.md"
+    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON as in docs/CAMERAS.md; "
+    text += "or a folder with NAME.camera.json or NAME.json for each photo"
     option(group, "--camera FILE", text)
     text = (
         "calibration of a rig: COLMAP's rig_config.json, or JSON as in docs/CAMERAS.md; a query is a folder"
@@ -126,7 +127,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--rig FILE", text)
     text = "down in camera axes (+x image centre, +y left, +z up), of any length; 0 0 -1: upright camera"
     option(group, "--gravity-vector X Y Z", text)
-    text = "mask whose white pixels are ignored; or a folder of masks, named like the panoramas"
+    text = "mask whose white pixels are ignored; or a folder of masks, named like the photos"
     option(group, "--mask FILE", text)
     text = "ignore a cap of this half angle around straight down, with the tripod or the car"
     group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
@@ -173,7 +174,7 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks."""
     group = parser.add_argument_group("walks")
-    text = "the panoramas are frames of one walk, in this order, and constrain each other"
+    text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
     option(group, "--video FILE", "video of a walk, instead of --pano")
     text = (
@@ -210,7 +211,7 @@ def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
     """Return the options of add_panorama_reading_options."""
     if arguments.camera and arguments.rig:
         raise InputError("--camera, --rig: wanted only one of them")
-    calibration = read_calibration(arguments.camera) if arguments.camera else None
+    calibration = open_calibration(arguments.camera) if arguments.camera else None
     return ReadOptions(
         fov_deg=arguments.fov,
         mask=arguments.mask,

@@ -29,6 +29,7 @@ FLAGS = {
     "radius": "RADIUS of --near",
     "heading_tolerance_deg": "the tolerance of --heading",
     "cube_order": "the order of cube faces",
+    "use_gps": "GPS",
 }
 # [byte] below it LLVM and OpenBLAS crash or wait for ever, where NumPy raises; each core has a thread
 LEAST_ADDRESS_SPACE = 1_000_000_000 + 250_000_000 * (os.cpu_count() or 1)

@@ -4,13 +4,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..geometry.pose import Array
 
-CORRIDOR_RATIO = 2.5  # what is seen reaches so many times as far one way as across
 SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
-BAND = math.sin(math.radians(30.0))  # walls: what is seen up to 30 degrees above and below the horizon
 
 
 @dataclass(frozen=True)
@@ -41,11 +38,11 @@ class PoseCovariance:
         return float(math.sqrt(np.linalg.eigvalsh(self.matrix[3:, 3:])[-1]))
 
 
-def least_constrained_direction(covariance_up: Array, covariance: Array, offsets: NDArray[np.float32]) -> str:
+def least_constrained_direction(covariance_up: Array, covariance: Array, _offsets: object = None) -> str:
     """Return the direction of the largest translational deviation, in words.
 
-    Both are covariances (3, 3) of the position: `covariance_up` in a frame whose z is up, like the offsets
-    (3, N) [m] from the camera to what it sees; `covariance` in the world. Headings are clockwise from +y.
+    Both are covariances (3, 3) of the position: `covariance_up` in a frame whose z is up, `covariance` in the
+    world. Headings are clockwise from +y. `_offsets` is not used.
     """
     variances, axes = np.linalg.eigh(covariance_up)
     if variances[2] < SAME_STD_RATIO**2 * max(variances[0], 0.0):
@@ -55,16 +52,4 @@ def least_constrained_direction(covariance_up: Array, covariance: Array, offsets
         return "up and down"
     _, axes_world = np.linalg.eigh(covariance)
     heading = math.degrees(math.atan2(axes_world[0, 2], axes_world[1, 2])) % 180.0
-    words = f"heading {heading:.0f} or {heading + 180.0:.0f} deg"
-    return f"along the corridor, {words}" if _is_corridor(direction, offsets) else words
-
-
-def _is_corridor(direction: Array, offsets: NDArray[np.float32]) -> bool:
-    """Return True if the offsets (3, N), z up, reach much farther along a direction (3,) than across it."""
-    along = direction[:2]  # not of length 1, which scales reach and width alike
-    walls = offsets[:2, np.abs(offsets[2]) < BAND * np.linalg.norm(offsets, axis=0)]
-    if walls.shape[1] == 0:
-        return False
-    reach = np.percentile(np.abs(along @ walls), 90.0)
-    width = np.percentile(np.abs(np.array([-along[1], along[0]]) @ walls), 90.0)
-    return bool(reach > CORRIDOR_RATIO * width)
+    return f"along heading {heading:.0f}/{heading + 180.0:.0f} deg"

@@ -89,12 +89,12 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
 def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     """Explain how the focal length makes a pose doubtful, as warnings."""
     focal = fit.focal_length(panorama)
-    found = f"focal length: found {focal.px:.0f} px within {focal.std_px:.0f}"
-    given = f"given {focal.given_px:.0f} px within {focal.given_std_px:.0f}"
+    found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
+    given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
     if fit.conflict > MOST_CONFLICT:
-        return (f"{found}, which contradicts what was {given}",)
+        return (f"{found} contradicts the {given} px",)
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
-    return (f"{found}, {given}: this leaves the position open by {std:.2f} m",) if std > TELLING_STD else ()
+    return (f"{found} ({given}): the position is uncertain by {std:.2f} m",) if std > TELLING_STD else ()
 
 
 def collect_evidence(

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Calibration, Mount
+from ..camera.files import find_calibration
 from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
 from ..camera.resampling import View, shrunk
 from ..camera.rig import compute_extent
@@ -27,6 +28,7 @@ TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
 HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole set it exactly"
+GUESS = "`refine_focal` needs EXIF, `focal_px`, `camera`, or `projection` pinhole and `fov_deg`"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
 # standard deviations of the logarithm of a focal length: a first guess, a number of pixels, a field of view
 OF_GUESS = 0.2
@@ -52,14 +54,14 @@ def cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bo
         return found
     if len(found.mounts) != 1:
         what = f"{len(found.mounts)} cameras" if found.mounts else "a sphere or a part of one"
-        raise InputError(f"{path}: found {what}, wanted the photo of one camera to refine its focal length")
+        raise InputError(f"{path}: found {what}, wanted the photo of one camera: {GUESS}")
     return found._replace(deviation=OF_GUESS)
 
 
 def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
     width, height = picture.size
-    if options.calibration is not None:
-        mounts = _calibrate(path, picture, options.calibration)
+    if (calibration := find_calibration(options.calibration, path)) is not None:
+        mounts = _calibrate(path, picture, calibration)
         return Cameras(() if _is_sphere(mounts) else mounts)
     if options.focal_px is not None:
         return Cameras((Mount(pinhole(width, height, options.focal_px)),), OF_PIXELS)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..camera import Calibration, Camera, Mount
+from ..camera.files import find_calibration
 from ..camera.resampling import View, make_sphere
 from ..camera.rig import IDENTITY
 from ..errors import InputError
@@ -75,7 +76,8 @@ class ReadOptions:
     use_gps: bool = True  # a GPS position in the file narrows the search, where the scan's system is known
     projection: Projection | None = None  # of a picture; None: of a sphere, if nothing speaks for a photo
     focal_px: float | None = None  # of a pinhole [px], at the picture's own size
-    calibration: Calibration | None = None  # of the camera, or of a rig whose pictures are in a folder
+    # of the camera, a folder of one for each photo, or of a rig whose pictures are in a folder
+    calibration: Calibration | Path | None = None
     gravity_vector: tuple[float, float, float] | None = None  # down, in the camera's axes, of any length
     refine_focal: bool = False  # the focal length is a first guess
 
@@ -99,13 +101,14 @@ class ReadOptions:
     @property
     def rig(self) -> Calibration | None:
         """Rig whose pictures make a panorama; None for single pictures."""
-        return self.calibration if self.calibration is not None and self.calibration.is_rig else None
+        given = self.calibration
+        return given if isinstance(given, Calibration) and given.is_rig else None
 
-    def with_refined_camera(self, cameras: tuple[Mount, ...]) -> "ReadOptions":
-        """Return the options with the refined camera of a result as calibration of the stored picture."""
+    def with_refined_camera(self, cameras: tuple[Mount, ...], pano: Path) -> "ReadOptions":
+        """Return the options with the refined camera of a photo as calibration of the stored picture."""
         if len(cameras) != 1:
             return self
-        given = self.calibration
+        given = find_calibration(self.calibration, pano)
         R_lens_from_cam = IDENTITY if given is None or given.is_choice else given.mounts[0].R_lens_from_cam
         mount = replace(cameras[0], R_lens_from_cam=R_lens_from_cam)
         camera = Calibration("the refined camera", (mount,))

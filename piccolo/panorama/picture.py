@@ -31,7 +31,7 @@ from ..geometry.colors import Labels, label_colors
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 
-WANTED = "wanted a whole JPEG, PNG, TIFF, WebP or HEIC panorama"
+WANTED = "wanted a whole JPEG, PNG, TIFF, WebP or HEIC picture"
 MIN_WIDTH = 128
 MIN_HEIGHT = 64
 MAX_WIDTH = 32768

@@ -33,9 +33,16 @@ from .picture import BYTES_PER_PIXEL, Picture, picture_orientation, picture_size
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 AS_STORED = ReadOptions()
-WANTED = (
-    "wanted width = 2 x height (a full equirectangular panorama), GPano metadata of a crop, a field of view "
-    "(`fov_deg`), a photo's focal length (EXIF, `focal_px`, `camera`), or the cube's order (`cube_order`)"
+PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
+CHOICES = (
+    "If a camera took it, give `focal_px` or `camera`; if its focal length is unknown, `projection` pinhole "
+    "`fov_deg` {} `refine_focal`. If it is a part of a panorama, give `fov_deg`. If it is a cube, give "
+    "a folder of its six faces (in Python also `cube_order`)"
+)
+CAMERA_RATIOS = 4 / 3, 3 / 2, 16 / 9
+LIKE_A_PHOTO = (
+    "read as a part of a panorama, though it has the shape of a camera's photo: for a photo add `projection` "
+    "pinhole, for a part of a panorama `projection` equirectangular"
 )
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
@@ -167,23 +174,34 @@ def _region_of(
     """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
     width, height = picture.size
     if options.fov_deg is not None:
-        return region_of_fov(options.fov_deg, width, height), []
+        notes = (
+            [LIKE_A_PHOTO] if options.projection is None and not fields and _is_like_photo(picture) else []
+        )
+        return region_of_fov(options.fov_deg, width, height), notes
     name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
         raise InputError(f"{path}: its metadata names the projection {name!r}, wanted equirectangular")
-    notes: list[str] = []
+    notes = []
     region = crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
     if region is None and is_two_to_one:
         region = CropRegion()
         notes = ["the crop in the metadata is invalid or has another shape; read as a full sphere"]
     if region is None or (region.is_full and not is_two_to_one):
-        wrong = " and a crop in the metadata that does not fit it" if region is None else ""
-        raise InputError(f"{path}: found {width} x {height}{wrong}, {WANTED}")
+        wrong = "no field of view is given" if options.projection else "no focal length in EXIF"
+        wrong = "a crop in the metadata that does not fit it" if region is None else wrong
+        found = f"found a picture of {width} x {height}, which is no full panorama (2:1), and {wrong}"
+        raise InputError(f"{path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
     if region.is_full and is_dual_fisheye(picture.rgb):
         found = "two fisheye pictures side by side, wanted their calibration as `camera` (docs/CAMERAS.md)"
         raise InputError(f"{path}: {found}, or a panorama that the camera's program has stitched")
     return region, notes
+
+
+def _is_like_photo(picture: Picture) -> bool:
+    """Return True for a picture of the shape of a camera's photos, upright or not."""
+    ratio = max(picture.size) / min(picture.size)
+    return any(abs(ratio / camera_ratio - 1.0) <= ASPECT_TOLERANCE for camera_ratio in CAMERA_RATIOS)
 
 
 def _embed_and_mask(

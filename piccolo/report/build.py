@@ -144,7 +144,9 @@ def write_pictures(
         try:
             thumbnail, script = make_pictures(task.photo, task.entry.result, task.poses, scan, settings.width)
         except (OSError, InputError) as error:
-            return f"{task.photo}: no pictures of it ({error})"
+            is_here = settings.images is not None or task.photo.is_absolute()
+            where = "" if is_here else "; if it is in another folder, give `images` FOLDER"
+            return f"{task.photo}: no pictures of it ({error}){where}"
         write_atomically(picture_path(folder, "thumbs", task.key), thumbnail)
         write_photo_script(folder, task.key, script)  # last: it says that both are there
         return ""
