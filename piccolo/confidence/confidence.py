@@ -79,9 +79,9 @@ def posterior(
 ) -> Array:
     """Return the probabilities (K + 1,) that each of K poses, best first, is right, and that none of them is.
 
-    The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees. They hold where half
-    of all queries have an answer, as in the trials from which they were learnt. None is more likely if the
-    best pose's deviation makes 0.1 m doubtful.
+    The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees. They hold where
+    half of all queries have an answer, as in the trials from which they were learnt. None is more likely if
+    the best pose's deviation makes 0.1 m doubtful.
     """
     model = model or choose_model(standings[0])
     logits = [log_odds(standing, model) for standing in standings]

@@ -38,11 +38,11 @@ class PoseCovariance:
         return float(math.sqrt(np.linalg.eigvalsh(self.matrix[3:, 3:])[-1]))
 
 
-def least_constrained_direction(covariance_up: Array, covariance: Array, _offsets: object = None) -> str:
+def least_constrained_direction(covariance_up: Array, covariance: Array) -> str:
     """Return the direction of the largest translational deviation, in words.
 
     Both are covariances (3, 3) of the position: `covariance_up` in a frame whose z is up, `covariance` in the
-    world. Headings are clockwise from +y. `_offsets` is not used.
+    world. Headings are clockwise from +y.
     """
     variances, axes = np.linalg.eigh(covariance_up)
     if variances[2] < SAME_STD_RATIO**2 * max(variances[0], 0.0):

@@ -186,5 +186,5 @@ def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None
         covariance_map += of_camera
     J[3:, 3:] = query.scan_map.R_map_from_world.T
     covariance_world = J @ covariance_map @ J.T
-    words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:], points.offsets)
+    words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:])
     return PoseCovariance(0.5 * (covariance_world + covariance_world.T), words, std_of_fit)
