@@ -212,14 +212,14 @@ def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):
     assert "found no prepared map" in capsys.readouterr().err
     missing = str(tmp_path / "missing.map")
     assert prepare_command.main(["--cloud", cloud, "--add", missing, "--out", str(out), "--quiet"]) == 3
-    assert f"{missing}: found no such file, wanted a map by" in capsys.readouterr().err
+    assert f"{missing}: found no such file, wanted a map of" in capsys.readouterr().err
     assert prepare_command.main(["--cloud", path, "--add", path, "--out", str(out), "--quiet"]) == 3
     assert "wanted the files of a scan to add" in capsys.readouterr().err
     add = ["--add", path, "--cloud", cloud, "--out", path, "--quiet"]
     assert prepare_command.main([*add, "--name", "house"]) == 3
     assert "--name: found 'house', which the map has already: 'house'" in capsys.readouterr().err
     assert prepare_command.main([*add, "--up", "x"]) == 3
-    assert "a scan is added in the map's axes" in capsys.readouterr().err
+    assert "a scan is added in the axes of the map" in capsys.readouterr().err
     assert prepare_command.main([*add, "--name", "Storey 2"]) == 0
     assert json.loads(capsys.readouterr().out)["scans"] == ["house", "Storey 2"]
     scan_map = load_map(tmp_path / "house.map")
@@ -237,4 +237,4 @@ def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):
     wanted = f"{table}: within, of {Path(pano).name}: found 'Roof', wanted of 'house', 'Storey 2'\n"
     assert capsys.readouterr().err.endswith(wanted)
     assert localize_command.main(["--cloud", cloud, *query[2:], "--within", "Storey 2"]) == 3
-    assert "--within: found a scan without names, wanted a map by" in capsys.readouterr().err
+    assert "--within: found a scan without names, wanted a map of" in capsys.readouterr().err
