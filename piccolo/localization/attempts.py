@@ -52,7 +52,7 @@ def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
     A first look by whole views (0 halves) may settle a whole upright sphere. Then come poses from feature
     matches, first of one half of the views, then of both, and at last searches by whole views: with gravity
     `auto` as known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly
-    taken about level: this is searched first, as what gravity `known` means for them.
+    taken about level: unless their tilt is known exactly, this is what is searched as known.
     """
     method = query.method
     looks_first = method.uses_features and method.uses_search and is_whole(query)
@@ -61,7 +61,7 @@ def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
         attempts += [(num_halves, search_matches) for num_halves in (1, ALL_HALVES)]
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
-        upright: SearchedGravity = "level" if is_partial else "known"
+        upright: SearchedGravity = "level" if is_partial and not query.photo.has_tilt else "known"
         attempts.append((ALL_HALVES, partial(search_views, gravity=upright)))
     if method.uses_search and query.settings.gravity != "known":
         with_any_tilt = partial(search_views, gravity="unknown", is_brief=looks_first)

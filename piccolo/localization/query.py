@@ -63,6 +63,7 @@ class Photo:
     small: Texels  # colours at the size at which poses are compared
     colors: Once[Texels]  # at the size at which the loss is taken
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
+    has_tilt: bool  # R_cam_from_level is known, from metadata or a gravity vector
     pixel: float  # [rad] of the photo as it was given, but none finer than those that are compared
 
     @property
@@ -169,6 +170,7 @@ def prepare_query(
         make_texels(resize(resized, COMPARED_WIDTH)),
         Once(partial(make_texels, panorama)),
         np.eye(3) if R_level_from_cam is None else R_level_from_cam.T,
+        R_level_from_cam is not None,
         math.tau / min(panorama.rgb.shape[1], width),
     )
     photo.images.search()  # each search begins with it
