@@ -10,7 +10,7 @@ import numba
 import numpy as np
 import pytest
 from batches import ROOT, command_of, run
-from measuring import confidence, damage, page, scaling
+from measuring import confidence, damage, page, photos, scaling
 from rooms import write_room
 
 from piccolo.geometry.pose import Pose
@@ -95,14 +95,14 @@ def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
 def test_photos_of_a_scene_come_with_their_calibrations(tmp_path, capsys):
     write_room(tmp_path, "--seed 7 --points 40000 --panoramas 1 --width 512 --variants clean")
     (query,) = read_scene(tmp_path).queries
-    photo = damage.cut_photo(
-        read_panorama(query.image).rgb, query.pose, np.random.default_rng(3), tmp_path / "images" / "a.jpg"
-    )
+    path = tmp_path / "images" / "a.jpg"
+    photo = photos.cut_photo(read_panorama(query.image).rgb, query.pose, 70.0, np.random.default_rng(3))
+    photos.write_photo(photo, path)
     camera = {"format": "piccolo-camera/1", "model": "SIMPLE_PINHOLE", "width": 1024, "height": 768}
     (tmp_path / "cameras").mkdir()
     params = {"params": [photo.focal_px, 512, 384]}
     (tmp_path / "cameras" / "a.camera.json").write_text(json.dumps(camera | params))
-    write_queries(tmp_path, [Query(photo.path, "own", photo.pose)])
+    write_queries(tmp_path, [Query(path, "own", photo.pose)])
     assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert [line for line in text.splitlines() if line.startswith("## ")] == [

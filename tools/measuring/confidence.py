@@ -23,7 +23,7 @@ from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import AS_STORED, read_panorama, read_photo
+from piccolo.panorama import ReadOptions, read_panorama, read_photo
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.reproduce_paper import UPSIDE_DOWN
 from piccolo.scenes.scene import Scene, read_scene
@@ -31,6 +31,7 @@ from piccolo.scenes.synthetic.room import PLAIN
 from piccolo.scenes.synthetic.world import VARIANTS, World, blur, make_query, make_world, scan_world
 
 from .calibration import Case, print_cases
+from .photos import Image, change_sensor, cut_photo
 from .places import ALIKE_KINDS, CHANGED, REPEATED_KINDS, make_alike, make_repeated
 
 EPILOG = """\
@@ -38,16 +39,17 @@ example:
   python tools/benchmark.py confidence --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
 
 A seed makes rooms, and places that look the same from several positions. Scenes are folders with cloud.ply,
-queries.json and images; each panorama is localized in each cloud. A false answer is a pose with the status
-localized that is more than 0.1 m or 5 degrees off. Writes the trials as JSON lines for tools/benchmark.py
-calibration, and prints a table.
+queries.json and images; each panorama is localized in each cloud. With --photos, photos of 55 to 90 degrees
+are cut out of the panoramas, processed as by other cameras, and localized in their place. A false answer is
+a pose with the status localized that is more than 0.1 m or 5 degrees off. Writes the trials as JSON lines
+for tools/benchmark.py calibration, and prints a table.
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
 LEAST_RADIUS = math.radians(8.0)  # of an occluder
 MOST_RADIUS = math.radians(28.0)
 ASPECT = 0.75  # height by width of a narrow photo
-Image = NDArray[np.uint8]
+PHOTO_FOVS_DEG = 55.0, 90.0  # of phone photos
 Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
 
 
@@ -59,6 +61,7 @@ class Trial(NamedTuple):
     true_pose: Pose | None  # None where the panorama was not taken in this cloud
     gravity: Gravity = "auto"
     is_masked: NDArray[np.bool_] | None = None  # (H, W) what the photo does not show
+    focal_px: float | None = None  # of a pinhole photo; None for a sphere
 
 
 def occlude(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
@@ -230,6 +233,22 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points
     yield thin_points(points, rng), [trial._replace(case="sparse") for trial in upright]
 
 
+def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator[tuple[Points, list[Trial]]]:
+    """Cut `number` photos out of each panorama of every scene, and try them in one scene's cloud."""
+    cloud = read_cloud(scene.cloud)
+    rng = np.random.default_rng([len(scene.queries), 54])
+    trials = []
+    for one in (scene, *others):
+        for query in (query for query in one.queries for _ in range(number)):
+            fov_deg = rng.uniform(*PHOTO_FOVS_DEG)
+            photo = cut_photo(read_panorama(query.image).rgb, query.pose, fov_deg, rng)
+            case = f"{fov_deg // 10:.0f}0 deg" if one is scene else "elsewhere"
+            true_pose = photo.pose if one is scene else None
+            rgb = change_sensor(photo.rgb, rng)
+            trials.append(Trial(case, rgb, true_pose, focal_px=photo.focal_px))
+    yield (cloud.points + cloud.origin_world, cloud.colors), trials
+
+
 def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
@@ -239,7 +258,9 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
         others = [other for other in scenes if other is not scene]
-        for points, trials in scene_trials(scene, others):
+        number = arguments.photos
+        of_scene = photo_trials(scene, others, number) if number else scene_trials(scene, others)
+        for points, trials in of_scene:
             yield scene.name, points, trials
 
 
@@ -279,7 +300,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=list(ALIKE_KINDS),
     )
     option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
-    option(parser, "--out FILE", "append a JSON line per trial", required=True)
+    option(parser, "--photos N", "cut so many photos out of each panorama of the scenes", default=0)
+    option(parser, "--out FILE", "write a JSON line per trial", required=True)
     option(parser, "--threads N", "number of threads", default=num_cores())
 
 
@@ -293,7 +315,7 @@ def run(arguments: argparse.Namespace) -> int:
             scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
                 settings = CoarseToFineSettings(gravity=trial.gravity)
-                photo = read_photo(trial.rgb, AS_STORED, trial.is_masked)
+                photo = read_photo(trial.rgb, ReadOptions(focal_px=trial.focal_px), trial.is_masked)
                 found = localize(scan_map, photo, settings, workers, Stopwatch())
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(found.pose, truth)

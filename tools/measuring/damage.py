@@ -1,28 +1,17 @@
-"""Damaged panoramas and scans with known poses, and phone photos cut out of panoramas."""
+"""Damaged panoramas and scans with known poses."""
 
-import math
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
 
-from piccolo.camera.model import camera_of_fov
-from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.sphere import compute_pixels
 from piccolo.scenes.synthetic.world import blur
 
-from .confidence import Image, Points, light_unevenly, mask_outside_field, occlude, thin_points
+from .confidence import Points, light_unevenly, mask_outside_field, occlude, thin_points
+from .photos import Image
 
-PHOTO_SIZE = (1024, 768)  # [px]
-PHOTO_FOV_DEG = 70.0
-DIAGONAL_35MM = 43.27  # [mm] of the film that EXIF compares with
-EXIF_IFD = 0x8769
-EXIF_FOCAL_35MM = 0xA405
-EXIF_FOCAL = 0x920A
 POINT_NOISE = 0.05  # [m]
 JPEG_QUALITY = 10
 
@@ -82,34 +71,3 @@ DAMAGED_SCANS: dict[str, Callable[[Points, np.random.Generator], Points]] = {
     "scan thinned to 5%": thin_points,
     "scan with 5 cm noise": add_point_noise,
 }
-
-
-class Photo(NamedTuple):
-    """A phone photo cut out of a panorama."""
-
-    path: Path
-    pose: Pose
-    focal_px: float
-
-
-def cut_photo(rgb: Image, pose: Pose, rng: np.random.Generator, path: Path) -> Photo:
-    """Cut a pinhole photo out of a panorama (H, W, 3) taken at `pose`, in any direction but steep ones.
-
-    The JPEG at `path` has its focal length in EXIF in whole millimetres, as phones write it.
-    """
-    camera = camera_of_fov("pinhole", PHOTO_FOV_DEG, *PHOTO_SIZE)
-    pitch, roll = np.radians(rng.uniform([-15.0, -5.0], [15.0, 5.0]))
-    R_photo_from_pano = exp_so3(np.array([roll, pitch, 0.0])) @ yaw_rotation(rng.uniform(0.0, 2.0 * np.pi))
-    columns, rows = (np.arange(size) + 0.5 for size in PHOTO_SIZE)
-    rays, _ = camera.rays(np.stack(np.meshgrid(columns, rows), axis=-1))
-    u, v = compute_pixels(rays @ R_photo_from_pano, rgb.shape[1])
-    map_u = (u - 0.5).astype(np.float32)  # OpenCV has pixel centres at whole numbers
-    map_v = (v - 0.5).astype(np.float32)
-    picture = cv2.remap(rgb, map_u, map_v, cv2.INTER_CUBIC, borderMode=cv2.BORDER_WRAP)
-    image = PillowImage.fromarray(picture)
-    exif = image.getexif()
-    focal_px = camera.focal[0]
-    focal_35mm = round(focal_px / math.hypot(*PHOTO_SIZE) * DIAGONAL_35MM)
-    exif.get_ifd(EXIF_IFD).update({EXIF_FOCAL_35MM: focal_35mm, EXIF_FOCAL: 4.25})
-    image.save(path, quality=93, exif=exif)
-    return Photo(path, Pose(R_photo_from_pano @ pose.R_cam_from_world, pose.center_world), focal_px)

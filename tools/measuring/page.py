@@ -32,9 +32,10 @@ from piccolo.scenes.scene import Query, Scene, read_scene
 from piccolo.scenes.synthetic.world import make_query, make_world
 
 from .calibration import pose_error
-from .confidence import Image, Points
-from .damage import DAMAGED_SCANS, PHOTO_FOV_DEG, cut_photo, damage_panorama
+from .confidence import Points
+from .damage import DAMAGED_SCANS, damage_panorama
 from .kernels import kernel_table
+from .photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
 from .scaling import clean_queries, size_table
 
 EPILOG = """\
@@ -250,10 +251,11 @@ class Bench:
             for number in range(self.arguments.photos if queries else 0):
                 query = queries[number % len(queries)]
                 path = Path(folder) / f"{scene.name}_{number}.jpg"
-                photo = cut_photo(read_panorama(query.image).rgb, query.pose, rng, path)
-                exact = scan.localize(photo.path, focal_px=photo.focal_px)
+                photo = cut_photo(read_panorama(query.image).rgb, query.pose, PHOTO_FOV_DEG, rng)
+                write_photo(photo, path)
+                exact = scan.localize(path, focal_px=photo.focal_px)
                 self.add(PHOTOS, f"{scene.name}, exact focal length", path.name, photo.pose, exact)
-                rounded = scan.localize(photo.path)
+                rounded = scan.localize(path)
                 self.add(PHOTOS, f"{scene.name}, focal length by EXIF", path.name, photo.pose, rounded)
 
     def measure_paper(self, scene: Scene, scan: piccolo.Scan) -> None:
