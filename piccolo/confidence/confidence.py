@@ -43,7 +43,7 @@ NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at m
 FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 VIEWS_MODEL = ChoiceModel((5.75, 0.43), (4.04, 3.82))  # of whole spheres by whole views alone
-MATCHES_MODEL = ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82))  # where local features were asked
+MATCHES_MODEL = ChoiceModel((9.44, 1.12, 1.94), (8.01, 4.86))  # where local features were asked
 
 
 def choose_model(standing: Standing) -> ChoiceModel:

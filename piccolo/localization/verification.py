@@ -126,7 +126,7 @@ def match_pictures(own: Keypoints, drawn: Keypoints) -> tuple[NDArray[np.intp], 
     distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
     nearest = distances.argmin(axis=1)
     best = distances[np.arange(len(a)), nearest]
-    is_same = (drawn.rays @ drawn.rays.T)[nearest] > COS_ELSEWHERE
+    is_same = drawn.rays[nearest] @ drawn.rays.T > COS_ELSEWHERE
     distances[is_same] = np.inf
     is_distinct = best < DISTINCT_RATIO**2 * distances.min(axis=1)
     return np.flatnonzero(is_distinct), nearest[is_distinct]
