@@ -62,29 +62,6 @@ def test_samples_along_turned_directions_equal_their_twin():
         np.testing.assert_allclose(found.T, expected, atol=0.1)
 
 
-def test_scores_equal_correlations_one_by_one():
-    rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    samples, validity = search.turn_panorama(_query().photo.images.search(), uniform_rotations(50))
-    validity[:, rng.random(validity.shape[1]) < 0.2] = 0
-    samples *= validity[:, None]
-    panorama = search.weigh_by_area(samples, validity, AREA, 1)
-    candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
-    row, views = scan_map.views.at(candidate, Workers(2))
-    pairs = np.empty(40, np.float32)
-    features, seen = views.features.reshape(len(views.features), -1), views.is_seen.view(np.uint8)
-    scores = search.masked_correlation(features, seen, AREA, panorama, Workers(2))
-    how = whole_areas(24), panorama, row, rotation
-    search.correlate_pairs(views.features, views.is_seen, *how, pairs)
-    twin = []
-    for c, r in zip(row, rotation, strict=True):
-        w = AREA * views.is_seen[c] * validity[r]
-        f, s = views.features[c].astype(float), samples[r].astype(float)
-        twin.append((w * f * s).sum() / np.sqrt((w * f * f).sum() * (w * s * s).sum()))
-    for found in (scores[row, rotation], pairs):  # each up to a factor of its own
-        factor = (found @ twin) / (found @ found)
-        np.testing.assert_allclose(factor * found, twin, atol=3e-3)
-
-
 def test_wide_samples_are_averages_by_area():
     rng, (cells, areas) = np.random.default_rng(3), wider_cells(12)
     samples = rng.uniform(-127.5, 127.5, (600, 3, len(AREA))).astype(np.float32)
@@ -94,30 +71,6 @@ def test_wide_samples_are_averages_by_area():
         wide, is_valid = search.widen_samples(samples, validity, Workers(num_threads))
         np.testing.assert_array_equal(wide, np.rint(samples) @ matrix / areas)
         np.testing.assert_array_equal(is_valid, np.rint(validity @ matrix / areas))
-
-
-def test_sums_of_a_search_are_exact():
-    """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
-    for area, most_seen in ((AREA, 1), (wider_cells(12)[1], 255)):
-        one = np.ones((1, 3, len(area)), np.float32)
-        panorama = search.weigh_by_area(127.5 * one, one[:, 0], area, most_seen)
-        assert 127 * panorama.samples.sum(dtype=float) < 2**24
-        assert most_seen * panorama.energy.sum(dtype=float) < 2**24
-        assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
-        for values in panorama:
-            np.testing.assert_array_equal(values, np.rint(values))
-    rng = np.random.default_rng(0)
-    samples = rng.uniform(-127.5, 127.5, (20, 3, len(AREA))).astype(np.float32)
-    validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
-    features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
-    seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = search.weigh_by_area(samples * validity[:, None], validity, AREA, 1)
-    expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama, Workers(1))
-    cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
-    features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
-    found = search.masked_correlation(features, seen, AREA[cells], shuffled, Workers(1))
-    np.testing.assert_array_equal(found, expected[views])
 
 
 @pytest.mark.parametrize(("gravity", "most"), [("known", 10), ("unknown", 100)])
