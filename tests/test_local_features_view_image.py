@@ -6,12 +6,15 @@ import rooms
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
+from piccolo.geometry.pose import Pose
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.view_image import fill_gaps, render_gray
 from piccolo.scenes.synthetic.raycast import cast_rays
 
 WIDTH = 256
+EVERYWHERE = np.ones((WIDTH // 2, WIDTH), bool)
+LEVEL = Pose(np.eye(3), np.zeros(3))
 
 
 def _octree(*shells):
@@ -29,7 +32,7 @@ def test_the_nearest_surface_wins_with_its_grey_and_range():
     near = _sphere(1.5)
     near = near[np.abs(near[:, 1]) < 0.7]
     near = near[(near[:, 0] > 0) & (np.abs(near[:, 2]) < 0.7)]
-    view = render_gray(_octree((_sphere(3.0, 512), 60), (near, 200)), np.zeros(3), WIDTH)
+    view = render_gray(_octree((_sphere(3.0, 512), 60), (near, 200)), LEVEL, EVERYWHERE)
     rays = pixel_rays(WIDTH)
     is_near = (rays[..., 0] > 0) & (np.abs(rays[..., 1:]).max(axis=-1) < 0.42)
     is_far = (rays[..., 0] < 0) | (np.abs(rays[..., 1:]).max(axis=-1) > 0.52)
@@ -43,7 +46,7 @@ def test_the_nearest_surface_wins_with_its_grey_and_range():
 
 def test_ranges_and_greys_are_those_of_the_room():
     _, true_pose, room = rooms.scene(1)[1], rooms.scene(1)[2], rooms.room(1)[0].rooms[0]
-    view = render_gray(rooms.scan_map(1).octree, true_pose.center_world, WIDTH)
+    view = render_gray(rooms.scan_map(1).octree, Pose(np.eye(3), true_pose.center_world), EVERYWHERE)
     rays = pixel_rays(WIDTH).reshape(-1, 3)
     center_world = rooms.query(1).pose.center_world
     ranges, rgb, _ = cast_rays(room, center_world, rays, Workers(2), "room")
@@ -59,7 +62,7 @@ def test_what_is_seen_through_a_thin_scan_is_dropped():
     """Before a wall at 4 m a sheet at 1 m of which one pixel in seven was scanned."""
     sheet = _sphere(1.0, 96)
     sheet = sheet[(sheet[:, 0] > 0.5)]
-    view = render_gray(_octree((_sphere(4.0, 512), 40), (sheet, 220)), np.zeros(3), WIDTH)
+    view = render_gray(_octree((_sphere(4.0, 512), 40), (sheet, 220)), LEVEL, EVERYWHERE)
     behind_sheet = pixel_rays(WIDTH)[..., 0] > 0.7
     assert (view.ranges[behind_sheet] < 1.5).all()
     assert view.is_filled[behind_sheet].mean() > 0.9  # all but where hardly a quarter is left
