@@ -14,9 +14,13 @@ from piccolo.localization.query import Cache, Query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
 
+WHOLE = SimpleNamespace(is_partial=False, has_tilt=False)  # photos, of which nothing else is asked
+PARTIAL = SimpleNamespace(is_partial=True, has_tilt=False)
+TILTED_WHOLE = SimpleNamespace(is_partial=False, has_tilt=True)
+TILTED_PARTIAL = SimpleNamespace(is_partial=True, has_tilt=True)
 VIEWS = SimpleNamespace(averages=lambda *_: None, points=lambda *_: None, surroundings=lambda *_: None)
 QUERY = Query(
-    photo=None,
+    photo=WHOLE,
     scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose),
     settings=CoarseToFineSettings(),
     workers=Workers(1),
@@ -48,6 +52,6 @@ def seen(explains, num_blocks=4):
 def compared(monkeypatch, explains, counts):
     """A query with made-up comparisons, and made-up counts of matches, by the x of a pose."""
     for module in (selection, last_descent):
-        monkeypatch.setattr(module, "count_matches", lambda matches, pose: counts.get(place(pose), 0))
+        monkeypatch.setattr(module, "count_agreeing", lambda query, pose: counts.get(place(pose), 0))
     known = {at(x, 0.0).pose.key: seen(part) for x, part in explains.items()}
     return replace(QUERY, cache=Cache(VIEWS, known))

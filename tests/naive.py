@@ -226,6 +226,32 @@ def block_correlation(first, second, shared, blocks, num_blocks):
     return correlation, area
 
 
+def centered_correlation(features, seen, samples, validity, area, flat, least_seen):
+    """Correlations (views, rotations) of channels (n, 3, cells) around their means over shared cells.
+
+    A view's channels are multiplied by the fraction seen (views, cells) already. The photo's means are those
+    over all that it shows. Deviations count as `flat` at least; the correlation is multiplied by the root of
+    the fraction seen of what the photo shows, and is 0 if that is at most `least_seen`.
+    """
+    found = np.zeros((len(features), len(samples)))
+    for i, f in enumerate(features.astype(float)):
+        for r, s in enumerate(samples.astype(float)):
+            shown = area * validity[r]
+            weight = shown * seen[i]
+            total = weight.sum()
+            part = total / shown.sum()
+            if part <= least_seen:
+                continue
+            photo_mean = (shown * s).sum(axis=1, keepdims=True) / shown.sum()
+            view_mean = (shown * f).sum(axis=1, keepdims=True) / total
+            product = (shown * f * (s - photo_mean)).sum()
+            of_view = (shown * f * f).sum() - total * (view_mean**2).sum()
+            of_photo = (weight * s * s).sum() - total * (photo_mean**2).sum()
+            norm = math.sqrt(max(of_view, flat**2 * total) * max(of_photo, flat**2 * total))
+            found[i, r] = product / norm * math.sqrt(part)
+    return found
+
+
 def votes(matches, R_cam_from_map, center_map):
     """Sum over features of the largest weight of a match within 20 deg, 1.7 in size, 40 deg in turn."""
     best = {}

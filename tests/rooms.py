@@ -22,10 +22,10 @@ WIDTH = 512
 
 
 @functools.lru_cache
-def room(seed):
+def room(seed, num_points=NUM_POINTS):
     """World of one room, and its cloud as a file would be read: shifted and in Morton order."""
     world = make_world(seed, np.array(SIZE))
-    points, colors, _ = scan_world(world, NUM_POINTS, Workers(2))
+    points, colors, _ = scan_world(world, num_points, Workers(2))
     origin_world = np.round((points.min(axis=0).astype(float) + points.max(axis=0)) / 2)
     points = (points - origin_world).astype(np.float32)
     order = morton_order(points, colors)
@@ -33,14 +33,14 @@ def room(seed):
 
 
 @functools.lru_cache
-def scan_map(seed):
-    return replace(prepare_map(room(seed)[1], Workers(2)), scan_sha256=64 * "0")
+def scan_map(seed, num_points=NUM_POINTS):
+    return replace(prepare_map(room(seed, num_points)[1], Workers(2)), scan_sha256=64 * "0")
 
 
 @functools.lru_cache
-def query(seed, variant="clean", index=0):
+def query(seed, variant="clean", index=0, width=WIDTH):
     """A panorama of a room with its true pose in the world."""
-    return make_query(room(seed)[0], index, variant, WIDTH, Workers(2))
+    return make_query(room(seed)[0], index, variant, width, Workers(2))
 
 
 def as_panorama(rgb):
@@ -54,9 +54,9 @@ def errors(pose, true_pose):
     return distance, np.degrees(angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world))
 
 
-def local(seed, pose):
+def local(seed, pose, num_points=NUM_POINTS):
     """A pose of the world near a room's local origin."""
-    return Pose(pose.R_cam_from_world, pose.center_world - room(seed)[1].origin_world)
+    return Pose(pose.R_cam_from_world, pose.center_world - room(seed, num_points)[1].origin_world)
 
 
 def packed(seed):

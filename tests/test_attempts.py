@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from made_up import QUERY, at, compared, places
+from made_up import PARTIAL, QUERY, TILTED_PARTIAL, TILTED_WHOLE, WHOLE, at, compared, place, places
 
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import exp_so3, is_correct
@@ -18,6 +18,7 @@ from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.verification import Verified
 from piccolo.scan_map.prior import Prior
 
 KNOWN = CoarseToFineSettings(gravity="known")
@@ -151,26 +152,35 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
 LOOK = (0, "look_first")
 HALF = (1, "search_matches")
 ALL = (2, "search_matches")
-UPRIGHT = (2, "search_views")
+UPRIGHT = (2, {"gravity": "known"})
+ABOUT_LEVEL = (2, {"gravity": "level"})
 TILTED = (2, {"gravity": "unknown", "is_brief": False})
 BRIEFLY = (2, {"gravity": "unknown", "is_brief": True})
 
 
 @pytest.mark.parametrize(
-    ("is_whole", "gravity", "parts", "expected"),
+    ("photo", "gravity", "parts", "expected"),
     [
-        (True, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
-        (True, "known", {}, [LOOK, HALF, ALL, UPRIGHT]),
-        (False, "auto", {}, [HALF, ALL, UPRIGHT, TILTED]),
-        (False, "unknown", {}, [HALF, ALL, TILTED]),
-        (True, "auto", {"uses_features": False}, [UPRIGHT, TILTED]),
-        (True, "auto", {"uses_search": False}, [HALF, ALL]),
+        (WHOLE, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
+        (WHOLE, "known", {}, [LOOK, HALF, ALL, UPRIGHT]),
+        (WHOLE, "unknown", {}, [HALF, ALL, TILTED]),
+        (TILTED_WHOLE, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
+        (PARTIAL, "auto", {}, [HALF, ALL, ABOUT_LEVEL, TILTED]),
+        (PARTIAL, "known", {}, [HALF, ALL, ABOUT_LEVEL]),
+        (PARTIAL, "unknown", {}, [HALF, ALL, ABOUT_LEVEL, TILTED]),
+        (TILTED_PARTIAL, "auto", {}, [HALF, ALL, UPRIGHT, TILTED]),
+        (TILTED_PARTIAL, "known", {}, [HALF, ALL, UPRIGHT]),
+        (WHOLE, "auto", {"uses_features": False}, [UPRIGHT, TILTED]),
+        (PARTIAL, "auto", {"uses_features": False}, [ABOUT_LEVEL, TILTED]),
+        (WHOLE, "auto", {"uses_search": False}, [HALF, ALL]),
+        (PARTIAL, "auto", {"uses_search": False}, [HALF, ALL]),
     ],
 )
-def test_attempts_are_made_in_this_order(monkeypatch, is_whole, gravity, parts, expected):
-    monkeypatch.setattr(attempts, "is_whole", lambda query: is_whole)
+def test_attempts_are_made_in_this_order(photo, gravity, parts, expected):
+    """Photos of a part of the sphere are searched about level, unless their tilt is known."""
     settings = CoarseToFineSettings(gravity=gravity)
-    found = attempts.plan_attempts(replace(QUERY, method=METHOD._replace(**parts), settings=settings))
+    query = replace(QUERY, photo=photo, method=METHOD._replace(**parts), settings=settings)
+    found = attempts.plan_attempts(query)
     assert [(num, getattr(run, "__name__", None) or run.keywords) for num, run in found] == expected
 
 
@@ -215,3 +225,30 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
     found, is_enough = attempts.search_matches(query, [looked], Stopwatch())
     assert places(found) == kept
     assert is_enough == (is_sure and len(kept) == 2)
+
+
+@pytest.mark.parametrize(
+    ("photo", "expected"),
+    [(PARTIAL, [*range(9), 1.5]), (TILTED_PARTIAL, [*range(9), 1.5]), (WHOLE, range(9))],
+)
+def test_poses_of_a_part_of_the_sphere_are_verified(monkeypatch, photo, expected):
+    """The best and seven alternatives; what matches more than chance does is added, scored where it went."""
+    num_matches = {0.0: 6, 1.0: 7, 8.0: 99}
+    asked, scored = [], []
+
+    def verify(query, pose):
+        asked.append(place(pose))
+        return Verified(at(place(pose) + 0.5, 0.0).pose, num_matches.get(place(pose), 0))
+
+    monkeypatch.setattr(attempts, "verify", verify)
+    monkeypatch.setattr(
+        attempts, "score_pose", lambda query, pose: scored.append(place(pose)) or at(1.5, 0.7)
+    )
+    known = [at(k, 0.9 - 0.1 * k) for k in range(9)]
+    query = replace(QUERY, photo=photo)
+    found = attempts.add_verified(query, known)
+    assert places(found) == list(expected)
+    assert found[:9] == known
+    assert asked == (list(range(8)) if photo.is_partial else [])
+    assert scored == ([1.5] if photo.is_partial else [])
+    assert attempts.add_verified(query, []) == []

@@ -9,7 +9,9 @@ import pytest
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.optimize.channel_loss import (
     CHANCE,
+    FLAT,
     NUM_BLOCKS,
+    NUM_MOMENTS,
     ChannelProblem,
     channel_equations,
     correlate,
@@ -86,32 +88,80 @@ def test_a_point_on_masked_pixels_costs_half_of_the_most_it_could():
     assert (sums[GRADIENT:] == 0).all()
 
 
-def test_each_block_correlates_over_what_both_show_and_counts_beyond_chance():
+def test_moments_of_each_block_are_over_what_both_show():
+    arguments, (shown, levels, w, blocks) = _blockwise()
+    sums = np.empty((NUM_BLOCKS, NUM_MOMENTS))
+    correlate(*arguments, sums)
+    a, b = levels - 127.5, shown - 127.5
+    products = np.stack([(a * b).sum(axis=0), (a * a).sum(axis=0), (b * b).sum(axis=0)])
+    terms = w * np.concatenate([products, np.ones((1, len(w))), a, b])
+    expected = [[term[blocks == block].sum() for term in terms] for block in range(NUM_BLOCKS)]
+    np.testing.assert_allclose(sums, expected, rtol=1e-3, atol=0.5)
+    np.testing.assert_allclose(sums[:, 3], np.array(expected)[:, 3], rtol=1e-5)
+    np.testing.assert_allclose(sums[:, 4:], np.array(expected)[:, 4:], atol=2e-3)
+    assert 0.5 < sums[:, 3].sum() < 0.9
+
+
+def test_a_pose_scores_what_its_blocks_correlate_beyond_chance():
+    """Channels around their means over the block."""
+    arguments, of_twin = _blockwise()
+    total = _score(*of_twin)
+    assert score(*arguments) == pytest.approx(total, abs=1e-4)
+    assert 0.2 < total < 0.7
+
+
+def test_plain_blocks_do_not_correlate_whatever_their_colours_are():
+    """Nor does noise below the least deviation; but an edge as strong as it does."""
+    points, _, weights, rgb = _problem()
+    weights = (weights / weights.sum()).astype(np.float32)
+    blocks = (np.arange(len(weights)) * NUM_BLOCKS // len(weights)).astype(np.int32)
+    plain = np.full_like(rgb, (200, 90, 180))
+    step_up = np.where(np.arange(rgb.shape[1])[None, :, None] < rgb.shape[1] // 2, 100, 160).astype(np.uint8)
+    step_up = np.ascontiguousarray(np.broadcast_to(step_up, rgb.shape))
+    for image, noise, least, most in (
+        (plain, 0.0, 0.0, 0.0),
+        (plain, 2.0, 0.0, 0.01),
+        (step_up, 0.0, 0.9, 1.0),
+    ):
+        pixels = naive.project(points.T, TILTED.R_cam_from_world, TILTED.center_world, rgb.shape[1])
+        levels = naive.sample(image, pixels).T
+        levels = levels + noise * np.random.default_rng(1).normal(size=levels.shape)
+        texels = pack_texels(image)
+        how = texels.rgbx, texels.width, TILTED.R_cam_from_world, TILTED.center_world
+        found = score(points, levels.astype(np.float32), weights, blocks, *how)
+        assert least <= found <= most + 1e-6
+        w = weights.astype(float)
+        assert found == pytest.approx(_score(naive.sample(image, pixels).T, levels, w, blocks), abs=1e-4)
+
+
+def _blockwise():
+    """Arguments of `score` whose blocks correlate more or less, and those of its twin."""
     points, levels, weights, rgb = _problem()
     is_valid = np.ones(rgb.shape[:2], dtype=bool)
     is_valid[:20] = False
     pixels = naive.project(points.T, TILTED.R_cam_from_world, TILTED.center_world, rgb.shape[1])
     shown = naive.sample(rgb, pixels).T
-    noise = np.linspace(0, 200, points.shape[1]).astype(np.float32)  # so that blocks correlate more or less
+    noise = np.linspace(0, 200, points.shape[1]).astype(np.float32)
     levels = np.clip(shown + noise * (levels - 130) / 70, 0, 255).astype(np.float32)
     w = weights * (naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9) / weights.sum()
     blocks = (np.arange(points.shape[1]) * NUM_BLOCKS // points.shape[1]).astype(np.int32)
-    expected, total = [], 0.0
-    for block in range(NUM_BLOCKS):
-        a, b, of_block = *((x[:, blocks == block] - 127.5) for x in (shown, levels)), w[blocks == block]
-        expected.append([a * b @ of_block, b * b @ of_block, a * a @ of_block, [of_block.sum()] * 3])
-        product, own, other = (channel.sum() for channel in expected[-1][:3])
-        total += max(product / np.sqrt(own * other) - CHANCE, 0) / (1 - CHANCE) * of_block.sum()
     texels = pack_texels(rgb, is_valid)
     how = texels.rgbx, texels.width, TILTED.R_cam_from_world, TILTED.center_world
     arguments = points, levels, (weights / weights.sum()).astype(np.float32), blocks, *how
-    sums = np.empty((NUM_BLOCKS, 4))
-    correlate(*arguments, sums)
-    np.testing.assert_allclose(sums[:, :3], np.sum(expected, axis=2)[:, :3], rtol=1e-3, atol=0.5)
-    np.testing.assert_allclose(sums[:, 3], np.array(expected)[:, 3, 0], rtol=1e-5)
-    assert 0.5 < sums[:, 3].sum() < 0.9
-    assert score(*arguments) == pytest.approx(total, abs=1e-4)
-    assert 0.2 < total < 0.7
+    return arguments, (shown, levels, w, blocks)
+
+
+def _score(shown, levels, weights, blocks):
+    """Score by NumPy: covariances of each block around its weighted means."""
+    total = 0.0
+    for block in np.unique(blocks[weights > 0]):
+        w, a, b = weights[blocks == block], levels[:, blocks == block], shown[:, blocks == block]
+        a = a - np.average(a, axis=1, weights=w)[:, None]
+        b = b - np.average(b, axis=1, weights=w)[:, None]
+        variances = [max((w * x * x).sum() / w.sum(), FLAT**2) for x in (a, b)]
+        correlation = (w * a * b).sum() / w.sum() / math.sqrt(variances[0] * variances[1])
+        total += max(correlation - CHANCE, 0) / (1 - CHANCE) * w.sum()
+    return total
 
 
 def test_solver_equals_numpy_and_refuses_a_singular_matrix():

@@ -9,11 +9,10 @@ import pytest
 import rooms
 from measuring.confidence import mask_outside_field, occlude
 
-from piccolo.confidence.localization import Evidence
+from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
-from piccolo.local_features.hypotheses import count_matches
 from piccolo.localization.comparison import (
     CONTRADICTS,
     Comparison,
@@ -25,6 +24,7 @@ from piccolo.localization.comparison import (
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.verdict import is_mirrored
+from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
@@ -175,12 +175,18 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     assert (mask_occluders(clean, true_pose) is clean) == fits
 
 
-def test_a_photo_that_was_turned_over_is_told():
+@pytest.mark.parametrize("fov_deg", [None, 90.0])
+def test_a_photo_that_was_turned_over_is_told(fov_deg):
+    """Whole or narrow: the mirrored photo's features agree with a pose, its own with none."""
+    outside = None if fov_deg is None else mask_outside_field(WIDTH, fov_deg, 0.5)
     rgb = rooms.query(1).rgb
-    doubtful = Evidence(0.5, 0.5, 0.5, 0.5, 0.9, num_matches=10)
-    assert is_mirrored(_query(rgb[:, ::-1].copy()), doubtful)
-    right = _query(rgb)
-    matched = dataclasses.replace(doubtful, num_matches=count_matches(right.matches, _clean()[1]))
-    assert matched.num_matches > 10
-    assert not is_mirrored(right, matched)
-    assert not is_mirrored(_query(rgb[:, ::-1].copy()), dataclasses.replace(doubtful, score=0.9))
+    right = _query(rgb, outside)
+    turned_over = _query(rgb[:, ::-1].copy(), None if outside is None else outside[:, ::-1].copy())
+    assert right.photo.is_partial == turned_over.photo.is_partial == (fov_deg is not None)
+    doubtful = Hypothesis(_clean()[1], 0.5)
+    assert count_agreeing(right, doubtful.pose) > 15
+    plain = Hypothesis(doubtful.pose, 0.7)  # it explains nearly all of the photo
+    assert is_mirrored(turned_over, doubtful)
+    assert not is_mirrored(right, doubtful)
+    assert not is_mirrored(turned_over, plain)
+    assert not is_mirrored(dataclasses.replace(turned_over, num_halves=0), doubtful)

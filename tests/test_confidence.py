@@ -38,13 +38,30 @@ def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
 
 
 def test_right_and_wrong_evidence():
-    assert all(w > 0.0 for w in rule.MODEL.weights)
-    assert rule.MODEL.none_weights[1] >= 0.0
+    for model in (rule.VIEWS_MODEL, rule.MATCHES_MODEL):
+        assert all(w > 0.0 for w in model.weights)
+        assert model.none_weights[1] >= 0.0
     p = posterior([RIGHT, ELSEWHERE], SURE)
     assert p[0] > 0.98
     assert classify(p, 0.9) == rule.LOCALIZED
     p = posterior([WRONG, ELSEWHERE._replace(ratio=0.9)], None)
     assert p[0] < 0.2
+    assert classify(p, 0.9) == rule.NOT_LOCALIZED
+
+
+def test_whole_views_alone_have_a_model_of_their_own():
+    """Two features; a pose without matches is judged by it, and local features count once they were asked."""
+    views = Standing(0.5, 0.2, None)
+    np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
+    assert rule.choose_model(views) == rule.VIEWS_MODEL
+    assert rule.choose_model(views._replace(num_matches=0)) == rule.MATCHES_MODEL
+    assert (len(rule.VIEWS_MODEL.weights), len(rule.MATCHES_MODEL.weights)) == (2, len(rule.FEATURES))
+    for model, standing in ((rule.VIEWS_MODEL, views), (rule.MATCHES_MODEL, views._replace(num_matches=5))):
+        expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0
+        assert rule.log_odds(standing._replace(log_prior=-2.0)) == pytest.approx(expected)
+        np.testing.assert_array_equal(posterior([standing], SURE), posterior([standing], SURE, model))
+    assert classify(posterior([RIGHT._replace(num_matches=None)], SURE), 0.9) == rule.LOCALIZED
+    p = posterior([WRONG._replace(num_matches=None)], None)
     assert classify(p, 0.9) == rule.NOT_LOCALIZED
 
 

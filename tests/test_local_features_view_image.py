@@ -1,17 +1,21 @@
 """The scan as a grey picture: the nearest is shown, gaps are closed, what shines through them is dropped."""
 
+import cv2
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
-from piccolo.geometry.sphere import pixel_rays
+from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.view_image import fill_gaps, render_gray
 from piccolo.scenes.synthetic.raycast import cast_rays
 
 WIDTH = 256
+EVERYWHERE = np.ones((WIDTH // 2, WIDTH), bool)
+LEVEL = Pose(np.eye(3), np.zeros(3))
 
 
 def _octree(*shells):
@@ -29,7 +33,7 @@ def test_the_nearest_surface_wins_with_its_grey_and_range():
     near = _sphere(1.5)
     near = near[np.abs(near[:, 1]) < 0.7]
     near = near[(near[:, 0] > 0) & (np.abs(near[:, 2]) < 0.7)]
-    view = render_gray(_octree((_sphere(3.0, 512), 60), (near, 200)), np.zeros(3), WIDTH)
+    view = render_gray(_octree((_sphere(3.0, 512), 60), (near, 200)), LEVEL, EVERYWHERE)
     rays = pixel_rays(WIDTH)
     is_near = (rays[..., 0] > 0) & (np.abs(rays[..., 1:]).max(axis=-1) < 0.42)
     is_far = (rays[..., 0] < 0) | (np.abs(rays[..., 1:]).max(axis=-1) > 0.52)
@@ -43,7 +47,7 @@ def test_the_nearest_surface_wins_with_its_grey_and_range():
 
 def test_ranges_and_greys_are_those_of_the_room():
     _, true_pose, room = rooms.scene(1)[1], rooms.scene(1)[2], rooms.room(1)[0].rooms[0]
-    view = render_gray(rooms.scan_map(1).octree, true_pose.center_world, WIDTH)
+    view = render_gray(rooms.scan_map(1).octree, Pose(np.eye(3), true_pose.center_world), EVERYWHERE)
     rays = pixel_rays(WIDTH).reshape(-1, 3)
     center_world = rooms.query(1).pose.center_world
     ranges, rgb, _ = cast_rays(room, center_world, rays, Workers(2), "room")
@@ -55,11 +59,46 @@ def test_ranges_and_greys_are_those_of_the_room():
     assert np.corrcoef(view.gray.ravel()[is_shown], gray[is_shown])[0, 1] > 0.85
 
 
+def test_a_turned_camera_sees_the_same_along_its_rays():
+    """Looked up at the nearest pixel of the level picture; what differs lies at edges."""
+    center = rooms.scene(1)[2].center_world
+    R = exp_so3(np.array([0.5, -0.4, 1.3]))
+    level = render_gray(rooms.scan_map(1).octree, Pose(np.eye(3), center), EVERYWHERE)
+    turned = render_gray(rooms.scan_map(1).octree, Pose(R, center), EVERYWHERE)
+    indices = compute_indices(pixel_rays(WIDTH) @ R, WIDTH)  # x_map = R_cam_from_map.T @ x_cam
+    gray, ranges = level.gray[indices].astype(float), level.ranges[indices]
+    is_shown = turned.is_filled & level.is_filled[indices]
+    assert is_shown.mean() > 0.95
+    assert np.median(np.abs(turned.gray - gray)[is_shown]) <= 3
+    assert np.corrcoef(turned.gray[is_shown], gray[is_shown])[0, 1] > 0.93
+    is_seen = (turned.ranges > 0) & (ranges > 0)
+    assert is_seen.mean() > 0.8
+    assert np.median(np.abs(turned.ranges - ranges)[is_seen]) < 0.02
+    assert (np.abs(turned.ranges - ranges)[is_seen] < 0.1).mean() > 0.95
+    unturned = level.gray.astype(float)
+    assert np.corrcoef(turned.gray[is_shown], unturned[is_shown])[0, 1] < 0.5
+
+
+def test_only_what_the_mask_asks_for_is_drawn():
+    """Inside of it as without a mask, and hardly anything beyond."""
+    pose = Pose(exp_so3(np.array([0.5, -0.4, 1.3])), rooms.scene(1)[2].center_world)
+    octree = rooms.scan_map(1).octree
+    is_drawn = np.zeros((WIDTH // 2, WIDTH), bool)
+    is_drawn[30:100, 60:180] = True
+    part, whole = render_gray(octree, pose, is_drawn), render_gray(octree, pose, EVERYWHERE)
+    inner = np.s_[50:80, 85:155]
+    np.testing.assert_array_equal(part.gray[inner], whole.gray[inner])
+    np.testing.assert_array_equal(part.ranges[inner], whole.ranges[inner])
+    beyond = ~cv2.dilate(is_drawn.view(np.uint8), np.ones((35, 35), np.uint8)).view(bool)
+    assert not part.is_filled[beyond].any()
+    assert (part.ranges[beyond] == 0).all()
+
+
 def test_what_is_seen_through_a_thin_scan_is_dropped():
     """Before a wall at 4 m a sheet at 1 m of which one pixel in seven was scanned."""
     sheet = _sphere(1.0, 96)
     sheet = sheet[(sheet[:, 0] > 0.5)]
-    view = render_gray(_octree((_sphere(4.0, 512), 40), (sheet, 220)), np.zeros(3), WIDTH)
+    view = render_gray(_octree((_sphere(4.0, 512), 40), (sheet, 220)), LEVEL, EVERYWHERE)
     behind_sheet = pixel_rays(WIDTH)[..., 0] > 0.7
     assert (view.ranges[behind_sheet] < 1.5).all()
     assert view.is_filled[behind_sheet].mean() > 0.9  # all but where hardly a quarter is left

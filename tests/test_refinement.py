@@ -30,10 +30,10 @@ def _fit(x, score, yaw_deg=0.0):
     return Fit(at(x, score, yaw_deg).pose, score)
 
 
-def _asked():
+def _asked(is_partial=False):
     """A query whose images are their names, of a photo that shows all cells."""
     images = Images(*(Once(lambda name=name: name) for name in Images._fields))
-    photo = SimpleNamespace(images=images, find_shown_cells=lambda *_: np.ones(3))
+    photo = SimpleNamespace(images=images, find_shown_cells=lambda *_: np.ones(3), is_partial=is_partial)
     return replace(QUERY, photo=photo, cache=Cache(VIEWS))
 
 
@@ -81,12 +81,16 @@ def test_narrow_ranks_poses_first():
     assert narrow(turned, 8) == [turned[k].pose for k in (0, 2, 4)]
 
 
-def test_the_beam_narrows_from_stage_to_stage(monkeypatch):
-    """From 500 starts to 400, 48 and 8 poses, of which two are perturbed for as long as that helps."""
-    made = collections.Counter()
+@pytest.mark.parametrize(("is_partial", "first"), [(False, 5), (True, 12)])
+def test_the_beam_narrows_from_stage_to_stage(monkeypatch, is_partial, first):
+    """From 500 starts to 400, 48 and 8 poses, of which two are perturbed for as long as that helps.
+
+    The first descents of a photo of a part of the sphere are as long as the second.
+    """
+    made, descents = collections.Counter(), []
 
     def descend_all(scan_map, image, starts, num_iterations, workers):
-        made[num_iterations] += len(starts.candidate)
+        descents.append((num_iterations, len(starts.candidate)))
         return starts, None
 
     def stage(name, query, found):
@@ -99,8 +103,9 @@ def test_the_beam_narrows_from_stage_to_stage(monkeypatch):
         monkeypatch.setattr(refinement, name, functools.partial(stage, name))
     centers = np.outer(np.arange(500), [1.0, 0.0, 0.0])
     starts = Starts(np.repeat(np.eye(3)[None], 500, axis=0), centers, np.arange(500))
-    found = refinement.refine(_asked(), starts, METHOD.beam)
-    assert list(made.values()) == [500, 400, 48, 8, 8, 2, 12]
+    found = refinement.refine(_asked(is_partial), starts, METHOD.beam)
+    assert descents == [(first, 500), (12, 400)]
+    assert list(made.values()) == [48, 8, 8, 2, 12]
     assert [place(h.pose) for h in found] == list(range(12))
 
 

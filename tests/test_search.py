@@ -6,12 +6,13 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from measuring.confidence import mask_outside_field
 
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
-from piccolo.localization import search
+from piccolo.localization import attempts, search
 from piccolo.localization.query import make_images, prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama
@@ -62,29 +63,6 @@ def test_samples_along_turned_directions_equal_their_twin():
         np.testing.assert_allclose(found.T, expected, atol=0.1)
 
 
-def test_scores_equal_correlations_one_by_one():
-    rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    samples, validity = search.turn_panorama(_query().photo.images.search(), uniform_rotations(50))
-    validity[:, rng.random(validity.shape[1]) < 0.2] = 0
-    samples *= validity[:, None]
-    panorama = search.weigh_by_area(samples, validity, AREA, 1)
-    candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
-    row, views = scan_map.views.at(candidate, Workers(2))
-    pairs = np.empty(40, np.float32)
-    features, seen = views.features.reshape(len(views.features), -1), views.is_seen.view(np.uint8)
-    scores = search.masked_correlation(features, seen, AREA, panorama, Workers(2))
-    how = whole_areas(24), panorama, row, rotation
-    search.correlate_pairs(views.features, views.is_seen, *how, pairs)
-    twin = []
-    for c, r in zip(row, rotation, strict=True):
-        w = AREA * views.is_seen[c] * validity[r]
-        f, s = views.features[c].astype(float), samples[r].astype(float)
-        twin.append((w * f * s).sum() / np.sqrt((w * f * f).sum() * (w * s * s).sum()))
-    for found in (scores[row, rotation], pairs):  # each up to a factor of its own
-        factor = (found @ twin) / (found @ found)
-        np.testing.assert_allclose(factor * found, twin, atol=3e-3)
-
-
 def test_wide_samples_are_averages_by_area():
     rng, (cells, areas) = np.random.default_rng(3), wider_cells(12)
     samples = rng.uniform(-127.5, 127.5, (600, 3, len(AREA))).astype(np.float32)
@@ -94,30 +72,6 @@ def test_wide_samples_are_averages_by_area():
         wide, is_valid = search.widen_samples(samples, validity, Workers(num_threads))
         np.testing.assert_array_equal(wide, np.rint(samples) @ matrix / areas)
         np.testing.assert_array_equal(is_valid, np.rint(validity @ matrix / areas))
-
-
-def test_sums_of_a_search_are_exact():
-    """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
-    for area, most_seen in ((AREA, 1), (wider_cells(12)[1], 255)):
-        one = np.ones((1, 3, len(area)), np.float32)
-        panorama = search.weigh_by_area(127.5 * one, one[:, 0], area, most_seen)
-        assert 127 * panorama.samples.sum(dtype=float) < 2**24
-        assert most_seen * panorama.energy.sum(dtype=float) < 2**24
-        assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
-        for values in panorama:
-            np.testing.assert_array_equal(values, np.rint(values))
-    rng = np.random.default_rng(0)
-    samples = rng.uniform(-127.5, 127.5, (20, 3, len(AREA))).astype(np.float32)
-    validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
-    features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
-    seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = search.weigh_by_area(samples * validity[:, None], validity, AREA, 1)
-    expected = search.masked_correlation(features.reshape(50, -1), seen, AREA, panorama, Workers(1))
-    cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = search.TurnedPanorama(*(values[..., cells] for values in panorama))
-    features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
-    found = search.masked_correlation(features, seen, AREA[cells], shuffled, Workers(1))
-    np.testing.assert_array_equal(found, expected[views])
 
 
 @pytest.mark.parametrize(("gravity", "most"), [("known", 10), ("unknown", 100)])
@@ -179,6 +133,78 @@ def test_tilt_in_the_metadata_is_that_of_every_start():
     np.testing.assert_allclose(np.degrees(np.arcsin(forward[:, 2])), 20.0, atol=1e-6)
     assert (left[:, 2] > 0.1).all()
     assert len(np.unique(np.round(forward, 6), axis=0)) > 6
+
+
+def test_about_level_are_seven_pitches_in_forty_headings():
+    """Without roll; neighbours in heading are as far apart as those in pitch."""
+    rotations = search.list_rotations(_query(), "level")
+    assert len(rotations) == 7 * 40
+    forward, left, _ = rotations.transpose(1, 0, 2)
+    np.testing.assert_allclose(
+        rotations @ rotations.transpose(0, 2, 1), np.eye(3)[None].repeat(280, 0), atol=1e-9
+    )
+    np.testing.assert_allclose(left[:, 2], 0.0, atol=1e-9)
+    pitches, counts = np.unique(np.round(np.degrees(np.arcsin(forward[:, 2])), 6), return_counts=True)
+    np.testing.assert_allclose(pitches, 9.0 * np.arange(-3, 4), atol=1e-5)
+    assert (counts == 40).all()
+    for pitch in pitches:
+        of_pitch = np.abs(np.degrees(np.arcsin(forward[:, 2])) - pitch) < 1e-3
+        headings = np.sort(np.degrees(np.arctan2(forward[of_pitch, 1], forward[of_pitch, 0])) % 360.0)
+        np.testing.assert_allclose(np.diff(headings), 9.0, atol=1e-6)
+
+
+def test_about_level_only_headings_that_the_prior_allows_are_searched():
+    prior = Prior(heading_deg=90.0, heading_tolerance_deg=20.0)
+    query = _query()
+    asked = dataclasses.replace(query, settings=dataclasses.replace(query.settings, prior=prior))
+    rotations = search.list_rotations(asked, "level")
+    forward = rotations[:, 0]
+    assert len(rotations) == 7 * 5  # 72, 81, 90, 99, 108
+    assert (np.abs(np.degrees(np.arctan2(forward[:, 0], forward[:, 1])) - 90.0) < 20.0).all()
+
+
+def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
+    """With all yaws at that tilt, not about level."""
+    is_left = np.arange(1024) < 300
+    for gpano, gravity in (
+        (GPano(pitch_deg=0.0), "known"),
+        (None, "level"),
+        (GPano(pitch_deg=12.0), "known"),
+    ):
+        narrow = _query(gpano).mask_pixels(~is_left & np.ones((512, 1), bool))
+        assert narrow.photo.is_partial
+        assert narrow.photo.has_tilt == (gpano is not None)
+        searched = [
+            run.keywords["gravity"] for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")
+        ]
+        assert searched == [gravity, "unknown"]
+        rotations = search.list_rotations(narrow, gravity)
+        if gpano is not None:
+            assert len(rotations) == narrow.settings.num_yaws
+            np.testing.assert_allclose(np.degrees(np.arcsin(rotations[:, 0, 2])), gpano.pitch_deg, atol=1e-6)
+
+
+def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
+    """With the means subtracted; nearer in angle than those of a whole photo, and near the true pose."""
+    true_pose = rooms.scene(1)[2]
+    narrow = _query().mask_pixels(mask_outside_field(512, 90.0, 0.5))
+    starts = search.search_poses(narrow, "level")
+    near = [
+        np.linalg.norm(center - true_pose.center_world) < 0.8
+        and np.degrees(angle_between(R, true_pose.R_cam_from_world)) < 25
+        for center, R in zip(starts.center_map, starts.R_cam_from_map, strict=True)
+    ]
+    assert any(near[:150])
+    pairs = itertools.combinations(starts.poses()[:300], 2)
+    apart = np.array([rooms.errors(*pair) for pair in pairs])
+    nearest = apart[apart[:, 0] < 0.5, 1].min()
+    assert 14.0 <= nearest < 20.0
+    rotations = search.list_rotations(narrow, "level")
+    samples, validity = search.turn_panorama(narrow.photo.images.search(), rotations)
+    found = search.best_poses_wide(narrow.scan_map, samples, validity, 20, Workers(1), True)
+    best = found[0][0], found[1][0]
+    np.testing.assert_array_equal(starts.R_cam_from_map[0], rotations[best[1]])
+    assert starts.candidate[0] == narrow.scan_map.sparse[best[0]]
 
 
 @pytest.mark.parametrize("gravity", ["known", "unknown"])

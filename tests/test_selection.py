@@ -101,6 +101,16 @@ def test_the_pose_with_the_greatest_odds_is_selected(monkeypatch, explains, matc
     assert selection.select(query, alone) is alone
 
 
+def test_whole_views_alone_have_no_matches_and_ratios_are_to_the_best(monkeypatch):
+    query = compared(monkeypatch, {0.0: 0.5, 3.0: 0.4}, {0.0: 20, 3.0: 7})
+    poses = at(0.0, 0.5), [at(3.0, 0.3)]
+    found = selection.assess_poses(query, *poses)
+    assert [(s.score, s.num_matches) for s in found] == [(0.5, 20), (0.3, 7)]
+    assert [s.ratio for s in found] == pytest.approx([1.0, 0.8])
+    by_views = selection.assess_poses(replace(query, num_halves=0), *poses)
+    assert by_views == [s._replace(num_matches=None) for s in found]
+
+
 def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monkeypatch):
     """Each two are compared over other parts of the sphere."""
     query = compared(monkeypatch, {}, {0.0: 20, 3.0: 20, 6.0: 20})
@@ -168,7 +178,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "sampling_loss": lambda *_: 0.07,
         "measure_agreement": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
         "compare_occlusion": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
-        "count_matches": lambda matches, pose: counts.get(place(pose), 0),
+        "count_agreeing": lambda query, pose: counts.get(place(pose), 0),
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,
     }.items():

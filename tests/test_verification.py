@@ -1,0 +1,217 @@
+"""Poses verified by drawing the scan: the right one has many matches, and a twin matches the features."""
+
+import functools
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rooms
+from measuring.confidence import mask_outside_field
+
+from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
+from piccolo.geometry.sphere import pixel_rays
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.local_features.hypotheses import count_matches
+from piccolo.local_features.keypoints import Keypoints
+from piccolo.localization import verification
+from piccolo.localization.localize import localize
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.verification import PLACE, TURN, count_agreeing, match_pictures, pairs_near, verify
+from piccolo.panorama import Panorama
+
+NUM_POINTS = 200_000
+WIDTH = 1024
+SETTINGS = CoarseToFineSettings(gravity="unknown")
+SMALL = np.array([0.01, -0.02, 0.015, 0.05, -0.04, 0.03])  # [rad], [m]
+
+
+def _narrow(seed=1, yaw=1.0):
+    """A level photo of 70 degrees that looks along an azimuth, and its true pose in the world."""
+    taken = rooms.query(seed, width=WIDTH)
+    return Panorama(taken.rgb, ~mask_outside_field(WIDTH, 70.0, yaw)), taken.pose
+
+
+def _asked(num_threads=2):
+    """A query of its own, with an empty cache."""
+    return prepare_query(_narrow()[0], rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(num_threads))
+
+
+@functools.lru_cache
+def _query():
+    return _asked()
+
+
+@functools.lru_cache
+def _true_pose():
+    return rooms.local(1, _narrow()[1], NUM_POINTS)
+
+
+def _moved(offset, yaw=0.0):
+    """The true pose, turned and moved [m]."""
+    R = yaw_rotation(yaw) @ _true_pose().R_cam_from_world
+    return Pose(R, _true_pose().center_world + np.array(offset))
+
+
+def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():
+    right = verify(_query(), _true_pose())
+    assert right.num_matches >= 20
+    assert count_agreeing(_query(), _true_pose()) == right.num_matches
+    for wrong in (_moved((0.0, 0.0, 0.0), 2.0), _moved((1.0, -0.8, 0.0))):
+        assert verify(_query(), wrong).num_matches <= 6
+        assert count_agreeing(_query(), wrong) <= 6
+
+
+def test_a_pose_is_refined_towards_the_truth():
+    off = step(_true_pose(), SMALL)
+    before = rooms.errors(off, _true_pose())
+    found = verify(_query(), off)
+    after = rooms.errors(found.pose, _true_pose())
+    assert after[0] < min(0.02, 0.4 * before[0])
+    assert after[1] < min(0.4, 0.4 * before[1])
+    assert found.num_matches >= 20
+
+
+def test_verification_is_the_same_bits_at_any_number_of_threads():
+    poses = [_true_pose(), step(_true_pose(), SMALL), _moved((1.0, -0.8, 0.0))]
+    one, two = (
+        query.workers.map(functools.partial(verify, query), poses, "verify")
+        for query in (_asked(1), _asked(2))
+    )
+    for a, b in zip(one, two, strict=True):
+        assert a.num_matches == b.num_matches
+        assert a.pose.key == b.pose.key
+
+
+def test_the_scan_is_drawn_once_for_each_pose_of_the_grid(monkeypatch):
+    """At the grid's pose, wherever in its cell the pose lies; a masked photo is matched again."""
+    drawn = []
+
+    def match_drawn(query, pose):
+        drawn.append(pose)
+        return len(drawn)
+
+    monkeypatch.setattr(verification, "match_drawn", match_drawn)
+    query = _asked()
+    middle = Pose(exp_so3(TURN * np.array([3.0, -2.0, 8.0])), PLACE * np.array([7.0, -4.0, 2.0]))
+    for share in (0.0, 0.4, -0.4):
+        turn = log_so3(middle.R_cam_from_world) + share * TURN
+        near = Pose(exp_so3(turn), middle.center_world + share * PLACE)
+        assert pairs_near(query, near) == 1
+    assert len(drawn) == 1
+    np.testing.assert_allclose(drawn[0].center_world, middle.center_world, atol=1e-12)
+    np.testing.assert_allclose(drawn[0].R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
+    assert pairs_near(query, Pose(middle.R_cam_from_world, middle.center_world + 0.6 * PLACE)) == 2
+    turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * TURN, 0.0]))
+    assert pairs_near(query, Pose(turned, middle.center_world)) == 3
+    masked = query.mask_pixels(np.zeros((8, 16), bool))
+    assert pairs_near(masked, middle) == 4
+    assert pairs_near(query, middle) == 1
+
+
+def test_matches_lie_on_the_scan_where_the_photo_sees_them():
+    """At the true pose most of the rays lead to their points."""
+    pairs = pairs_near(_query(), _true_pose())
+    errors = verification.compute_errors(pairs, _true_pose().R_cam_from_world, _true_pose().center_world)
+    expected = (pairs.points - _true_pose().center_world) @ _true_pose().R_cam_from_world.T
+    cosines = (expected * pairs.rays).sum(axis=1) / np.linalg.norm(expected, axis=1)
+    np.testing.assert_allclose(errors, np.arccos(np.clip(cosines, -1, 1)), atol=1e-3)
+    assert (errors < verification.AGREE).sum() >= 20
+    assert np.isfinite(pairs.points).all()
+    cloud = np.asarray(rooms.room(1, NUM_POINTS)[1].points)
+    nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in pairs.points]
+    assert np.median(nearest) < 0.05
+
+
+@pytest.mark.parametrize(
+    ("offset", "yaw_deg", "expected"),
+    [
+        ((0.29, 0.0, 0.0), 0.0, 30),
+        ((0.31, 0.0, 0.0), 0.0, 0),
+        ((0.0, 0.0, 0.0), 4.9, 30),
+        ((0, 0, 0), 5.1, 0),
+    ],
+)
+def test_matches_with_which_a_pose_moves_away_are_anothers(monkeypatch, offset, yaw_deg, expected):
+    """By 0.3 m or 5 degrees."""
+    moved = _moved(offset, math.radians(yaw_deg))
+    monkeypatch.setattr(verification, "verify", lambda *_: verification.Verified(moved, 30))
+    assert count_agreeing(_query(), _true_pose()) == expected
+
+
+def test_two_fifths_of_a_metre_off_the_matches_are_those_of_the_true_pose():
+    off = _moved((0.0, -0.4, 0.0))
+    found = verify(_query(), off)
+    assert found.num_matches >= 12
+    assert rooms.errors(found.pose, _true_pose())[0] < 0.1
+    assert count_agreeing(_query(), off) == 0
+
+
+def test_whole_photos_and_whole_views_alone_are_not_drawn(monkeypatch):
+    monkeypatch.setattr(verification, "verify", lambda *_: pytest.fail("drawn"))
+    panorama = rooms.scene(1)[1]
+    whole = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    assert count_agreeing(whole, _true_pose()) == count_matches(whole.matches, _true_pose()) > 20
+    assert count_agreeing(replace(_query(), num_halves=0), _true_pose()) == 0
+
+
+def _keypoints(rays, descriptors):
+    rays = np.asarray(rays, np.float32)
+    return Keypoints(rays, np.zeros_like(rays), np.ones(len(rays), np.float32), descriptors)
+
+
+def _match_one_by_one(own, drawn):
+    """By the angle [rad] to the best match, which of the others are elsewhere."""
+    found = []
+    for k, descriptor in enumerate(own.descriptors.astype(float)):
+        distances = np.linalg.norm(drawn.descriptors - descriptor, axis=1)
+        best = int(np.argmin(distances))
+        cosines = drawn.rays.astype(float) @ drawn.rays[best].astype(float)
+        others = distances[np.arccos(np.clip(cosines, -1, 1)) > math.radians(2.0)]
+        if distances[best] < 0.8 * others.min(initial=math.inf):
+            found.append((k, best))
+    return found
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_pictures_are_matched_as_their_twin(seed):
+    """Half of the features are seen again; of these some look like another one next to them, or elsewhere."""
+    rng = np.random.default_rng(seed)
+    descriptors = rng.integers(0, 60, (120, 128)).astype(np.uint8)
+    rays = pixel_rays(256).reshape(-1, 3)[rng.permutation(128 * 256)[:120]]
+    rays[:20] = rays[20:40] + rng.normal(0.0, 0.005, (20, 3))  # within two degrees
+    descriptors[:40] = np.concatenate([descriptors[20:40]] * 2)
+    descriptors[40:60] = descriptors[60:80]  # elsewhere
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    noise = rng.integers(0, 12, (90, 128)).astype(np.uint8)
+    unknown = rng.integers(0, 60, (60, 128)).astype(np.uint8)
+    own = _keypoints(np.zeros((150, 3)), np.concatenate([descriptors[:90] + noise, unknown]))
+    drawn = _keypoints(rays, descriptors)
+    mine, theirs = match_pictures(own, drawn)
+    assert list(zip(mine, theirs, strict=True)) == _match_one_by_one(own, drawn)
+    assert set(range(40)) | set(range(80, 90)) <= set(mine)
+    assert not set(range(40, 80)) & set(mine)
+    assert len(mine) < 100
+
+
+def test_without_features_nothing_matches_and_a_lone_one_is_distinct():
+    rng = np.random.default_rng(0)
+    own = _keypoints(np.eye(3), rng.integers(0, 60, (3, 128)).astype(np.uint8))
+    nothing = own.take(np.empty(0, np.int64))
+    for a, b in ((own, nothing), (nothing, own), (nothing, nothing)):
+        assert [len(found) for found in match_pictures(a, b)] == [0, 0]
+    mine, theirs = match_pictures(own, own.take(np.array([1])))
+    assert (mine.tolist(), theirs.tolist()) == ([0, 1, 2], [0, 0, 0])
+
+
+@pytest.mark.parametrize(("seed", "yaw"), [(1, -3.0), (2, 2.0), (3, -3.0)])
+def test_a_narrow_photo_of_unknown_gravity_is_found(seed, yaw):
+    """70 degrees of a room, with furniture and pictures in view."""
+    photo, true_pose = _narrow(seed, yaw)
+    found = localize(rooms.scan_map(seed, NUM_POINTS), photo, SETTINGS, Workers(2), Stopwatch())
+    distance, angle_deg = rooms.errors(found.pose, true_pose)
+    assert found.status == "localized"
+    assert distance < 0.015
+    assert angle_deg < 0.25
