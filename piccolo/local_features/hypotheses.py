@@ -313,9 +313,9 @@ def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.i
     return members[: list_members(matches, transpose_matches(matches), R, t, cos_rough, members)]
 
 
-def count_matches(matches: Matches, pose: Pose) -> int:
-    """Count the features of the photo that a pose puts where the map has them."""
-    return len(np.unique(matches.query[find_inliers(matches, pose, COS_EXACT)]))
+def count_matches(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) -> int:
+    """Count the features of the photo that a pose puts where the map has them, within an angle."""
+    return len(np.unique(matches.query[find_inliers(matches, pose, cos_agree)]))
 
 
 def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) -> MatchedPose | None:

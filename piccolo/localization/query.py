@@ -96,7 +96,7 @@ class Cache:
     unoccluded: dict[bytes, "Query"] = field(
         default_factory=dict
     )  # `comparison.mask_occluders`, by the blocks masked
-    pairs: dict[bytes, Any] = field(default_factory=dict)  # `verification.pairs_near`, by its grid
+    matches: dict[bytes, Any] = field(default_factory=dict)  # `verification.matches_near`, by its grid
     ends: set[bytes] = field(default_factory=set)  # keys of poses that no perturbation improves
 
 

@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
+from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
-from ..local_features.hypotheses import count_matches, descend_matches
+from ..local_features.hypotheses import count_matches, exact_pose
 from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
+from ..local_features.matching import Matches
 from ..local_features.view_image import render_gray
 from .query import Query
 
@@ -24,21 +25,9 @@ TURN = 0.05  # [rad] and at rotation vectors on one of this
 AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = math.cos(math.radians(2.0))
-REFINED_WITHIN = (4.0, 1.5, 0.8)  # [deg] matches that the pose is refined with, round by round
-AGREE = math.radians(0.5)  # matches with a smaller error agree
-SCALE = math.radians(0.3)  # of the loss
+COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 NEAR = 0.3  # [m] matches with which a pose moves farther are another pose's
 NEAR_TURN = math.radians(5.0)
-LEAST_PAIRS = 4  # with which a pose is refined
-REFINEMENTS = 8  # steps
-TOLERANCE = 1e-7  # [rad + m] a shorter step ends the descent
-
-
-class Pairs(NamedTuple):
-    """Features of the photo, and the points of the scan drawn at a pose that look like them."""
-
-    rays: Array  # (M, 3) in the camera's frame
-    points: Array  # (M, 3) [m] in the map
 
 
 class Verified(NamedTuple):
@@ -61,16 +50,12 @@ def count_agreeing(query: Query, pose: Pose) -> int:
 
 
 def verify(query: Query, pose: Pose) -> Verified:
-    """Refine a pose on the matches with the scan drawn near it, and count those that agree."""
-    pairs = pairs_near(query, pose)
-    R = pose.R_cam_from_world.copy()
-    t = pose.center_world.copy()
-    for limit in REFINED_WITHIN:
-        fits = compute_errors(pairs, R, t) < math.radians(limit)
-        if fits.sum() >= LEAST_PAIRS:
-            descend_matches((pairs.rays[fits], pairs.points[fits], SCALE), REFINEMENTS, TOLERANCE, R, t)
-    agreeing = pairs.rays[compute_errors(pairs, R, t) < AGREE]
-    return Verified(Pose(R, t), len(np.unique(agreeing, axis=0)))
+    """Find the pose that most matches with the scan drawn near a pose agree with, and count these."""
+    matches = matches_near(query, pose)
+    found = exact_pose(matches, pose, None)
+    if found is None:
+        return Verified(pose, 0)
+    return Verified(found.pose, count_matches(matches, found.pose, COS_AGREE))
 
 
 def is_near(pose: Pose, other: Pose) -> bool:
@@ -79,25 +64,18 @@ def is_near(pose: Pose, other: Pose) -> bool:
     return bool(turn < NEAR_TURN and math.dist(pose.center_world, other.center_world) < NEAR)
 
 
-def compute_errors(pairs: Pairs, R_cam_from_map: Array, center_map: Array) -> Array:
-    """Return the angles (M,) [rad] between the rays and the points seen from a pose."""
-    rays = rotate_points(pairs.points - center_map, R_cam_from_map)
-    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-9)
-    return np.asarray(2.0 * np.arcsin(np.clip(0.5 * np.linalg.norm(rays - pairs.rays, axis=1), 0.0, 1.0)))
-
-
-def pairs_near(query: Query, pose: Pose) -> Pairs:
+def matches_near(query: Query, pose: Pose) -> Matches:
     """Return the matches with the scan drawn near a pose, on a grid of poses; cached by the grid."""
     place = np.rint(pose.center_world / PLACE)
     turn = np.rint(log_so3(pose.R_cam_from_world) / TURN)
     key = np.concatenate([place, turn]).astype(np.int64).tobytes()
-    if key not in query.cache.pairs:
-        query.cache.pairs[key] = match_drawn(query, Pose(exp_so3(turn * TURN), place * PLACE))
-    pairs: Pairs = query.cache.pairs[key]
-    return pairs
+    if key not in query.cache.matches:
+        query.cache.matches[key] = match_drawn(query, Pose(exp_so3(turn * TURN), place * PLACE))
+    matches: Matches = query.cache.matches[key]
+    return matches
 
 
-def match_drawn(query: Query, pose: Pose) -> Pairs:
+def match_drawn(query: Query, pose: Pose) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
     is_valid = query.photo.panorama.is_valid
     is_drawn = cv2.dilate(is_valid.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0
@@ -108,15 +86,27 @@ def match_drawn(query: Query, pose: Pose) -> Pairs:
     drawn = drawn.take(is_seen)
     own = join_keypoints([half().keypoints for half in query.features])
     mine, theirs = match_pictures(own, drawn)
-    offsets = drawn.rays[theirs].astype(np.float64) * ranges[is_seen][theirs, None]
-    points = pose.center_world + rotate_points(offsets, pose.R_cam_from_world.T)
-    return Pairs(own.rays[mine].astype(np.float64), points)
+    ranges = ranges[is_seen][theirs]
+    R_map_from_cam = pose.R_cam_from_world.T
+    directions = rotate_points(drawn.rays[theirs].astype(np.float64), R_map_from_cam)
+    tangents = rotate_points(drawn.tangents[theirs].astype(np.float64), R_map_from_cam)
+    return Matches(
+        mine.astype(np.int32),
+        own.rays[mine],
+        own.tangents[mine],
+        own.sizes[mine],
+        (pose.center_world + directions * ranges[:, None]).astype(np.float32),
+        directions.astype(np.float32),
+        tangents.astype(np.float32),
+        drawn.sizes[theirs] * ranges,
+        np.ones(len(mine), np.float32),
+    )
 
 
 def match_pictures(own: Keypoints, drawn: Keypoints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Match each feature with the most similar one, unless another elsewhere is nearly as similar.
 
-    Squared distances of 8-bit descriptors are whole numbers, exact in float32.
+    Squared distances of 8-bit descriptors are whole numbers, exact in float32 by any matrix product.
     """
     if not len(own.rays) or not len(drawn.rays):
         nothing = np.empty(0, np.intp)
@@ -126,7 +116,7 @@ def match_pictures(own: Keypoints, drawn: Keypoints) -> tuple[NDArray[np.intp], 
     distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
     nearest = distances.argmin(axis=1)
     best = distances[np.arange(len(a)), nearest]
-    is_same = drawn.rays[nearest] @ drawn.rays.T > COS_ELSEWHERE
+    is_same = sum(np.multiply.outer(one[nearest], one) for one in drawn.rays.T) > COS_ELSEWHERE
     distances[is_same] = np.inf
     is_distinct = best < DISTINCT_RATIO**2 * distances.min(axis=1)
     return np.flatnonzero(is_distinct), nearest[is_distinct]
