@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,10 +16,11 @@ from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
-from .focal_length import WIDE, calibrate, change_camera
+from .focal_length import WIDE, FocalFit, calibrate, change_camera
 from .last_descent import HOPELESS_SCORE, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
-from .query import prepare_query
+from .query import Query, prepare_query
+from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
 from .verdict import judge
 
@@ -28,6 +30,14 @@ GUESSES = (
     0.15,
 )  # added to the log of the focal length: one comes near enough to any that is 20 % off
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
+
+
+class Found(NamedTuple):
+    """The poses found for a photo, refined."""
+
+    query: Query
+    selection: Selection
+    fit: FocalFit | None  # of a photo whose focal length is not exact
 
 
 @one_blas_thread
@@ -40,6 +50,22 @@ def localize(
     method: MethodConfig = METHOD,
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
+    found = find_pose(scan_map, panorama, settings, workers, watch, method)
+    if isinstance(found, Localization):
+        return found
+    with watch.stage("refine"):
+        return judge(*found)
+
+
+def find_pose(
+    scan_map: ScanMap,
+    panorama: Panorama,
+    settings: CoarseToFineSettings,
+    workers: Workers,
+    watch: Stopwatch,
+    method: MethodConfig = METHOD,
+) -> Found | Localization:
+    """Search and refine, as `localize`; a result says why nothing can be searched."""
     allowed_map = apply_prior(scan_map, settings.prior)
     if len(allowed_map.sparse) == 0:
         return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
@@ -60,9 +86,8 @@ def localize(
         with watch.stage("refine"):
             found = refine_to_the_end(query, hypotheses)
             if panorama.focal_prior is None or found.best.score < HOPELESS_SCORE:
-                return judge(query, found)
-            query, found, fit = calibrate(query, found)
-            return judge(query, found, fit)
+                return Found(query, found, None)
+            return Found(*calibrate(query, found))
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:
