@@ -73,6 +73,20 @@ def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
     assert "`near_world` allows 0; the nearest to `near_world` is" in nothing["warnings"][-1]
 
 
+def test_a_tilted_photo_is_clear_by_its_gravity_in_a_table(scene, tmp_path, capsys):
+    taken = query(7, "tilt")
+    photo = tmp_path / "tilted.png"
+    cv2.imwrite(str(photo), taken.rgb[..., ::-1])
+    down = taken.pose.R_cam_from_world @ [0.0, 0.0, -9.81]
+    table = tmp_path / "priors.csv"
+    table.write_text(f"name,gravity_x,gravity_y,gravity_z\ntilted.png,{down[0]},{down[1]},{down[2]}\n")
+    assert localize.main(_arguments(scene, "--pano", str(photo), "--priors", str(table))) == 0
+    result = Result.from_json(capsys.readouterr().out)
+    assert errors(result.pose, taken.pose)[0] < 0.03
+    assert set(result.seconds) == {"read", "search", "refine"}  # as upright: no features are matched
+    assert result.settings["prior"]["gravity_vector"] == pytest.approx(down.tolist())
+
+
 def test_files_are_written_and_look_right(scene, tmp_path, capsys):
     out, overlay, occlusion = (tmp_path / name for name in ("pose.json", "overlay.png", "occlusion.png"))
     pictures = ["--overlay", str(overlay), "--occlusion-mask", str(occlusion)]

@@ -156,9 +156,9 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     title = "prior knowledge (preset default only); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
     text = (
-        "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, within; "
+        "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, within, "
     )
-    text += "they take precedence over the following options"
+    text += "gravity_x, gravity_y, gravity_z; they take precedence over the options for all photos"
     option(group, "--priors FILE", text)
     option(group, "--near X Y Z RADIUS", "the camera was within RADIUS of this position [m]")
     option(group, "--height MIN MAX", "height of the camera above the floor [m]")
