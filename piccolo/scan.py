@@ -397,4 +397,4 @@ def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
     """Return the prior that options give; InputError if one is invalid, or the method uses no prior."""
     if not isinstance(settings, CoarseToFineSettings):
         raise InputError(f"`{min(given)}`: not an option of the preset paper")
-    return Prior(**given | {"within": tuple(given.get("within", ()))})
+    return replace(settings.prior, **given | {"within": tuple(given.get("within", settings.prior.within))})

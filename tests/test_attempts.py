@@ -112,6 +112,13 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     )
 
 
+def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):
+    monkeypatch.setattr(attempts, "search_poses", lambda *_: pytest.fail("a search beyond gravity"))
+    told = replace(KNOWN, prior=Prior(gravity_vector=(0.0, 0.0, -1.0)))
+    asked = _query(rooms.as_panorama(rooms.query(1).rgb), told)
+    assert attempts.search_beyond_prior(asked, rooms.scan_map(1), Stopwatch()) == []
+
+
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
     mirror = attempts.mirror_query(asked)

@@ -107,6 +107,7 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, cap
     [
         (["--gravity", "known"], "line 1: made with --gravity auto, now --gravity known; use"),
         (["--height", "0.5", "2"], "line 1: made without --height, now --height 0.5 2; use"),
+        (["--gravity-vector", "0", "0", "-1"], "made without --gravity-vector, now --gravity-vector 0 0 -1"),
         (["--focal", "1585"], "line 1: made without --focal, now --focal 1585; use"),
         (["--preset", "paper"], "line 1: made with --preset default, now --preset paper; use"),
         (["--crs", "none"], "line 1: made with GPS, now without GPS; use"),

@@ -73,6 +73,20 @@ def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
     assert "`near_world` allows 0; the nearest to `near_world` is" in nothing["warnings"][-1]
 
 
+def test_a_tilted_photo_is_clear_by_its_gravity_in_a_table(scene, tmp_path, capsys):
+    taken = query(7, "tilt")
+    photo = tmp_path / "tilted.png"
+    cv2.imwrite(str(photo), taken.rgb[..., ::-1])
+    down = taken.pose.R_cam_from_world @ [0.0, 0.0, -9.81]
+    table = tmp_path / "priors.csv"
+    table.write_text(f"name,gravity_x,gravity_y,gravity_z\ntilted.png,{down[0]},{down[1]},{down[2]}\n")
+    assert localize.main(_arguments(scene, "--pano", str(photo), "--priors", str(table))) == 0
+    result = Result.from_json(capsys.readouterr().out)
+    assert errors(result.pose, taken.pose)[0] < 0.03
+    assert set(result.seconds) == {"read", "search", "refine"}  # as upright: no features are matched
+    assert result.settings["prior"]["gravity_vector"] == pytest.approx(down.tolist())
+
+
 def test_files_are_written_and_look_right(scene, tmp_path, capsys):
     out, overlay, occlusion = (tmp_path / name for name in ("pose.json", "overlay.png", "occlusion.png"))
     pictures = ["--overlay", str(overlay), "--occlusion-mask", str(occlusion)]
@@ -128,10 +142,12 @@ USAGE = [
     ("--preset paper use_visibility=no", "found 'use_visibility=no', wanted one of true, fal"),
     ("--preset paper max_points=many", "found 'max_points=many', wanted int"),
     ("--preset paper --near 0 0 0 1", "--near: not an option of the preset paper"),
+    ("--preset paper --gravity-vector 0 0 -1", "--gravity-vector: not an option of the preset paper"),
     ("--preset paper --up -y", "--up: not an option of the preset paper"),
     ("--preset paper --refine-focal", "--refine-focal: not an option of the preset paper"),
     ("--preset paper --gravity auto", "gravity: found auto"),
     ("--height 2 1", "--height: found [2.0, 1.0]"),
+    ("--gravity-vector 0 0 0", "--gravity-vector: found (0.0, 0.0, 0.0), wanted three finite numbers"),
     ("--preset default num_yaws=1000000", "num_yaws: found 1000000, wanted 1 to 3600"),
     ("--near nan 0 0 1", "found nan or inf, wanted finite numbers"),
     ("--overlay x.png --pano a b", "found 2 photos, wanted one photo or a folder"),

@@ -19,6 +19,10 @@ from piccolo.scan_map.prior import Prior
         ("name,x,y\na,1\n", "line 2: found x without y"),
         ("name,z\na,1\n", "line 2: found z without x"),
         ("name,tolerance\na,1\n", "line 2: found tolerance without heading"),
+        ("name,gravity_x,gravity_z\na,0,-1\n", "line 2: found gravity_x without gravity_y"),
+        ("name,gravity_x,gravity_y,gravity_z\na,0,-1,\n", "line 2: found gravity_y without gravity_z"),
+        ("name,gravity_x,gravity_y,gravity_z\na,,0,-1\n", "line 2: found gravity_z without gravity_x"),
+        ("name,gravity_x,gravity_y,gravity_z\na,0,0,0\n", "line 2: `gravity_vector`: found .*, not all 0"),
         ("name,heading\na,north\n", "line 2: found heading 'north', wanted a number"),
         ("name,heading\na,nan\n", "line 2: found heading nan, wanted a finite number"),
         ("name,x,y,radius\na,1,2,-3\n", "line 2: radius: found -3.0"),
@@ -40,6 +44,15 @@ def test_a_table_names_the_scans_that_a_photo_may_be_in(tmp_path):
     priors = read_priors(table, Prior(within=("Roof",)))
     assert priors.prior_of(Path("a.jpg"), Prior(within=("Roof",))).within == ("Storey 1", "Storey 2")
     assert priors.prior_of(Path("b.jpg"), Prior(within=("Roof",))).within == ("Roof",)
+
+
+def test_a_table_gives_each_photo_its_gravity(tmp_path):
+    table = tmp_path / "priors.csv"
+    table.write_text("name,gravity_x,gravity_y,gravity_z,height\na.jpg,-4,0,-9,\nb.jpg,,,,1.5\n")
+    general = Prior(gravity_vector=(0.0, 0.0, -1.0))
+    priors = read_priors(table, general)
+    assert priors.prior_of(Path("a.jpg"), general) == Prior(gravity_vector=(-4.0, 0.0, -9.0))
+    assert priors.prior_of(Path("b.jpg"), general).gravity_vector == (0.0, 0.0, -1.0)
 
 
 def test_empty_cells_fall_back_and_paths_go_before_names(tmp_path):

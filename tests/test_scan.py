@@ -10,7 +10,9 @@ import rooms
 
 import piccolo
 from piccolo.files.cache import sha256_of_arrays
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
+from piccolo.scan_map.prior import Prior
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +38,7 @@ def test_options_that_are_none_are_named(scan):
         ({"gravity": "Known"}, piccolo.InputError, "`gravity`: found 'Known', wanted one of auto"),
         ({"mask": np.ones((3, 3), bool)}, piccolo.InputError, "mask: wanted an array"),
         ({"fov_deg": 90.0}, piccolo.InputError, "need a file"),
+        ({"gravity_vector": (0.0, 0.0, 0.0)}, piccolo.InputError, "`gravity_vector`: found .*, wanted three"),
     ):
         with pytest.raises(error, match=text):
             scan.localize(np.zeros((64, 128, 3), np.uint8), **options)
@@ -137,6 +140,14 @@ def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
     with pytest.raises(piccolo.InputError, match="found a scan of the preset paper"):
         paper.save(tmp_path / "paper.map")
     assert [path.name for path in tmp_path.iterdir()] == ["room.map"]
+
+
+def test_a_photos_prior_is_added_to_that_of_the_scan(tmp_path, scan):
+    settings = CoarseToFineSettings(prior=Prior(height=(1.0, 2.0)))
+    opened = piccolo.Scan(dataclasses.replace(scan._opened, settings=settings))
+    (result,) = opened.localize_many([tmp_path / "none.jpg"], gravity_vector=np.array([0.0, 0.0, -1.0]))
+    prior = Prior(height=(1.0, 2.0), gravity_vector=(0.0, 0.0, -1.0))
+    assert result.settings["prior"] == dataclasses.asdict(prior)
 
 
 def test_a_photo_that_cannot_be_read_is_a_result_among_many(tmp_path, scan):

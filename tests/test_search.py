@@ -135,6 +135,14 @@ def test_tilt_in_the_metadata_is_that_of_every_start():
     assert len(np.unique(np.round(forward, 6), axis=0)) > 6
 
 
+def test_the_users_gravity_goes_before_the_tilt_in_the_metadata():
+    panorama = dataclasses.replace(rooms.scene(1)[1], gpano=GPano(pitch_deg=20.0))
+    settings = CoarseToFineSettings(prior=Prior(gravity_vector=(-9.0, 0.0, -9.0)))
+    photo = prepare_query(panorama, rooms.scan_map(1), settings, Workers(2)).photo
+    assert photo.has_tilt
+    np.testing.assert_allclose(photo.R_cam_from_level @ [0.0, 0.0, -1.0], [-(0.5**0.5), 0.0, -(0.5**0.5)])
+
+
 def test_about_level_are_seven_pitches_in_forty_headings():
     """Without roll; neighbours in heading are as far apart as those in pitch."""
     rotations = search.list_rotations(_query(), "level")

@@ -13,8 +13,10 @@ from ..scan_map.named_scans import check_within
 from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
 
-NUMBERS = ("x", "y", "z", "radius", "heading", "tolerance", "height")
-COLUMNS = (*NUMBERS, "within")
+GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
+COLUMNS = ("x", "y", "z", "radius", "heading", "tolerance", "height", *GRAVITY, "within")
+NOT_WITHOUT = {"x": "y", "y": "x", "z": "x", "radius": "x", "tolerance": "heading"}
+NOT_WITHOUT |= {"gravity_x": "gravity_y", "gravity_y": "gravity_z", "gravity_z": "gravity_x"}
 BETWEEN_NAMES = ";"
 WANTED = f"wanted a CSV file whose first line names its columns: name and any of {', '.join(COLUMNS)}"
 DEFAULT_RADIUS = 5.0  # [m]
@@ -61,6 +63,8 @@ def _prior_from(row: Mapping[str, float], within: tuple[str, ...], general: Prio
     if "heading" in row:
         changes["heading_deg"] = row["heading"]
         changes["heading_tolerance_deg"] = row.get("tolerance", general.heading_tolerance_deg)
+    if "gravity_x" in row:
+        changes["gravity_vector"] = tuple(row[column] for column in GRAVITY)
     return replace(general, **changes)
 
 
@@ -69,7 +73,8 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
 
     Columns: name (the panorama's path as given, or its file name), x, y, z [m] in the scan's frame (without z
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
-    [deg], height [m] above the floor, within (names of the map's scans, with semicolons between them).
+    [deg], height [m] above the floor, gravity_x, gravity_y, gravity_z (down, in the camera's axes, of any
+    length), within (names of the map's scans, with semicolons between them).
 
     Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
@@ -109,7 +114,7 @@ def _numbers(where: str, row: Mapping[str, str | None]) -> dict[str, float]:
             raise InputError(f"{where}: found {column} {text.strip()!r}, wanted a number") from error
         if not math.isfinite(numbers[column]):
             raise InputError(f"{where}: found {column} {text.strip()}, wanted a finite number")
-    for column, other in (("x", "y"), ("y", "x"), ("z", "x"), ("radius", "x"), ("tolerance", "heading")):
+    for column, other in NOT_WITHOUT.items():
         if column in numbers and other not in numbers:
             raise InputError(f"{where}: found {column} without {other}")
     return numbers

@@ -39,7 +39,7 @@ output: one JSON object per photo and line, in the order given (docs/RESULT.md);
 to stderr. Ctrl-C lets the current photo finish and then stops a batch; a second Ctrl-C stops it at once.
 """
 PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
-ONLY_DEFAULT = ("near", "height", "heading", "within", "refine_focal")
+ONLY_DEFAULT = ("near", "height", "heading", "within", "gravity_vector", "refine_focal")
 NONE = "none"
 CACHE_TEXT = f"folder of prepared maps (default: in the user's cache); {NONE}: prepare the map again"
 PHOTOS_OF_A_JOB = 8  # as many are localized while a process starts and opens a map
@@ -156,9 +156,9 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     title = "prior knowledge (preset default only); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
     text = (
-        "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, within; "
+        "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, within, "
     )
-    text += "they take precedence over the following options"
+    text += "gravity_x, gravity_y, gravity_z; they take precedence over the options for all photos"
     option(group, "--priors FILE", text)
     option(group, "--near X Y Z RADIUS", "the camera was within RADIUS of this position [m]")
     option(group, "--height MIN MAX", "height of the camera above the floor [m]")
@@ -208,7 +208,7 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
 
 
 def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
-    """Return the options of add_panorama_reading_options."""
+    """Return the options with which panoramas are read."""
     if arguments.camera and arguments.rig:
         raise InputError("--camera, --rig: wanted only one of them")
     calibration = open_calibration(arguments.camera) if arguments.camera else None
@@ -221,7 +221,6 @@ def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
         projection=arguments.projection,
         focal_px=arguments.focal,
         calibration=read_rig(arguments.rig) if arguments.rig else calibration,
-        gravity_vector=tuple(arguments.gravity_vector) if arguments.gravity_vector else None,
         refine_focal=arguments.refine_focal,
     )
 
@@ -277,13 +276,15 @@ def settings_from(arguments: argparse.Namespace) -> Settings:
 
 
 def prior_from(options: dict[str, Any]) -> Prior:
-    """Return what the options of add_prior_options say of all photos; nothing of a command without them."""
+    """Return what the options say of the poses of all photos; nothing of a command without them."""
     within = tuple(options.get("within") or ())
     given: dict[str, Any] = {"within": within, "heading_deg": options.get("heading")}
     if near := options.get("near"):
         given |= {"near_world": tuple(near[:3]), "radius": near[3]}
     if height := options.get("height"):
         given["height"] = tuple(height)
+    if gravity_vector := options.get("gravity_vector"):
+        given["gravity_vector"] = tuple(gravity_vector)
     return Prior(**given)
 
 

@@ -18,7 +18,7 @@ from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.keypoints import HALVES
 from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
-from ..scan_map.prior import NOTHING_KNOWN
+from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
 from .comparison import score_pose
 from .prior import contradictions
@@ -126,10 +126,11 @@ def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]
 
 def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
     """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    is_asked = query.settings.prior != NOTHING_KNOWN and query.method.uses_search and is_whole(query)
+    gravity_alone = Prior(gravity_vector=query.settings.prior.gravity_vector)
+    is_asked = query.settings.prior != gravity_alone and query.method.uses_search and is_whole(query)
     if not is_asked:
         return []
-    settings = replace(query.settings, prior=NOTHING_KNOWN)
+    settings = replace(query.settings, prior=gravity_alone)
     anywhere = brief_query(replace(query, scan_map=scan_map, settings=settings))
     with watch.stage("search"):
         starts = search_poses(anywhere, "known")

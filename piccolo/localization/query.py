@@ -17,7 +17,7 @@ from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches, match
 from ..panorama import Panorama
-from ..panorama.gpano import rotation_to_level
+from ..panorama.gpano import attitude_of_gravity, rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
 from ..panorama.texels import Texels, pack_texels
@@ -159,8 +159,10 @@ def prepare_query(
     workers: Workers,
     method: MethodConfig = METHOD,
 ) -> Query:
-    """Prepare a panorama for the search in a map; its metadata give the camera's tilt."""
-    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
+    """Prepare a panorama for the search in a map; the prior or metadata give the camera's tilt."""
+    down_cam = settings.prior.gravity_vector
+    gpano = attitude_of_gravity(down_cam) if down_cam else panorama.gpano
+    R_level_from_cam = rotation_to_level(gpano) if gpano else None
     width = method.scales.full.width
     resized = resize(panorama, width)
     photo = Photo(

@@ -78,7 +78,6 @@ class ReadOptions:
     focal_px: float | None = None  # of a pinhole [px], at the picture's own size
     # of the camera, a folder of one for each photo, or of a rig whose pictures are in a folder
     calibration: Calibration | Path | None = None
-    gravity_vector: tuple[float, float, float] | None = None  # down, in the camera's axes, of any length
     refine_focal: bool = False  # the focal length is a first guess
 
     def __post_init__(self) -> None:
@@ -93,9 +92,6 @@ class ReadOptions:
         if self.projection is not None and self.projection not in get_args(Projection):
             wanted = f"wanted one of {', '.join(get_args(Projection))}"
             raise InputError(f"`projection`: found {self.projection!r}, {wanted}")
-        vector = self.gravity_vector
-        if vector is not None and not (all(map(math.isfinite, vector)) and math.hypot(*vector) > 0.0):
-            raise InputError(f"`gravity_vector`: found {vector}, wanted three finite numbers, not all 0")
         self._check_together()
 
     @property

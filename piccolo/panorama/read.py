@@ -19,7 +19,6 @@ from .gpano import (
     ASPECT_TOLERANCE,
     CropRegion,
     attitude,
-    attitude_of_gravity,
     crop_region,
     embed_crop,
     full_size,
@@ -94,8 +93,7 @@ def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], optio
     if rgb.shape[1] != 2 * len(rgb):
         found = f"{rgb.dtype} of shape {rgb.shape}"
         raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
-    down = options.gravity_vector
-    return Panorama(rgb, is_valid, None if down is None else attitude_of_gravity(down))
+    return Panorama(rgb, is_valid)
 
 
 def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
@@ -233,9 +231,7 @@ def _mask(path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, opti
     is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)
     if not is_valid.any():
         raise InputError(f"{path}: no pixel is left: all are masked, black, or of ignored labels")
-    down = options.gravity_vector
-    gpano = panorama.gpano if down is None else attitude_of_gravity(down)
-    return replace(panorama, is_valid=np.ascontiguousarray(is_valid), gpano=gpano)
+    return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
 
 
 def _user_masks(

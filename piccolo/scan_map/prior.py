@@ -1,4 +1,4 @@
-"""Prior knowledge of a camera's position: from the user, or a photo's GPS, which may be wrong indoors."""
+"""Prior knowledge of a camera's pose: from the user, or a photo's GPS, which may be wrong indoors."""
 
 import math
 from dataclasses import dataclass, replace
@@ -18,6 +18,8 @@ class Prior:
     heading_deg: float | None = None  # of the image centre, clockwise from the cloud's +y, as GPano counts
     heading_tolerance_deg: float = 20.0
     within: tuple[str, ...] = ()  # names of the map's scans that the camera may be in; all if none
+    # down, in the camera's axes, of any length; goes before metadata
+    gravity_vector: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         """Refuse contradictory values, naming the option."""
@@ -32,6 +34,9 @@ class Prior:
             raise InputError(f"`height`: found {list(self.height)}, wanted MIN below MAX")
         if not 0.0 < self.heading_tolerance_deg <= 180.0:
             raise InputError(f"heading_tolerance_deg: found {self.heading_tolerance_deg}, wanted 0 to 180")
+        vector = self.gravity_vector
+        if vector is not None and not (all(map(math.isfinite, vector)) and math.hypot(*vector) > 0.0):
+            raise InputError(f"`gravity_vector`: found {vector}, wanted three finite numbers, not all 0")
 
 
 NOTHING_KNOWN = Prior()
