@@ -1,8 +1,10 @@
 """A scan prepared for a method: `Scan`, the commands and the batches localize photos in it."""
 
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,22 +13,24 @@ from .camera import Calibration
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
 from .confidence.confidence import LOCALIZED
+from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
+from .localization.bundle import localize_bundle
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
-from .panorama import ReadOptions, read_photo
+from .panorama import Panorama, ReadOptions, read_photo
 from .panorama.photo import PhotoFacts, sha256_of
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .result import Result, Source, describe_failure, result_of, unreadable_result
 from .scan_map.named_scans import add_places, check_within
-from .scan_map.prior import GpsPrior, gps_prior
+from .scan_map.prior import GpsPrior, Prior, gps_prior
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk, WalkAbout, photo_facts
 from .walk.frames import Motion
@@ -107,7 +111,7 @@ class OpenedScan:
         """
         watch = Stopwatch()
         self.check_options(read_options, settings)
-        repeated = settings_json(settings, self.cloud_settings, read_options)
+        asked = read_options
         if calibration is not None and read_options.calibration is None:
             read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"), reading_once():
@@ -124,21 +128,68 @@ class OpenedScan:
                 found = run(self.prepared, picture, tried, self.workers, watch)
                 if found.status == LOCALIZED:
                     break
-            found = add_places(self.prepared, found)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
             raise InputError(OTHER_METHOD)
-        digest = self.prepared.scan_sha256 or None
+        about = settings_json(settings, self.cloud_settings, asked)
+        return replace(
+            self._make_result(panorama, picture, photo, found, about, watch.seconds), gps_prior=gps
+        )
+
+    def localize_bundle(
+        self,
+        panoramas: Sequence[File | NDArray[np.uint8]],
+        cams_from_bundle: Sequence[Pose],
+        read_options: ReadOptions,
+        settings: Settings,
+        is_masked: NDArray[np.bool_] | None = None,
+    ) -> list[Result]:
+        """Localize photos together whose poses in a common frame are known.
+
+        Raises InputError for a photo that can't be read, for the preset paper, and for a focal length that is
+        a guess.
+        """
+        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
+            raise InputError("`relative_poses`: not available with the preset paper")
+        self.check_options(read_options, settings)
+        watch = Stopwatch()
+        with watch.stage("read"), reading_once():
+            pictures = [read_photo(panorama, read_options, is_masked) for panorama in panoramas]
+            photos = [photo_facts(panorama, read_options.rig) for panorama in panoramas]
+        if any(map(has_guessed_focal, pictures)):
+            raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
+        found = localize_bundle(self.prepared, pictures, cams_from_bundle, settings, self.workers, watch)
+        about = settings_json(settings, self.cloud_settings, read_options)
+        seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
+        return [
+            self._make_result(*parts, about, seconds)
+            for parts in zip(panoramas, pictures, photos, found, strict=True)
+        ]
+
+    def _make_result(
+        self,
+        panorama: File | NDArray[np.uint8],
+        picture: Panorama,
+        photo: PhotoFacts,
+        found: Localization,
+        settings: dict[str, object],
+        seconds: dict[str, float],
+    ) -> Result:
+        """Return the result of a photo; `settings` are as in its JSON."""
+        has_labels = self.cloud_settings.labels is not None
+        if isinstance(self.prepared, ScanMap):
+            found = add_places(self.prepared, found)
         return result_of(
             found,
             cloud=self.name,
             pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
-            seconds=watch.seconds,
-            settings=repeated,
-            warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if read_options.labels else ()),
-            source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
-            gps_prior=gps,
+            seconds=seconds,
+            settings=settings,
+            warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if has_labels else ()),
+            source=Source(
+                self.prepared.scan_sha256 or None, photo.sha256, photo.image_size, photo.capture_time
+            ),
             cameras=found.cameras or picture.cameras,
         )
 
@@ -192,3 +243,17 @@ def make_failed_result(
         settings=settings_json(settings, scan.cloud_settings, read_options),
         source=Source(scan.prepared.scan_sha256 or None, digest),
     )
+
+
+def replace_settings(settings: Settings, given: dict[str, Any]) -> Settings:
+    """Return settings with options changed; InputError if the method has no such option."""
+    if unknown := given.keys() - {f.name for f in fields(settings)}:
+        raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
+    return replace(settings, **given)
+
+
+def make_prior(given: dict[str, Any], settings: Settings) -> Prior:
+    """Return the prior that options give; InputError if one is invalid, or the method uses no prior."""
+    if not isinstance(settings, CoarseToFineSettings):
+        raise InputError(f"`{min(given)}`: not an option of the preset paper")
+    return replace(settings.prior, **given | {"within": tuple(given.get("within", settings.prior.within))})

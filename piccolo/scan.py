@@ -1,7 +1,7 @@
 """The public class `Scan`: photos and walks are localized in it."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,7 @@ from .cloud.soa import PackedPoints
 from .errors import InputError
 from .geometry.pose import Pose
 from .geometry.rotations import Gravity
-from .localization.settings import CoarseToFineSettings
-from .opened_scan import File, OpenedScan, Settings, make_failed_result
+from .opened_scan import File, OpenedScan, Settings, make_failed_result, make_prior, replace_settings
 from .optimize.refine import Solver
 from .panorama import ReadOptions
 from .panorama.model import Projection
@@ -178,6 +177,7 @@ class Scan:
     def localize_many(  # noqa: PLR0913  options by name
         self,
         panoramas: Iterable[File | Image],
+        relative_poses: Sequence[Pose] | None = None,
         *,
         mask: File | Mask | None = None,
         mask_nadir_deg: float | None = None,
@@ -204,9 +204,19 @@ class Scan:
 
         `panoramas` and the options are as in `localize`; all photos have the same options. The status of a
         photo that can't be read is "unreadable", or "failed" if another try may succeed; `error` says why.
+
+        With `relative_poses`, one of each photo in any common frame [m], such as that of a phone's tracker,
+        the photos are localized together; one that can't be read is an InputError then.
         """
         read_options, settings, is_masked = self._parse(check_arguments(Scan.localize_many, locals()))
         self._opened.check_options(read_options, settings)
+        if relative_poses is not None:
+            photos = list(panoramas)
+            if len(photos) != len(relative_poses):
+                found = f"{len(relative_poses)} of {len(photos)} photos"
+                raise InputError(f"`relative_poses`: found {found}, wanted one of each photo")
+            bundle = self._opened.localize_bundle(photos, relative_poses, read_options, settings, is_masked)
+            return iter(bundle)
 
         def localize(panorama: File | Image) -> Result:
             try:
@@ -382,19 +392,6 @@ class Scan:
         opened = self._opened
         settings = {name: given[name] for name in SETTINGS_FIELDS & given.keys()}
         if prior := {name: given[name] for name in PRIOR_FIELDS & given.keys()}:
-            settings["prior"] = _make_prior(prior, opened.settings)
+            settings["prior"] = make_prior(prior, opened.settings)
         read_options = ReadOptions(labels=opened.cloud_settings.labels, **reading)
-        return read_options, _replace_settings(opened.settings, settings), is_masked
-
-
-def _replace_settings(settings: Settings, given: dict[str, Any]) -> Settings:
-    if unknown := given.keys() - {f.name for f in fields(settings)}:
-        raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
-    return replace(settings, **given)
-
-
-def _make_prior(given: dict[str, Any], settings: Settings) -> Prior:
-    """Return the prior that options give; InputError if one is invalid, or the method uses no prior."""
-    if not isinstance(settings, CoarseToFineSettings):
-        raise InputError(f"`{min(given)}`: not an option of the preset paper")
-    return replace(settings.prior, **given | {"within": tuple(given.get("within", settings.prior.within))})
+        return read_options, replace_settings(opened.settings, settings), is_masked

@@ -5,7 +5,7 @@ import itertools
 import os
 import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -32,6 +32,7 @@ from ..panorama.photo import sha256_of
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
+from .bundle import check_bundle_options, run_bundle
 from .command import command
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
 from .executing import (
@@ -72,7 +73,7 @@ class Run:
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
     a = arguments
-    given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video))
+    given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
     outputs = {"--out": arguments.out or STDOUT, "--plan": arguments.plan, **pictures}
@@ -95,6 +96,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     with checking_options():
         check_arguments(arguments)
         check_walk_options(arguments)
+        check_bundle_options(arguments)
         check_execution(arguments)
         limit_memory(arguments.max_memory)
         localizer = localizer_from(arguments, tuple(arguments.cloud))
@@ -182,6 +184,15 @@ def advise(result: Result) -> list[str]:
     return [f"  it fits nowhere well: {causes}?"]
 
 
+def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequence[str]) -> None:
+    """Print what was found, the warnings, and what to do about a doubtful result, unless --quiet."""
+    if arguments.quiet:
+        return
+    lines = [f"  warning: {for_terminal(printable(warning))}" for warning in warnings]
+    for line in (result.summary(), *lines, *advise(result)):
+        tqdm.write(line, file=sys.stderr)
+
+
 def record(run: Run, answer: Answer, write: Write) -> None:
     """Write the pictures asked for and the result, and say what was found."""
     arguments = run.arguments
@@ -193,10 +204,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
             write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
-    elif not arguments.quiet:
-        warnings = (f"  warning: {for_terminal(printable(warning))}" for warning in answer.warnings)
-        for line in (result.summary(), *warnings, *advise(result)):
-            tqdm.write(line, file=sys.stderr)
+    else:
+        print_result(arguments, result, answer.warnings)
     write(result.to_json())
     run.counts[result.status] += 1
 
@@ -267,6 +276,11 @@ def main(arguments: argparse.Namespace) -> int:
     run = prepare_run(arguments)
     if arguments.walk or arguments.video:
         return run_frames(run)
+    if arguments.relative:
+        localizer = run.localizer
+        opening = partial(open_scan, run, localizer, arguments.threads or num_cores())
+        photos = list(run.panoramas)
+        return run_bundle(arguments, photos, localizer, opening, partial(print_result, arguments))
     rig = run.localizer.read_options.rig
     with open_output(arguments.out or STDOUT) as (file, write):
         records = take_up_results(run, file)

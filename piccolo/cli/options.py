@@ -31,6 +31,7 @@ examples:
   python localize.py --cloud scan.ply --pano photos --out poses.jsonl --priors priors.csv
   ls photos/*.jpg | python localize.py --cloud scan.ply --pano - > poses.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 4
+  python localize.py --cloud scan.ply --pano photos --relative transforms.json --out poses.jsonl
   python localize.py --cloud scan.ply --walk --pano frames --out walk.jsonl
   python localize.py --cloud scan.ply --video walk.mp4 --every 0.5s --out walk.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
@@ -172,8 +173,11 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 
 
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
-    """Add the options of walks."""
-    group = parser.add_argument_group("walks")
+    """Add the options of walks, and of photos that belong together in another way."""
+    group = parser.add_argument_group("photos together")
+    text = "relative poses of the photos [m], which are then localized together: COLMAP's images.txt, "
+    text += "a transforms.json (nerfstudio, phone apps), or a TUM trajectory with the photos' names as times"
+    option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
     option(group, "--video FILE", "video of a walk, instead of --pano")

@@ -25,6 +25,7 @@ from ..scan_map.scan_map import ScanMap
 from .comparison import score_pose
 from .covariance import estimate_covariance
 from .localize import Found, find_pose
+from .prior import contradictions
 from .query import Query
 from .refinement import descend_fine
 from .selection import Selection, assess_poses
@@ -285,7 +286,8 @@ def describe_member(
     words = least_constrained_direction(covariance[3:, 3:], in_world[3:, 3:])
     known = PoseCovariance(0.5 * (in_world + in_world.T), words)
     is_right = math.erf(MAX_DISTANCE / (known.largest_std * math.sqrt(2.0)))
-    p = np.append(is_right * probabilities[:-1], 0.0)
+    warnings = contradictions(scan_map, pose, query.settings.prior)
+    p = np.append(is_right * probabilities[:-1], 0.0) * (not warnings)
     p[-1] = 1.0 - p.sum()
     elsewhere = [score_pose(query, member.cam_from_bundle @ other) for other in others]
     return replace(
@@ -295,6 +297,7 @@ def describe_member(
         probability_none=float(p[-1]),
         pose=scan_map.to_world(pose),
         covariance=known,
+        warnings=warnings,
         alternatives=tuple(
             Alternative(scan_map.to_world(h.pose), h.score, None, float(q))
             for h, q in zip(elsewhere, p[1:-1], strict=True)
