@@ -38,7 +38,7 @@ def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
 
 
 def test_right_and_wrong_evidence():
-    for model in (rule.VIEWS_MODEL, rule.MATCHES_MODEL):
+    for model in rule.MODELS.values():
         assert all(w > 0.0 for w in model.weights)
         assert model.none_weights[1] >= 0.0
     p = posterior([RIGHT, ELSEWHERE], SURE)
@@ -49,14 +49,15 @@ def test_right_and_wrong_evidence():
     assert classify(p, 0.9) == rule.NOT_LOCALIZED
 
 
-def test_whole_views_alone_have_a_model_of_their_own():
-    """Two features; a pose without matches is judged by it, and local features count once they were asked."""
+def test_each_kind_of_evidence_has_a_model_of_its_own():
+    """Whole views alone have two features; local features count once they were asked, even if none agrees."""
     views = Standing(0.5, 0.2, None)
     np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
-    assert rule.choose_model(views) == rule.VIEWS_MODEL
-    assert rule.choose_model(views._replace(num_matches=0)) == rule.MATCHES_MODEL
-    assert (len(rule.VIEWS_MODEL.weights), len(rule.MATCHES_MODEL.weights)) == (2, len(rule.FEATURES))
-    for model, standing in ((rule.VIEWS_MODEL, views), (rule.MATCHES_MODEL, views._replace(num_matches=5))):
+    standings = [views, views._replace(num_matches=0), views._replace(num_matches=0, is_drawn=True)]
+    assert [standing.kind for standing in standings] == list(rule.MODELS)
+    assert [len(model.weights) for model in rule.MODELS.values()] == [2, 3, 3]
+    for standing in standings:
+        model = rule.MODELS[standing.kind]
         expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0
         assert rule.log_odds(standing._replace(log_prior=-2.0)) == pytest.approx(expected)
         np.testing.assert_array_equal(posterior([standing], SURE), posterior([standing], SURE, model))

@@ -23,6 +23,14 @@ class Standing(NamedTuple):
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int | None  # local features that agree with it; None: whole views alone were compared
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
+    is_drawn: bool = False  # the matches are with the scan drawn at the pose, else with the map's features
+
+    @property
+    def kind(self) -> str:
+        """What was compared, as in MODELS."""
+        if self.num_matches is None:
+            return "whole views alone"
+        return "scan drawn at the pose" if self.is_drawn else "features of the map"
 
 
 class ChoiceModel(NamedTuple):
@@ -42,13 +50,11 @@ NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at m
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
-VIEWS_MODEL = ChoiceModel((5.75, 0.43), (4.04, 3.82))  # of whole spheres by whole views alone
-MATCHES_MODEL = ChoiceModel((9.44, 1.12, 1.94), (8.01, 4.86))  # where local features were asked
-
-
-def choose_model(standing: Standing) -> ChoiceModel:
-    """Return the model for a pose's kind of evidence."""
-    return VIEWS_MODEL if standing.num_matches is None else MATCHES_MODEL
+MODELS = {
+    "whole views alone": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
+    "features of the map": ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82)),
+    "scan drawn at the pose": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),
+}
 
 
 def pose_features(standing: Standing) -> Array:
@@ -62,7 +68,7 @@ def pose_features(standing: Standing) -> Array:
 
 def log_odds(standing: Standing, model: ChoiceModel | None = None) -> float:
     """Return the logarithm of a pose's odds, up to a constant; by default with the model of its evidence."""
-    model = model or choose_model(standing)
+    model = model or MODELS[standing.kind]
     return float(pose_features(standing) @ np.array(model.weights)) + standing.log_prior
 
 
@@ -83,7 +89,7 @@ def posterior(
     half of all queries have an answer, as in the trials from which they were learnt. None is more likely if
     the best pose's deviation makes 0.1 m doubtful.
     """
-    model = model or choose_model(standings[0])
+    model = model or MODELS[standings[0].kind]
     logits = [log_odds(standing, model) for standing in standings]
     logits.append(float(none_features(covariance) @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))

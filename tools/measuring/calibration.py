@@ -55,9 +55,9 @@ class Outcome(NamedTuple):
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
 
     @property
-    def has_matches(self) -> bool:
-        """True if local features were asked."""
-        return self.standings[0].num_matches is not None
+    def kind(self) -> str:
+        """What was compared, as in MODELS."""
+        return self.standings[0].kind
 
     def probabilities(self, model: ChoiceModel | None) -> Array:
         """Return the probability of each pose, and of none (K + 1,); by default with the model in use."""
@@ -184,16 +184,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     learnt = read(arguments.fit)
     sets = {"learnt from": learnt, "others": read(arguments.check)}
-    models: dict[bool, ChoiceModel] = {}  # by whether features were asked
-    for has_matches in sorted({o.has_matches for o in learnt}):
-        models[has_matches] = model = fit([o for o in learnt if o.has_matches == has_matches])
-        print("with local features:" if has_matches else "by whole views alone:")
+    models: dict[str, ChoiceModel] = {}
+    for kind in sorted({o.kind for o in learnt}):
+        models[kind] = model = fit([o for o in learnt if o.kind == kind])
+        print(f"{kind}:")
         for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
             print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=False)))
     for name, outcomes in sets.items():
         if not outcomes:
             continue
-        stated = [o.probabilities(models.get(o.has_matches)) for o in outcomes]
+        stated = [o.probabilities(models.get(o.kind)) for o in outcomes]
         right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
         called = [classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
