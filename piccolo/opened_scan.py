@@ -17,7 +17,7 @@ from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
-from .geometry.pose import Pose
+from .geometry.pose import Pose, check_rotation
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
 from .localization.bundle import localize_bundle
@@ -38,6 +38,7 @@ from .walk.tracker import Tracker
 
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
+MAX_SKEW = 1e-3  # of R R^T from the identity
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
 
@@ -153,6 +154,9 @@ class OpenedScan:
         if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
             raise InputError("`relative_poses`: not available with the preset paper")
         self.check_options(read_options, settings)
+        check_relative_poses(cams_from_bundle)
+        if not panoramas:
+            return []
         watch = Stopwatch()
         with watch.stage("read"), reading_once():
             pictures = [read_photo(panorama, read_options, is_masked) for panorama in panoramas]
@@ -206,6 +210,14 @@ class OpenedScan:
         if photo.gps is None or not crs or settings.prior.near_world is not None:
             return None
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
+
+
+def check_relative_poses(poses: Sequence[Pose]) -> None:
+    """Raise InputError for a pose that is none."""
+    for pose in poses:
+        check_rotation(pose.R_cam_from_world, MAX_SKEW, "`relative_poses`: found a matrix that")
+        if pose.center_world.shape != (3,) or not np.isfinite(pose.center_world).all():
+            raise InputError(f"`relative_poses`: found a position {pose.center_world}, wanted 3 numbers")
 
 
 def settings_json(

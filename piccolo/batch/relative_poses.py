@@ -1,5 +1,6 @@
 """Relative poses of photos, as other tools write them."""
 
+from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -7,13 +8,14 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.json_file import DAMAGE, describe, read_json, read_text
-from ..geometry.pose import Array, Pose, check_rotation, rotation_from_quaternion_wxyz
+from ..geometry.pose import Array, Pose, check_rotation, orthonormal, rotation_from_quaternion_wxyz
 from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
 
 WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio, or a TUM trajectory, in metres"
 MAX_SKEW = 1e-3  # of R R^T from the identity
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
+NamedPose = tuple[str, Pose]
 
 
 def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
@@ -25,72 +27,84 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
     Raises InputError if the file is none of these, or has no pose of a photo, or two.
     """
     poses = read_transforms(path) if path.suffix == ".json" else read_lines(path)
-    found = []
+    by_path = defaultdict[str, list[Pose]](list)
+    by_name = defaultdict[str, list[Pose]](list)
+    for name, pose in poses:
+        by_path[name].append(pose)
+        by_name[Path(name).name].append(pose)
+    chosen = []
     for photo in photos:
-        names = [name for name in dict.fromkeys((str(photo), photo.name, photo.stem)) if name in poses]
-        if not names:
-            raise InputError(f"{path}: found no pose of {photo}, wanted one of each photo")
-        found.append(poses[names[0]])
-    return found
+        found = by_path.get(str(photo)) or by_name.get(photo.name) or by_name.get(photo.stem) or []
+        if len(found) != 1:
+            raise InputError(f"{path}: found {len(found)} poses of {photo}, wanted one of each photo")
+        chosen.append(found[0])
+    return chosen
 
 
-def read_transforms(path: Path) -> dict[str, Pose]:
-    """Return the poses in a transforms.json, by path and by file name: T_world_from_cam, right, up, back."""
-    poses: dict[str, Pose] = {}
+def read_transforms(path: Path) -> list[NamedPose]:
+    """Return the poses in a transforms.json with the photos' paths: T_world_from_cam, right, up, back."""
+    poses = []
     document = read_json(path, WANTED)
     try:
         for frame in document["frames"]:
             T = np.array(frame["transform_matrix"], float)
             if T.shape != (4, 4):
                 raise ValueError(f"a transform_matrix of shape {T.shape}")
-            pose = make_pose(OPENGL_FROM_CAM.T @ T[:3, :3].T, T[:3, 3], frame["file_path"])
-            poses[frame["file_path"]] = pose
-            poses[Path(frame["file_path"]).name] = pose
+            name = str(frame["file_path"])
+            check_finite(T, name)
+            poses.append((name, make_pose(OPENGL_FROM_CAM.T @ T[:3, :3].T, T[:3, 3], name)))
     except DAMAGE as error:
         raise InputError(f"{path}: found {describe(error)}, {WANTED}") from error
     return poses
 
 
-def read_lines(path: Path) -> dict[str, Pose]:
+def read_lines(path: Path) -> list[NamedPose]:
     """Return the poses in a text file of COLMAP, by the photos' names, or of TUM, by times."""
     lines = [line for line in read_text(path, WANTED).splitlines() if not line.startswith("#")]
     rows = [line.split(None, NUM_COLMAP - 1) for line in lines]
     try:
         if rows and len(rows[0]) == NUM_COLMAP:
-            return dict(read_colmap_row(row) for row in rows[::2] if row)  # points follow each photo
-        return dict(read_tum_row(row) for row in rows if row)
+            return [read_colmap_row(row) for row in rows[::2] if row]  # points follow each photo
+        return [read_tum_row(row) for row in rows if row]
     except ValueError as error:
         raise InputError(f"{path}: found {error}, {WANTED}") from error
 
 
-def read_colmap_row(row: Sequence[str]) -> tuple[str, Pose]:
+def read_colmap_row(row: Sequence[str]) -> NamedPose:
     """Return the name and the pose of a row: T_cam_from_world, camera axes right, down, forward."""
     if len(row) != NUM_COLMAP:
         raise ValueError(f"{len(row)} columns of a photo")
     values = np.array(row[1:8], float)
+    check_finite(values, row[9])
     R_optical_from_world = read_quaternion(values[:4])
     center = -R_optical_from_world.T @ values[4:]
     return row[9], make_pose(OPTICAL_FROM_CAM.T @ R_optical_from_world, center, row[9])
 
 
-def read_tum_row(row: Sequence[str]) -> tuple[str, Pose]:
+def read_tum_row(row: Sequence[str]) -> NamedPose:
     """Return the time and the pose of a row: T_world_from_cam, camera axes right, down, forward."""
     if len(row) != NUM_TUM:
         raise ValueError(f"{len(row)} columns")
     values = np.array(row[1:], float)
+    check_finite(values, row[0])
     R_world_from_optical = read_quaternion(np.roll(values[3:], 1))
     return row[0], make_pose(OPTICAL_FROM_CAM.T @ R_world_from_optical.T, values[:3], row[0])
 
 
+def check_finite(values: Array, name: str) -> None:
+    """Raise ValueError if a pose has numbers that are not finite."""
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name}: a number that is not finite")
+
+
 def make_pose(R_cam_from_world: Array, center_world: Array, name: str) -> Pose:
-    """Return a pose; ValueError if its numbers are none."""
-    if not np.isfinite(center_world).all():
-        raise ValueError(f"{name}: a position that is not finite")
-    return Pose(check_rotation(R_cam_from_world, MAX_SKEW, f"{name}: a rotation that"), center_world)
+    """Return a pose, its rotation without what was rounded; ValueError if it is no rotation."""
+    R = check_rotation(R_cam_from_world, MAX_SKEW, f"{name}: a matrix that")
+    return Pose(orthonormal(R), center_world)
 
 
 def read_quaternion(wxyz: Array) -> Array:
-    """Return the rotation (3, 3) of a quaternion (4,); ValueError if it has no length."""
-    if not 0.0 < np.linalg.norm(wxyz) < np.inf:
+    """Return the rotation (3, 3) of a quaternion (4,); ValueError if it has no length that can be squared."""
+    if not 1e-100 < np.abs(wxyz).max() < 1e100:
         raise ValueError("a quaternion without a length")
     return rotation_from_quaternion_wxyz(wxyz)

@@ -10,6 +10,7 @@ from ..batch.relative_poses import read_relative_poses
 from ..batch.results_file import WAYS
 from ..files.atomic import is_stream
 from ..jobs.stopwatch import Stopwatch
+from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
 from .errors import UsageError, print_note
@@ -34,6 +35,8 @@ def run_bundle(
     print_result: Callable[[Result, Sequence[str]], None],
 ) -> int:
     """Localize the photos together, write their results at once, return the exit code."""
+    if not isinstance(localizer.settings, CoarseToFineSettings):
+        raise UsageError("--relative: not an option of the preset paper")
     out = arguments.out
     if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
         raise UsageError(f"--out: {out} has results already; {WAYS}")

@@ -63,7 +63,7 @@ class Member(NamedTuple):
 
 
 class Support(NamedTuple):
-    """What a photo says of a pose of the bundle."""
+    """Evidence of a photo for a pose of the bundle."""
 
     own: Hypothesis  # its own pose there
     is_found: bool  # by the photo alone
@@ -89,6 +89,7 @@ def localize_bundle(
     watch: Stopwatch,
 ) -> list[Localization]:
     """Localize photos together; `cams_from_bundle` are their poses in any common frame, in metres."""
+    cams_from_bundle = move_origin_near(cams_from_bundle)
     alone: list[Localization] = []
     members: dict[int, Member] = {}
     for k, panorama in enumerate(panoramas):
@@ -103,14 +104,23 @@ def localize_bundle(
     probabilities = weigh_bundles([list(supports.values()) for supports in tested])
     order = np.argsort(-probabilities[:-1], kind="stable")
     ranked = probabilities[[*order, -1]]
-    estimates = {k: estimate_own(members[k], support) for k, support in tested[order[0]].items()}
-    bundle = adjust_bundle(bundles[order[0]], [e for e in estimates.values() if e])
+    own = {k: estimate_own(members[k], support) for k, support in tested[order[0]].items()}
+    estimates = {k: estimate for k, estimate in own.items() if estimate}
+    if not estimates:  # the points fix no photo
+        return alone
+    bundle = adjust_bundle(bundles[order[0]], list(estimates.values()))
     others = [bundles[i] for i in order[1:]]
     for k, member in members.items():
-        rest = [e for i, e in estimates.items() if e and i != k]
-        pose, covariance = fuse_pose(bundle, rest, estimates[k], member.cam_from_bundle)
+        rest = [estimate for i, estimate in estimates.items() if i != k]
+        pose, covariance = fuse_pose(bundle, rest, own[k], member.cam_from_bundle)
         alone[k] = describe_member(member, pose, covariance, others, ranked)
     return alone
+
+
+def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
+    """Move the origin of the common frame to the photos' mean position, so that turns hardly move them."""
+    mean = np.mean([pose.center_world for pose in cams_from_bundle], axis=0)
+    return [Pose(pose.R_cam_from_world, pose.center_world - mean) for pose in cams_from_bundle]
 
 
 def propose_bundles(members: Sequence[Member]) -> list[Pose]:
@@ -261,6 +271,8 @@ def fuse_pose(
     bundle: Pose, rest: Sequence[Estimate], own: Estimate | None, cam_from_bundle: Pose
 ) -> tuple[Pose, Array]:
     """Return a photo's pose by the other photos and by itself, with its covariance (6, 6)."""
+    if own is not None and not rest:
+        return own.pose, own.covariance
     by_rest, of_rest = solve_bundle(bundle, rest)
     expected = cam_from_bundle @ by_rest
     J = differentiate(by_rest, cam_from_bundle)

@@ -1,0 +1,168 @@
+"""localize.py --relative and Scan.localize_many(relative_poses=...): results in order, and refusals."""
+
+import json
+
+import numpy as np
+import pytest
+from poses import SIZE, result
+from rooms import errors, scan_map
+
+import piccolo
+from piccolo.cli.localize import main
+from piccolo.cloud.settings import CloudSettings
+from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.jobs.threads import Workers
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.opened_scan import OpenedScan
+from piccolo.paper.settings import PaperSettings
+from piccolo.result import read_results
+from piccolo.scan import Scan
+from piccolo.scenes.export import Options, export
+from piccolo.scenes.scene import read_scene
+
+COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))
+NAMES = ("clean_2.jpg", "clean_0.jpg", "clean_1.jpg")  # in another order than in the files
+
+
+@pytest.fixture(scope="module")
+def relative(scene, tmp_path_factory):
+    """Relative poses of the scene's photos as transforms.json, in a frame of their own."""
+    folder = tmp_path_factory.mktemp("poses")
+    poses = [(q.image, q.pose @ COMMON_FROM_WORLD.inverse()) for q in read_scene(scene).queries]
+    results = [result(image, pose) for image, pose in poses]
+    export(results, "nerfstudio", folder / "transforms.json", Options(size=SIZE))
+    return folder / "transforms.json"
+
+
+def _command(scene, relative, *options):
+    photos = [str(scene / "images" / name) for name in NAMES]
+    cloud = ["--cloud", str(scene / "cloud.ply"), "--cache", "none", "--gravity", "known", "--threads", "2"]
+    return [*cloud, "--relative", str(relative), *map(str, options), "--pano", *photos]
+
+
+def _assert_right(scene, results):
+    truth = read_scene(scene).by_name
+    assert [r.status for r in results] == ["localized"] * 3
+    for found, name in zip(results, NAMES, strict=True):
+        distance, angle_deg = errors(found.pose, truth[name].pose)
+        assert distance < 0.02
+        assert angle_deg < 0.5
+
+
+def test_results_are_written_in_order(scene, relative, tmp_path, capsys):
+    out = tmp_path / "poses.jsonl"
+    assert main(_command(scene, relative, "--out", out)) == 0
+    results = read_results([out])
+    assert [r.pano for r in results] == [str(scene / "images" / name) for name in NAMES]
+    _assert_right(scene, results)
+    assert len(out.read_text().splitlines()) == 3
+    printed, err = capsys.readouterr()
+    assert printed == ""
+    assert [err.count(f"{name}: localized at") for name in NAMES] == [1, 1, 1]
+    assert "3 photos together in" in err
+    assert err.splitlines()[-1].endswith("s: 3 localized")
+    before = out.read_bytes()
+    assert main(_command(scene, relative, "--out", out)) == 2
+    assert f"--out: {out} has results already" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    assert main(_command(scene, relative, "--out", out, "--overwrite", "--quiet")) == 0
+    assert capsys.readouterr() == ("", "")
+    assert [r.pose.key for r in read_results([out])] == [r.pose.key for r in results]
+
+
+def test_results_go_to_stdout_and_the_code_says_that_some_are_not_localized(scene, relative, capsys):
+    """Nothing is sure enough."""
+    assert main(_command(scene, relative, "--min-confidence", 1.0 - 1e-15)) == 1
+    printed, err = capsys.readouterr()
+    lines = [json.loads(line) for line in printed.splitlines()]
+    assert [line["pano"].rpartition("/")[2] for line in lines] == list(NAMES)
+    assert "localized" not in {line["status"] for line in lines}
+    assert "3 not localized" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "code", "text"),
+    [
+        (["--walk"], 2, "--walk: not with --relative"),
+        (["--jobs", "2"], 2, "--jobs: not with --relative"),
+        (["--overlay", "."], 2, "--overlay: not with --relative"),
+        (["--occlusion-mask", "."], 2, "--occlusion-mask: not with --relative"),
+        (["--priors", "a.csv"], 2, "--priors: not with --relative"),
+        (["--refine-focal"], 2, "--refine-focal: not with --relative"),
+        (["--preset", "paper"], 2, "--relative: not an option of the preset paper"),
+        (["--relative", "none.json"], 3, "none.json: cannot be"),
+    ],
+)
+def test_options_that_do_not_go_together_are_refused(scene, relative, capsys, options, code, text):
+    given = _command(scene, relative, *options)
+    if "--preset" in options:
+        given.remove("--gravity")
+        given.remove("known")
+    assert main(given) == code
+    err = capsys.readouterr().err
+    assert text in err
+    assert err.count("\n") == 1
+
+
+def test_a_file_without_a_photos_pose_is_refused_before_any_work(scene, relative, tmp_path, capsys):
+    document = json.loads(relative.read_text())
+    document["frames"].pop()
+    (tmp_path / "less.json").write_text(json.dumps(document))
+    out = tmp_path / "out.jsonl"
+    assert main(_command(scene, tmp_path / "less.json", "--out", out)) == 3
+    assert "less.json: found 0 poses of" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(_command(scene, relative, "--out", relative)) == 2
+    assert "an input as the output" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def opened():
+    return OpenedScan(scan_map(7), "room", CloudSettings(), CoarseToFineSettings(), Workers(2), {})
+
+
+def _photos_and_poses(scene):
+    truth = read_scene(scene).by_name
+    poses = [truth[name].pose @ COMMON_FROM_WORLD.inverse() for name in NAMES]
+    return [scene / "images" / name for name in NAMES], poses
+
+
+def test_scan_localizes_many_together(scene, opened):
+    photos, poses = _photos_and_poses(scene)
+    results = list(Scan(opened).localize_many(iter(photos), relative_poses=poses, gravity="known"))
+    _assert_right(scene, results)
+    assert all(piccolo.Result.from_json(r.to_json()).to_json() == r.to_json() for r in results)
+    assert results[0].settings["gravity"] == "known"
+    assert list(Scan(opened).localize_many([], relative_poses=[])) == []
+
+
+def test_relative_poses_that_are_none_are_refused(scene, opened, tmp_path):
+    photos, poses = _photos_and_poses(scene)
+    scan = Scan(opened)
+    R = poses[0].R_cam_from_world
+    for given, text in (
+        (poses[:2], "`relative_poses`: found 2 of 3 photos, wanted one of each photo"),
+        ([], "`relative_poses`: found 0 of 3 photos"),
+        (3, "`relative_poses`: found 3, wanted a list, each Pose"),
+        ([None] * 3, "`relative_poses`: found .*, wanted a list, each Pose"),
+        ([*poses[:2], Pose(2.0 * R, np.zeros(3))], "`relative_poses`: found a matrix that is no rotation"),
+        (
+            [*poses[:2], Pose(R, np.full(3, np.nan))],
+            "`relative_poses`: found a position .*, wanted 3 numbers",
+        ),
+    ):
+        with pytest.raises(piccolo.InputError, match=text):
+            scan.localize_many(photos, relative_poses=given)
+    (tmp_path / "bad.jpg").write_bytes(b"no picture")
+    with pytest.raises(piccolo.InputError, match=r"bad\.jpg"):
+        scan.localize_many([tmp_path / "bad.jpg"], relative_poses=poses[:1])
+    with pytest.raises(piccolo.InputError, match="found a focal length that is a guess, wanted a known one"):
+        scan.localize_many(photos, poses, fov_deg=60.0, projection="pinhole", refine_focal=True)
+
+
+def test_the_preset_paper_has_no_relative_poses(scene):
+    photos, poses = _photos_and_poses(scene)
+    points = np.random.default_rng(0).uniform(0.0, 3.0, (2000, 3))
+    scan = piccolo.open_scan(points, np.full((2000, 3), 0.5), settings=PaperSettings())
+    with pytest.raises(piccolo.InputError, match="`relative_poses`: not available with the preset paper"):
+        scan.localize_many(photos, relative_poses=poses)

@@ -1,0 +1,156 @@
+"""Files of relative poses: the poses that were exported, by photo, and what is refused."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from poses import SIZE, result, tilted_poses
+from refusals import assert_refused
+
+from piccolo.batch.relative_poses import read_relative_poses
+from piccolo.scenes.export import Options, export
+
+POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
+PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]
+IDENTITY = np.eye(4).tolist()
+EXPORTED = [
+    ("colmap", "model", "model/images.txt", Options(size=SIZE)),
+    ("nerfstudio", "transforms.json", "transforms.json", Options(size=SIZE)),
+    ("tum", "poses.txt", "poses.txt", Options(timestamps="name")),
+]
+
+
+def _assert_same(found, expected):
+    assert len(found) == len(expected)
+    for pose, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(pose.R_cam_from_world, other.R_cam_from_world, atol=1e-12)
+        np.testing.assert_allclose(pose.center_world, other.center_world, atol=1e-12)
+
+
+def _write(path, text):
+    path.write_text(text)
+    return path
+
+
+def _transforms(path, *frames):
+    return _write(path, json.dumps({"frames": [{"file_path": n, "transform_matrix": T} for n, T in frames]}))
+
+
+def _colmap_row(name, values="1 0 0 0 1 2 3"):
+    return f"1 {values} 1 {name}\n\n"
+
+
+@pytest.mark.parametrize(("name", "out", "file", "options"), EXPORTED)
+def test_exported_poses_are_read_again(tmp_path, name, out, file, options):
+    """In the order of the photos, and of some of them."""
+    results = [result(photo, pose) for photo, pose in zip(PHOTOS, POSES, strict=True)]
+    export(results, name, tmp_path / out, options)
+    _assert_same(read_relative_poses(tmp_path / file, PHOTOS), POSES)
+    _assert_same(read_relative_poses(tmp_path / file, [PHOTOS[2], PHOTOS[0]]), [POSES[2], POSES[0]])
+    elsewhere = [Path("/elsewhere") / photo.name for photo in PHOTOS]
+    _assert_same(read_relative_poses(tmp_path / file, elsewhere), POSES)
+
+
+def test_points_of_photos_are_skipped(tmp_path):
+    """As COLMAP writes them below each photo, here ten numbers too."""
+    points = "1 2 3 4 5 6 7 8 9 10\n"
+    rows = [_colmap_row(f"{k}.jpg", f"1 0 0 0 {k} 0 0").strip() + "\n" + points for k in range(3)]
+    path = _write(tmp_path / "images.txt", "# comment\n" + "".join(rows))
+    found = read_relative_poses(path, [Path("2.jpg"), Path("1.jpg")])
+    assert [pose.center_world.tolist() for pose in found] == [[-2.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]
+
+
+def test_a_path_goes_before_a_name(tmp_path):
+    """Photos of two cameras have the same names."""
+    moved = np.eye(4)
+    moved[0, 3] = 5.0
+    path = _transforms(tmp_path / "a.json", ("left/1.jpg", IDENTITY), ("right/1.jpg", moved.tolist()))
+    left, right = read_relative_poses(path, [Path("left/1.jpg"), Path("right/1.jpg")])
+    assert (left.center_world[0], right.center_world[0]) == (0.0, 5.0)
+    assert_refused(
+        "found 2 poses of x/1.jpg, wanted one of each photo", read_relative_poses, path, [Path("x/1.jpg")]
+    )
+
+
+def test_rounded_rotations_become_rotations(tmp_path):
+    T = np.round(POSES[0].T_world_from_cam, 4)
+    path = _transforms(tmp_path / "a.json", ("1.jpg", T.tolist()))
+    (pose,) = read_relative_poses(path, [Path("1.jpg")])
+    R = pose.R_cam_from_world
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["a.jpg", "2.jpg", "11.jpg"])
+@pytest.mark.parametrize(("form", "out", "file", "options"), EXPORTED)
+def test_a_photo_without_a_pose_is_refused(tmp_path, form, out, file, options, name):
+    export([result(PHOTOS[2], POSES[2]), result(PHOTOS[0], POSES[0])], form, tmp_path / out, options)
+    message = f"found 0 poses of {name}, wanted one of each photo"
+    assert_refused(message, read_relative_poses, tmp_path / file, [PHOTOS[0], Path(name)])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "found 0 poses of 1.jpg"),
+        ("# only a comment\n", "found 0 poses of 1.jpg"),
+        ("hello\n", "found 1 columns, wanted COLMAP's images.txt"),
+        ("1 0 0 0 0 0 0\n", "found 7 columns, wanted"),
+        ("1 0 0 0 0 0 0 one\n", "found could not convert string to float: 'one', wanted"),
+        ("1 0 0 0 0 0 0 0\n", "found a quaternion without a length, wanted"),
+        ("1 0 0 0 0 0 0 1e200\n", "found a quaternion without a length, wanted"),
+        ("1 0 0 0 0 0 0 nan\n", "found 1: a number that is not finite, wanted"),
+        ("1 inf 0 0 0 0 0 1\n", "found 1: a number that is not finite, wanted"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "found 2 poses of 1.jpg, wanted one of each photo"),
+        (_colmap_row("1.jpg", "0 0 0 0 1 2 3"), "found a quaternion without a length, wanted"),
+        (_colmap_row("1.jpg", "1 0 0 0 1 inf 3"), "found 1.jpg: a number that is not finite, wanted"),
+        (_colmap_row("1.jpg", "1 0 nan 0 1 2 3"), "found 1.jpg: a number that is not finite, wanted"),
+        (_colmap_row("1.jpg") + "2 1 0 0 0\n", "found 5 columns of a photo, wanted"),
+        ("\0\1\2", "found 1 columns, wanted"),
+    ],
+)
+def test_damaged_rows_are_refused_in_one_line(tmp_path, text, message):
+    path = _write(tmp_path / "poses.txt", text)
+    assert_refused(message, read_relative_poses, path, [Path("1.jpg")])
+
+
+@pytest.mark.parametrize(
+    ("document", "message"),
+    [
+        ("{", "found damaged JSON"),
+        ("[]", "found TypeError"),
+        ("{}", r"found KeyError\('frames'\), wanted"),
+        ('{"frames": [{"file_path": "1.jpg"}]}', r"found KeyError\('transform_matrix'\), wanted"),
+        ('{"frames": [{"transform_matrix": [[1]]}]}', r"found a transform_matrix of shape \(1, 1\), wanted"),
+        ('{"frames": 3}', "found TypeError"),
+        ('{"frames": []}', "found 0 poses of 1.jpg"),
+    ],
+)
+def test_another_json_is_refused_in_one_line(tmp_path, document, message):
+    path = _write(tmp_path / "transforms.json", document)
+    assert_refused(message, read_relative_poses, path, [Path("1.jpg")])
+
+
+@pytest.mark.parametrize(
+    ("place", "value", "message"),
+    [
+        ((0, 0), 2.0, "1.jpg: a matrix that is no rotation"),
+        ((0, 0), -1.0, "1.jpg: a matrix that is no rotation"),  # it mirrors
+        ((0, 1), 0.01, "1.jpg: a matrix that is no rotation"),
+        ((0, 0), 1e300, "1.jpg: a matrix that is no rotation"),
+        ((2, 2), np.nan, "1.jpg: a number that is not finite"),
+        ((1, 3), np.inf, "1.jpg: a number that is not finite"),
+    ],
+)
+def test_matrices_that_are_no_poses_are_refused(tmp_path, place, value, message):
+    T = np.eye(4)
+    T[place] = value
+    path = _transforms(tmp_path / "transforms.json", ("1.jpg", T.tolist()))
+    assert_refused(f"found {message}, wanted", read_relative_poses, path, [Path("1.jpg")])
+
+
+def test_a_file_that_is_none_is_refused(tmp_path):
+    (tmp_path / "a.bin").write_bytes(b"\xff\xfe\x00\x80")
+    assert_refused("found bytes that are no text", read_relative_poses, tmp_path / "a.bin", [Path("1.jpg")])
+    assert_refused("not a file but a folder", read_relative_poses, tmp_path, [Path("1.jpg")])
+    assert_refused("cannot be|No such file", read_relative_poses, tmp_path / "none.txt", [Path("1.jpg")])
