@@ -169,12 +169,14 @@ def find_support(member: Member, bundle: Pose) -> Support:
     """Return what a photo says of a pose of the bundle, by its own best pose near the one expected."""
     query = member.found.query
     expected = member.cam_from_bundle @ bundle
-    hypotheses = [own for own, _ in member.own_poses]
-    own = next((h for h in hypotheses if is_same(h.pose, expected)), None)
-    others = [h for h in hypotheses if h is not own]
+    poses = [own for own, _ in member.own_poses]
+    own = next((h for h in poses if is_same(h.pose, expected)), None)
     found = own or max(refine_near(query, expected), key=lambda h: h.score)
-    p = posterior(assess_poses(query, found, others), member.alone.covariance)
-    return Support(found, own is not None, float(p[0]), max(float(p[-1]), LEAST_NONE))
+    if own is None:
+        poses.append(found)
+    p = posterior(assess_poses(query, poses[0], poses[1:]), member.alone.covariance)
+    k = next(k for k, h in enumerate(poses) if h is found)
+    return Support(found, own is not None, float(p[k]), max(float(p[-1]), LEAST_NONE))
 
 
 def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
