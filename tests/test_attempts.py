@@ -201,7 +201,7 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     made = [(k, run) for k in (1, 2, 0)]
     monkeypatch.setattr(method, "plan_attempts", lambda query: made)
     monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
-    monkeypatch.setattr(method, "judge", lambda query, found: (query.num_halves, found))
+    monkeypatch.setattr(method, "judge", lambda query, found, fit: (query.num_halves, found))
     how = CoarseToFineSettings(), Workers(1), Stopwatch()
     num_halves, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
     assert places(found) == [1, 2, 0][:num_made]

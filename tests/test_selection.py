@@ -171,7 +171,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     explains = {0.0: 0.6, 1.0: 0.5, 2.0: 0.4}
     around = SimpleNamespace(surroundings=lambda place, scale: "points" if scale < 0.01 else "coarse points")
     query = compared(monkeypatch, explains, counts)
-    photo = SimpleNamespace(given=None, panorama=None, colors=lambda: None)
+    photo = SimpleNamespace(given=None, panorama=None, colors=lambda: None, is_partial=False)
     query = replace(query, photo=photo, cache=replace(query.cache, views=around))
     for name, value in {
         "visible_points": lambda *_: None,

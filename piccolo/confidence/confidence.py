@@ -27,7 +27,7 @@ class Standing(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """What was compared, as in MODELS."""
+        """Key in MODELS: what the photo was compared with."""
         if self.num_matches is None:
             return "whole views alone"
         return "scan drawn at the pose" if self.is_drawn else "features of the map"

@@ -56,7 +56,7 @@ class Outcome(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """What was compared, as in MODELS."""
+        """Key in MODELS: what the photo was compared with."""
         return self.standings[0].kind
 
     def probabilities(self, model: ChoiceModel | None) -> Array:
