@@ -140,7 +140,8 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
 
 def match_poses(query: Query) -> list[Pose]:
     """Return poses from feature matches, best first; without whole views, those that the prior allows."""
-    level = query.photo.R_cam_from_level if query.settings.gravity == "known" else None
+    is_level = query.settings.gravity == "known" and (query.photo.has_tilt or not query.photo.is_partial)
+    level = query.photo.R_cam_from_level if is_level else None
     poses = [f.pose for f in propose_poses(query.matches, level, NUM_MATCHED, query.workers)]
     if query.method.uses_search:
         return poses
