@@ -9,7 +9,7 @@ from measuring.confidence import mask_outside_field
 
 from piccolo.geometry.pose import exp_so3, rotate_points, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.localization.refinement import CONE_MARGIN, Cone, find_cone, select_cells
+from piccolo.localization.cone import CONE_MARGIN, Cone, find_cone, select_cells
 from piccolo.panorama.texels import find_valid, pack_texels
 
 WIDTH = 128

@@ -17,19 +17,18 @@ from ..confidence.alternatives import (
     suppress_near,
 )
 from ..geometry.pose import Array, Pose, orthonormal
-from ..geometry.sphere import pixel_rays
 from ..geometry.suppression import non_maximum_suppression
-from ..geometry.vectors import rotate
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, inline_kernel, kernel
+from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
-from ..panorama.texels import Texels, find_valid
+from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW, Views
 from ..views.view import Cells, ViewArrays, ViewConfig
 from .comparison import compare, score_pose
+from .cone import Cone, find_cone, select_cells
 from .query import Query
 from .search import Starts
 from .settings import Beam
@@ -53,7 +52,6 @@ MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the l
 NUM_FOUND = 12  # poses of a search, at most
 PLAIN_SCORE = 0.2  # if the best has this score, poses with less than FAINT_PART of it are dropped
 FAINT_PART = 0.25
-CONE_MARGIN = math.radians(20.0)  # that a camera turns in a descent, at most
 SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
 SAME_ANGLE = math.radians(5.0)  # and this are one
 CLOSE_DISTANCE = 0.1  # [m] SAME_DISTANCE after the descent on middle cells
@@ -100,22 +98,6 @@ def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
         return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
 
     return sort_by_score(query.workers.map(refine_match, poses, "descend"))
-
-
-class Cone(NamedTuple):
-    """A cone in the camera's frame."""
-
-    axis_cam: Array  # (3,) unit vector
-    cos_angle: float  # of its half angle; -2 for the whole sphere
-
-
-def find_cone(image: Texels) -> Cone:
-    """Return the cone around what an image shows, wider by CONE_MARGIN."""
-    rays = pixel_rays(image.width)[find_valid(image)]
-    axis = rays.sum(axis=0)
-    axis /= max(float(np.linalg.norm(axis)), 1e-9)
-    angle = math.acos(np.clip((rays @ axis).min(initial=1.0), -1.0, 1.0)) + CONE_MARGIN
-    return Cone(axis, math.cos(angle) if angle < math.pi else -2.0)
 
 
 def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:
@@ -208,29 +190,6 @@ def keep_comparable(ranked: Sequence[Fit]) -> list[Fit]:
     best = max((f.score for f in ranked), default=0.0)
     least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
     return [f for f in ranked if f.score >= least]
-
-
-@inline_kernel
-def select_cells(
-    offsets: NDArray[np.int16],
-    unit: np.float32,
-    cone: Cone,
-    R_cam_from_map: Array,
-    center: Array,
-    kept: NDArray[np.int64],
-) -> int:
-    """Write the indices of the cells with offsets (3, N) that lie in a cone; return their number."""
-    axis = rotate(R_cam_from_map.T, cone.axis_cam)
-    num = 0
-    for j in range(offsets.shape[1]):
-        x = np.float32(offsets[0, j]) * unit - center[0]
-        y = np.float32(offsets[1, j]) * unit - center[1]
-        z = np.float32(offsets[2, j]) * unit - center[2]
-        along = axis[0] * x + axis[1] * y + axis[2] * z
-        if along >= cone.cos_angle * math.sqrt(x * x + y * y + z * z):
-            kept[num] = j
-            num += 1
-    return num
 
 
 @kernel

@@ -1,0 +1,54 @@
+"""A cone around what a photo shows: cells outside of it have no part in the first descents."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Array
+from ..geometry.sphere import pixel_rays
+from ..geometry.vectors import rotate
+from ..kernels.jit import inline_kernel
+from ..panorama.texels import Texels, find_valid
+
+CONE_MARGIN = math.radians(20.0)  # that a camera turns in a descent, at most
+
+
+class Cone(NamedTuple):
+    """A cone in the camera's frame."""
+
+    axis_cam: Array  # (3,) unit vector
+    cos_angle: float  # of its half angle; -2 for the whole sphere
+
+
+def find_cone(image: Texels) -> Cone:
+    """Return the cone around what an image shows, wider by CONE_MARGIN."""
+    rays = pixel_rays(image.width)[find_valid(image)]
+    axis = rays.sum(axis=0)
+    axis /= max(float(np.linalg.norm(axis)), 1e-9)
+    angle = math.acos(np.clip((rays @ axis).min(initial=1.0), -1.0, 1.0)) + CONE_MARGIN
+    return Cone(axis, math.cos(angle) if angle < math.pi else -2.0)
+
+
+@inline_kernel
+def select_cells(
+    offsets: NDArray[np.int16],
+    unit: np.float32,
+    cone: Cone,
+    R_cam_from_map: Array,
+    center: Array,
+    kept: NDArray[np.int64],
+) -> int:
+    """Write the indices of the cells with offsets (3, N) that lie in a cone; return their number."""
+    axis = rotate(R_cam_from_map.T, cone.axis_cam)
+    num = 0
+    for j in range(offsets.shape[1]):
+        x = np.float32(offsets[0, j]) * unit - center[0]
+        y = np.float32(offsets[1, j]) * unit - center[1]
+        z = np.float32(offsets[2, j]) * unit - center[2]
+        along = axis[0] * x + axis[1] * y + axis[2] * z
+        if along >= cone.cos_angle * math.sqrt(x * x + y * y + z * z):
+            kept[num] = j
+            num += 1
+    return num
