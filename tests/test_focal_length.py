@@ -118,6 +118,9 @@ def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
     result = scan().localize(rgb, focal_px=290.0, gravity="known")
     assert result.status == "not_localized"
     assert "px contradicts the given 290 +- 3 px" in result.warnings[-1]
+    far = scan().localize(rgb, focal_px=285.0)  # so far that the last fit has no crest
+    assert far.status == "not_localized"
+    assert far.warnings[-1] == "the picture contradicts the focal length given 285 +- 3 px"
 
 
 def test_an_exact_calibration_stays_exact():

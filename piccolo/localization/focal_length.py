@@ -253,18 +253,21 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
 
 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
-    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest."""
-    for k in range(MAX_CALIBRATIONS):
+    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
+
+    If the picture says nothing of it in the end, the conflict is that of the last fit in which it did.
+    """
+    conflict = 0.0
+    for k in range(MAX_CALIBRATIONS + 1):
         fit = fit_focal(query, found.best.pose, is_first=k == 0)
-        if fit.is_at_rest:
+        conflict = fit.conflict or conflict
+        if fit.is_at_rest or k == MAX_CALIBRATIONS:
             break
         query = recalibrate(query, fit.change)
         poses = [fit.move(found.best.pose), *(h.pose for h in found.alternatives)]
         moved = query.workers.map(partial(score_pose, query), poses, "compare")
         found = refine_to_the_end(query, moved)
-    else:
-        fit = fit_focal(query, found.best.pose, is_first=False)
-    return query, found, fit
+    return query, found, fit._replace(conflict=conflict)
 
 
 def recalibrate(query: Query, change: Array) -> Query:

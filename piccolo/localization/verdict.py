@@ -91,6 +91,8 @@ def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     focal = fit.focal_length(panorama)
     found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
     given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
+    if fit.conflict > MOST_CONFLICT and abs(focal.px - focal.given_px) < focal.given_std_px:
+        return (f"the picture contradicts the focal length {given} px",)
     if fit.conflict > MOST_CONFLICT:
         return (f"{found} contradicts the {given} px",)
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
