@@ -191,7 +191,9 @@ def score(
         s = sums[b]
         if s[3] <= 0.0:
             continue
-        product, energy, other = s[0], s[1], s[2]
+        product = s[0]
+        energy = s[1]
+        other = s[2]
         for k in range(4, 7):
             product -= s[k] * s[k + 3] / s[3]
             energy -= s[k] * s[k] / s[3]
