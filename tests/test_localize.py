@@ -20,6 +20,7 @@ from test_result import RESULT
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize, prepare_map
+from piccolo.confidence.localization import FocalLength
 from piccolo.result import Result
 from piccolo.scenes.scene import read_scene
 
@@ -111,12 +112,19 @@ def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
 
 
+GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
+
+
 @pytest.mark.parametrize(
     ("change", "advice"),
     [
         ({"status": "localized"}, []),
         ({"status": "ambiguous", "confidence": 0.05}, ["  to decide, give --near or --heading"]),
         ({"confidence": 0.1}, ["  to be sure, look at the --overlay, give --near"]),
+        (
+            {"status": "ambiguous", "confidence": 0.5, "focal_length": GUESSED},
+            ["  if other photos of this camera"],
+        ),
         ({"confidence": 0.09}, ["  it fits nowhere well: another scan, or bare walls?"]),
         (
             {"confidence": 0.09, "cameras": (Mount(pinhole(4, 3, 4.0)),)},

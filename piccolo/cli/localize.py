@@ -25,6 +25,7 @@ from ..jobs.memory import limit_memory
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
+from ..localization.focal_length import WIDE
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..panorama.cube import is_cube
@@ -170,6 +171,11 @@ def advise(result: Result) -> list[str]:
     is_ruled_out = result.best_pose is None or result.confidence == 0.0
     if result.status == LOCALIZED or is_ruled_out or result.probability_none is None:
         return []
+    focal = result.focal_length
+    if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:
+        return [
+            "  if other photos of this camera are localized, repeat with --focal, the mean of what they find"
+        ]
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
     if result.confidence >= MIN_FIT:

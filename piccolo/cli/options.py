@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     group = parser.add_argument_group("files")
     option(group, "--out FILE", "append the JSON lines to this file; a repeated command continues")
     option(group, "--overwrite", "replace the file of --out instead of continuing it")
-    folder = "a folder if there are several photos"
+    folder = "an existing folder if there are several photos"
     text = "the photo, the cloud seen from its pose, and a checkerboard of both; "
     option(group, "--overlay PNG", text + folder)
     text = "mask of the photo's size: white contradicts the scan, grey was not scanned, black elsewhere; "
