@@ -241,7 +241,8 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
 def test_poses_of_a_part_of_the_sphere_are_verified(monkeypatch, photo, expected):
     """The best and seven alternatives; what matches more than chance does is added, scored where it went."""
     num_matches = {0.0: 6, 1.0: 7, 8.0: 99}
-    asked, scored = [], []
+    asked = []
+    scored = []
 
     def verify(query, pose):
         asked.append(place(pose))

@@ -181,26 +181,32 @@ MISSES = _support(0.0, 1.0, False)
 
 def test_one_sure_photo_is_enough_beside_misses():
     bundles = [[_support(0.999, 1e-3), MISSES, MISSES], [_support(1e-3, 0.999), MISSES, MISSES]]
-    probabilities = weigh_bundles(bundles)
+    probabilities = weigh_bundles(bundles, 30)
     assert probabilities[0] > 0.98
     assert probabilities.sum() == pytest.approx(1.0)
-    many = weigh_bundles([[*bundles[0], *[MISSES] * 20]])  # bare walls lie together, and count as one
-    assert many[0] == pytest.approx(weigh_bundles(bundles[:1])[0])
+    many = weigh_bundles([[*bundles[0], *[MISSES] * 20]], 30)  # bare walls lie together, and count as one
+    assert many[0] == pytest.approx(weigh_bundles(bundles[:1], 30)[0])
 
 
 def test_weak_photos_that_coincide_beat_a_stronger_one():
     weak = [_support(0.3, 0.7)] * 4
     strong = [_support(0.8, 0.2), MISSES, MISSES, MISSES]
-    together, alone, _ = weigh_bundles([weak, strong])
+    together, alone, _ = weigh_bundles([weak, strong], 30)
     assert together > 0.99
     assert alone < 0.01
-    assert weigh_bundles([weak[:1]])[0] < 0.5
+    assert weigh_bundles([weak[:1]], 30)[0] < 0.5
+
+
+def test_two_poses_that_coincide_among_many_may_do_so_by_chance():
+    pair = [_support(0.02, 0.98), _support(0.02, 0.98), MISSES]
+    assert weigh_bundles([pair], 50)[0] < 0.5
+    assert weigh_bundles([pair], 1)[0] > 0.9
 
 
 def test_where_nothing_is_found_none_is_likely():
-    assert weigh_bundles([]).tolist() == [1.0]
-    assert weigh_bundles([[MISSES] * 3])[-1] > 0.9
-    assert np.isfinite(weigh_bundles([[_support(1.0, 1e-6)] * 300, [MISSES] * 300])).all()
+    assert weigh_bundles([], 0).tolist() == [1.0]
+    assert weigh_bundles([[MISSES] * 3], 30)[-1] > 0.9
+    assert np.isfinite(weigh_bundles([[_support(1.0, 1e-6)] * 300, [MISSES] * 300], 30)).all()
 
 
 def _members(far):

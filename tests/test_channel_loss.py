@@ -92,7 +92,8 @@ def test_moments_of_each_block_are_over_what_both_show():
     arguments, (shown, levels, w, blocks) = _blockwise()
     sums = np.empty((NUM_BLOCKS, NUM_MOMENTS))
     correlate(*arguments, sums)
-    a, b = levels - 127.5, shown - 127.5
+    a = levels - 127.5
+    b = shown - 127.5
     products = np.stack([(a * b).sum(axis=0), (a * a).sum(axis=0), (b * b).sum(axis=0)])
     terms = w * np.concatenate([products, np.ones((1, len(w))), a, b])
     expected = [[term[blocks == block].sum() for term in terms] for block in range(NUM_BLOCKS)]

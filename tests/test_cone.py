@@ -71,7 +71,8 @@ def test_no_cell_is_left_out_that_the_photo_shows_after_a_move_within_the_margin
         angle = rng.uniform(0.0, CONE_MARGIN - PIXEL)  # a pixel's corner lies beyond its middle
         moved_center = center + rng.uniform(0.0, 0.3) * way / np.linalg.norm(way)
         turned = exp_so3(angle * axis / np.linalg.norm(axis)) @ R
-        before, after = points - center, points - moved_center
+        before = points - center
+        after = points - moved_center
         cosines = (before * after).sum(axis=1)
         cosines /= np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
         is_within = np.arccos(np.clip(cosines, -1, 1)) + angle < CONE_MARGIN - PIXEL

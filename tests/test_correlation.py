@@ -67,7 +67,8 @@ def test_sums_of_a_search_are_exact():
     expected = masked_correlation(features.reshape(50, -1), seen, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
     shuffled = TurnedPanorama(*(values[..., cells] for values in panorama[:4]), panorama.most_seen)
-    features, seen = features[views][..., cells].reshape(50, -1), seen[views][:, cells]
+    features = features[views][..., cells].reshape(50, -1)
+    seen = seen[views][:, cells]
     found = masked_correlation(features, seen, shuffled, Workers(1))
     np.testing.assert_array_equal(found, expected[views])
 

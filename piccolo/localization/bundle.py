@@ -101,7 +101,8 @@ def localize_bundle(
     if not bundles:
         return alone
     tested = [{k: find_support(member, bundle) for k, member in members.items()} for bundle in bundles]
-    probabilities = weigh_bundles([list(supports.values()) for supports in tested])
+    num_proposed = sum(len(member.own_poses) for member in members.values())
+    probabilities = weigh_bundles([list(supports.values()) for supports in tested], num_proposed)
     order = np.argsort(-probabilities[:-1], kind="stable")
     ranked = probabilities[[*order, -1]]
     own = {k: estimate_own(members[k], support) for k, support in tested[order[0]].items()}
@@ -188,19 +189,21 @@ def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
     return [score_pose(query, pose) for pose in (*near, expected)]
 
 
-def weigh_bundles(supports: Sequence[Sequence[Support]]) -> Array:
+def weigh_bundles(supports: Sequence[Sequence[Support]], num_proposed: int) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
     The photos are independent evidence. Those that have missed a pose count as one: bare walls and changed
-    places lie together.
+    places lie together. Photos that have found the same pose of the bundle are more than chance, if they are
+    more than chance would give among all poses that were proposed.
     """
     logits = []
     for of_one in supports:
         p = np.array([s.probability for s in of_one])
         none = np.array([s.probability_none for s in of_one])
         missed = np.log((p + MISSED * none) / (p + none)).min()
-        num_found = sum(s.is_found for s in of_one)
-        logits.append(np.log((p + none) / none).sum() + missed - (num_found - 1) * math.log(CHANCE))
+        gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE)
+        coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
+        logits.append(np.log((p + none) / none).sum() + missed + coincidence)
     odds = np.exp(np.array([*logits, 0.0]) - max([*logits, 0.0]))
     return np.asarray(odds / odds.sum())
 
