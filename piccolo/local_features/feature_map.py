@@ -14,6 +14,7 @@ from ..geometry.vectors import minus, row
 from ..jobs.threads import Workers
 from ..kernels.jit import inline_kernel, kernel
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
+from .perspective_view import cover_sphere
 from .view_image import render_gray
 
 VIEW_WIDTH = 640  # [px] of the views
@@ -79,7 +80,7 @@ def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> Fe
     """Find the features seen from a centre (3,) [m] whose ray meets the scan within MAX_RANGE."""
     is_drawn = np.ones((VIEW_WIDTH // 2, VIEW_WIDTH), np.bool_)
     image = render_gray(octree, Pose(np.eye(3), center_map), is_drawn)
-    found = find_keypoints(image.gray, image.is_filled)
+    found = find_keypoints(image.gray, image.is_filled, cover_sphere(VIEW_WIDTH))
     ranges = image.ranges[compute_indices(found.rays, VIEW_WIDTH)]
     kept = np.flatnonzero((ranges > 0.0) & (ranges < MAX_RANGE))
     found = found.take(kept)

@@ -1,7 +1,7 @@
 """Grey pictures of the scan from a position, to find keypoints in: surfaces closed, small gaps filled."""
 
 import math
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -11,8 +11,8 @@ from ..cloud.octree import Octree, collect, find_level
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel
 from ..geometry.vectors import rotate
-from ..kernels.jit import F0, F1, HALF, kernel
-from ..views.view import thread_scratch
+from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
+from ..views.view import Scratch, thread_scratch
 
 VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
 REACH = np.float32(0.7)  # half width of what is drawn for a voxel, divided by the voxel's width
@@ -25,59 +25,100 @@ WIDER = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
 LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
 NOTHING = np.float32(1e30)
+NEAREST = np.float32(0.1)  # cosine of the angle between a pinhole's axis and what it shows, at least
 Floats = NDArray[np.floating[Any]]
 
 
 class ViewImage(NamedTuple):
-    """The scan seen from a pose, equirectangular, in the camera's axes."""
+    """The scan seen from a pose: a sphere's or a pinhole's picture, in the camera's axes."""
 
     gray: NDArray[np.uint8]  # (H, W)
     is_filled: NDArray[np.bool_]  # (H, W) where the grey means something
     ranges: NDArray[np.float32]  # (H, W) [m], 0 where nothing is seen
 
 
+@inline_kernel
+def project(
+    x: np.float32, y: np.float32, z: np.float32, r: np.float32, focal: np.float32, height: int, width: int
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the pixel u, v of a direction of length r, the pixels a radian there, and its radius.
+
+    `focal` [px] is a pinhole's, whose pixel is (-1, -1) behind it, and the radius r. With 0 the picture is the
+    sphere's, stretched across by r / radius.
+    """
+    if focal > F0:
+        if x < NEAREST * r:
+            return -F1, -F1, focal, r
+        u = HALF * np.float32(width) - focal * y / x
+        return u, HALF * np.float32(height) - focal * z / x, focal * r / x, r
+    rho: Any = math.sqrt(x * x + y * y)  # compiled, float32
+    u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
+    return u, v, np.float32(width / (2.0 * math.pi)), rho
+
+
 @kernel
-def draw_voxels(
+def project_voxels(
     tree: Octree,
     center: Array,
     R_cam_from_map: NDArray[np.float32],
+    focal: np.float32,
     is_drawn: NDArray[np.bool_],
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
-    ranges: NDArray[np.float32],
-    sums: NDArray[np.float32],
+    scratch: Scratch,
+) -> int:
+    """Project the voxels whose middles a mask (H, W) of the picture shows, and return their number.
+
+    Of each voxel `scratch` gets the node, as `directions` the pixel u, v and the range, and as `ranges` and
+    `turns` half of the height and of the width that is drawn for it [px].
+    """
+    height, width = is_drawn.shape
+    nodes, pixels, up, across = scratch.nodes, scratch.directions, scratch.ranges, scratch.turns
+    count = collect(tree, center, VOXEL_PER_RANGE, nodes, pixels)
+    num = 0
+    for k in range(count):
+        x, y, z = rotate(R_cam_from_map, (pixels[0, k], pixels[1, k], pixels[2, k]))
+        r: Any = math.sqrt(x * x + y * y + z * z)
+        u, v, px_per_rad, rho = project(x, y, z, r, focal, height, width)
+        if u < F0 or v < F0 or (focal > F0 and (u >= np.float32(width) or v >= np.float32(height))):
+            continue
+        if not is_drawn[min(int(v), height - 1), min(int(u), width - 1)]:
+            continue
+        level = find_level(tree, nodes[k])
+        size = np.float32(tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - level))
+        reach = REACH * size / max(r, np.float32(0.05)) * px_per_rad
+        up[num] = min(max(reach, LEAST_REACH), MOST_REACH)
+        across[num] = min(up[num] * r / max(rho, np.float32(1e-3)), np.float32(0.25) * np.float32(width))
+        pixels[0, num] = u
+        pixels[1, num] = v
+        pixels[2, num] = r
+        nodes[num] = nodes[k]
+        num += 1
+    return num
+
+
+@kernel
+def draw_voxels(
+    tree: Octree, scratch: Scratch, count: int, wraps: bool, ranges: NDArray[np.float32], sums: NDArray[np.float32]
 ) -> None:
     """Write the nearest range (H, W), and sums (H, W, 2) of weighted grey and of weights near that range.
 
-    Voxels whose middle is not in `is_drawn` (H, W) are left out. `found` (N,) and `directions` (3, N) are
-    scratch for `collect`.
+    `scratch` holds `count` voxels from `project_voxels`. A picture that wraps continues at the other side.
     """
     height, width = ranges.shape
-    count = collect(tree, center, VOXEL_PER_RANGE, found, directions)
     ranges[:] = NOTHING
     sums[:] = F0
-    W = np.float32(width)
-    px_per_rad = np.float32(width / (2.0 * math.pi))
     for is_second in range(2):
         for k in range(count):
-            x, y, z = rotate(R_cam_from_map, (directions[0, k], directions[1, k], directions[2, k]))
-            rho: Any = math.sqrt(x * x + y * y)  # compiled, float32
-            r: Any = math.sqrt(x * x + y * y + z * z)
-            node = tree.nodes[found[k]]
-            size = np.float32(
-                tree.leaf_size * 2.0 ** (len(tree.level_start) - 2 - find_level(tree, found[k]))
-            )
-            reach = REACH * size / max(r, np.float32(0.05)) * px_per_rad
-            reach = min(max(reach, LEAST_REACH), MOST_REACH)
-            across = min(reach * r / max(rho, np.float32(1e-3)), np.float32(0.25) * W)
-            u, v = direction_to_pixel(x, y, z, rho, W)
-            if not is_drawn[min(int(v), height - 1), min(int(u), width - 1)]:
-                continue
+            u, v, r = scratch.directions[0, k], scratch.directions[1, k], scratch.directions[2, k]
+            reach, across = scratch.ranges[k], scratch.turns[k]
+            node = tree.nodes[scratch.nodes[k]]
             gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
             top: Any = max(np.int32(math.ceil(v - reach - HALF)), 0)
             bottom: Any = min(np.int32(math.floor(v + reach - HALF)), height - 1)
-            left = np.int32(math.ceil(u - across - HALF))
-            right = np.int32(math.floor(u + across - HALF))
+            left: Any = np.int32(math.ceil(u - across - HALF))
+            right: Any = np.int32(math.floor(u + across - HALF))
+            if not wraps:
+                left = max(left, 0)
+                right = min(right, width - 1)
             for i in range(top, bottom + 1):
                 dv = (np.float32(i) + HALF - v) / reach
                 for at in range(left, right + 1):
@@ -93,15 +134,17 @@ def draw_voxels(
                         sums[i, j, 1] += weight
 
 
-def is_in_front(ranges: NDArray[np.float32]) -> NDArray[np.bool_]:
+def is_in_front(ranges: NDArray[np.float32], wraps: bool = True) -> NDArray[np.bool_]:
     """Return the mask (H, W) of the pixels that are not seen through a gap in a nearer surface.
 
     `ranges` (H, W) are the nearest, NOTHING where there is none. A pixel is seen through a gap if every wider
     pixel around it shows something much nearer.
     """
-    height, width = ranges.shape
-    nearest = ranges.reshape(height // WIDER, WIDER, width // WIDER, WIDER).min(axis=(1, 3))
-    around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode="wrap"), ((1, 1), (0, 0)), mode="edge")
+    nearest = ranges[::WIDER, ::WIDER].copy()
+    for i, j in np.ndindex(WIDER, WIDER):
+        np.minimum(nearest, ranges[i::WIDER, j::WIDER], out=nearest)
+    beside: Literal["wrap", "edge"] = "wrap" if wraps else "edge"
+    around = np.pad(np.pad(nearest, ((0, 0), (1, 1)), mode=beside), ((1, 1), (0, 0)), mode="edge")
     farthest = cv2.dilate(around, np.ones((3, 3), np.uint8))[1:-1, 1:-1]
     limit = np.repeat(np.repeat(farthest, WIDER, axis=0), WIDER, axis=1)
     return np.asarray((ranges < NOTHING) & (ranges <= limit * BEHIND))
@@ -134,15 +177,21 @@ def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
-def render_gray(octree: Octree, pose: Pose, is_drawn: NDArray[np.bool_]) -> ViewImage:
-    """Draw the scan at a pose in the map, where the mask (H, 2 H) says so, and a little beyond."""
+def render_gray(octree: Octree, pose: Pose, is_drawn: NDArray[np.bool_], focal: float = 0.0) -> ViewImage:
+    """Draw the scan at a pose in the map, where the mask (H, W) says so, and a little beyond.
+
+    The picture is a pinhole's with the focal length `focal` [px], or the sphere's, W = 2 H, if it is 0. Sides
+    are multiples of 16 pixels.
+    """
     scratch = thread_scratch()
     ranges = np.empty(is_drawn.shape, np.float32)
     sums = np.empty((*is_drawn.shape, 2), np.float32)
     center = np.asarray(pose.center_world, np.float64)
     R = np.asarray(pose.R_cam_from_world, np.float32)
-    draw_voxels(octree, center, R, is_drawn, scratch.nodes, scratch.directions, ranges, sums)
-    weight = is_in_front(ranges).astype(np.float32)
+    wraps = focal == 0.0
+    count = project_voxels(octree, center, R, np.float32(focal), is_drawn, scratch)
+    draw_voxels(octree, scratch, count, wraps, ranges, sums)
+    weight = is_in_front(ranges, wraps).astype(np.float32)
     gray = weight * sums[..., 0] / np.maximum(sums[..., 1], np.float32(1e-6))
     filled, is_filled = fill_gaps(gray, weight)
     levels = np.rint(np.clip(filled, 0.0, 1.0) * np.float32(255.0)).astype(np.uint8)

@@ -15,7 +15,6 @@ from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, propose_poses
-from ..local_features.keypoints import HALVES
 from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.prior import Prior
@@ -35,9 +34,8 @@ FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
 NUM_SCORED = 64  # starts, if only the best score is needed
-ALL_HALVES = len(HALVES)
 NUM_VERIFIED = 7  # alternatives of the best pose that are verified
-ENOUGH_MATCHES = 40  # of half of the features: the other half is not asked
+ENOUGH_MATCHES = 40  # of a part of the features: the others are not asked
 CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NUM_MATCHED = 6  # poses from matches that are refined
 
@@ -47,25 +45,26 @@ Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Found]
 
 
 def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
-    """Return the searches for a photo in order, each with the number of feature halves that it matches.
+    """Return the searches for a photo in order, each with the number of parts of the features that it matches.
 
-    A first look by whole views (0 halves) may settle a whole upright sphere. Then come poses from feature
-    matches, first of one half of the views, then of both, and at last searches by whole views: with gravity
+    A first look by whole views (0 parts) may settle a whole upright sphere. Then come poses from feature
+    matches, first of a part of the views, then of all, and at last searches by whole views: with gravity
     `auto` as known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly
     taken about level: unless their tilt is known exactly, this is what is searched as known.
     """
     method = query.method
+    num_parts = len(query.features)
     looks_first = method.uses_features and method.uses_search and is_whole(query)
     attempts: list[tuple[int, Attempt]] = [(0, look_first)] if looks_first else []
     if method.uses_features:
-        attempts += [(num_halves, search_matches) for num_halves in (1, ALL_HALVES)]
+        attempts += [(k + 1, search_matches) for k in range(num_parts)]
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
         upright: SearchedGravity = "level" if is_partial and not query.photo.has_tilt else "known"
-        attempts.append((ALL_HALVES, partial(search_views, gravity=upright)))
+        attempts.append((num_parts, partial(search_views, gravity=upright)))
     if method.uses_search and query.settings.gravity != "known":
         with_any_tilt = partial(search_views, gravity="unknown", is_brief=looks_first)
-        attempts.append((ALL_HALVES, with_any_tilt))
+        attempts.append((num_parts, with_any_tilt))
     return attempts
 
 
@@ -84,16 +83,16 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found
 def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
     """Refine the poses that feature matches vote for; True if the result is sure.
 
-    Poses from half of the features are dropped unless they are sure: all features find better ones.
+    Poses from a part of the features are dropped unless they are sure: all features find better ones.
     """
     with watch.stage("match"):
         poses = match_poses(query)
-        is_half = query.num_halves < ALL_HALVES
-        if is_half and (not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES):
+        is_part = query.num_parts < len(query.features)
+        if is_part and (not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES):
             return known, False
         found = known + add_verified(query, refine_matches(query, poses))
         is_enough = is_sure(query, found)
-        return known if is_half and not is_enough else found, is_enough
+        return known if is_part and not is_enough else found, is_enough
 
 
 def search_views(

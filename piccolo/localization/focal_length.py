@@ -277,13 +277,13 @@ def recalibrate(query: Query, change: Array) -> Query:
     after = before.with_camera(change_camera(before.camera, change))
     taken = given.resample(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
-    features = tuple(Once(partial(_turn_features, half, before, after)) for half in query.features)
-    return replace(fresh, features=features, num_halves=query.num_halves)
+    features = tuple(Once(partial(_turn_features, part, before, after)) for part in query.features)
+    return replace(fresh, features=features, num_parts=query.num_parts)
 
 
-def _turn_features(half: Once[Features], before: Mount, after: Mount) -> Features:
+def _turn_features(part: Once[Features], before: Mount, after: Mount) -> Features:
     """Give the features the rays that another calibration gives to their pixels."""
-    found = half()
+    found = part()
     keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
     return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
 

@@ -77,8 +77,8 @@ def find_pose(
     # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, query.photo.colors):
         hypotheses: list[Hypothesis] = []
-        for num_halves, attempt in plan_attempts(query):
-            query = replace(query, num_halves=num_halves)
+        for num_parts, attempt in plan_attempts(query):
+            query = replace(query, num_parts=num_parts)
             hypotheses, is_enough = attempt(query, hypotheses, watch)
             if is_enough:
                 break

@@ -14,13 +14,14 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
-from ..local_features.keypoints import HALVES, Keypoints, find_keypoints, join_keypoints
+from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches, match
+from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere, view_around
 from ..panorama import Panorama
 from ..panorama.gpano import attitude_of_gravity, rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
-from ..panorama.texels import Texels, pack_texels
+from ..panorama.texels import Texels, find_valid, pack_texels
 from ..scan_map.scan_map import ScanMap
 from ..views.points_around import RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
@@ -109,20 +110,21 @@ class Query:
     settings: CoarseToFineSettings
     workers: Workers
     method: MethodConfig
-    features: tuple[Once[Features], ...]  # of half of the photo's views each
+    features: tuple[Once[Features], ...]  # of a part of the photo's views each
+    views: tuple[PerspectiveView, ...]  # in which the features are found
     cache: Cache
-    num_halves: int = len(HALVES)  # of the features that are matched; 0 with whole views alone
+    num_parts: int  # of the features that are matched; 0 with whole views alone
 
     @cached_property
     def keypoints(self) -> Keypoints:
         """Keypoints of the photo."""
-        return join_keypoints([half().keypoints for half in self.features[: self.num_halves]])
+        return join_keypoints([part().keypoints for part in self.features[: self.num_parts]])
 
     @cached_property
     def matches(self) -> Matches:
         """Keypoints of the photo matched with features of the map."""
-        halves = [half() for half in self.features[: self.num_halves]]
-        return join_matches([h.matches for h in halves], [len(h.keypoints.rays) for h in halves])
+        parts = [part() for part in self.features[: self.num_parts]]
+        return join_matches([p.matches for p in parts], [len(p.keypoints.rays) for p in parts])
 
     def mask_pixels(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """Mask pixels (h, 2 h) of the photo, and normalise the rest again."""
@@ -176,14 +178,27 @@ def prepare_query(
         math.tau / min(panorama.rgb.shape[1], width),
     )
     photo.images.search()  # each search begins with it
-    features = tuple(Once(partial(find_features, resized, scan_map, workers, views)) for views in HALVES)
-    return Query(photo, scan_map, settings, workers, method, features, Cache(RecentViews(scan_map.octree)))
+    parts = find_parts(photo)
+    features = tuple(Once(partial(find_features, resized, scan_map, workers, views)) for views in parts)
+    cache = Cache(RecentViews(scan_map.octree))
+    views = tuple(view for part in parts for view in part)
+    return Query(photo, scan_map, settings, workers, method, features, views, cache, len(features))
 
 
-def find_features(panorama: Panorama, scan_map: ScanMap, workers: Workers, views: Sequence[int]) -> Features:
+def find_parts(photo: Photo) -> list[list[PerspectiveView]]:
+    """Return the views in which a photo's features are found: one if it shows all, or two halves of many."""
+    width = photo.panorama.rgb.shape[1]
+    around = view_around(find_valid(photo.small), width / math.tau, width)
+    every = cover_sphere(width)
+    return [[around]] if around else [[every[k] for k in half] for half in HALVES]
+
+
+def find_features(
+    panorama: Panorama, scan_map: ScanMap, workers: Workers, views: Sequence[PerspectiveView]
+) -> Features:
     """Find the features in several views of a panorama, and match them to the map."""
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
-    keypoints = find_keypoints(gray, panorama.is_valid, workers, views)
+    keypoints = find_keypoints(gray, panorama.is_valid, views, workers)
     return Features(keypoints, match(keypoints, scan_map.features_now(workers), workers))
 
 

@@ -64,7 +64,7 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     standings = []
     for h, wrong in zip(hypotheses, is_wrong, strict=True):
-        num_matches = count_agreeing(query, h.pose) if query.num_halves else None
+        num_matches = count_agreeing(query, h.pose) if query.num_parts else None
         is_drawn = query.photo.is_partial
         standings.append(Standing(1.0, h.score, num_matches, log_prior if wrong else 0.0, is_drawn))
     return standings

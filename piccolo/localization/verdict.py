@@ -111,8 +111,8 @@ def collect_evidence(
         explained_fraction=fractions[0],
         contradicted_fraction=fractions[1],
         seen_fraction=agreement.seen_fraction,
-        num_matches=num_matches[0] if query.num_halves else None,
-        alternative_matches=max(num_matches[1:], default=0) if query.num_halves else None,
+        num_matches=num_matches[0] if query.num_parts else None,
+        alternative_matches=max(num_matches[1:], default=0) if query.num_parts else None,
     )
 
 
@@ -122,7 +122,7 @@ def is_mirrored(query: Query, best: Hypothesis) -> bool:
     Symmetric scenes match in a mirror too, but no better. The test is skipped for a pose that explains nearly
     all of the photo, and after a first look, which has compared the mirrored photo itself.
     """
-    if best.score >= ENOUGH_EXPLAINED or not query.num_halves:
+    if best.score >= ENOUGH_EXPLAINED or not query.num_parts:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
     found = propose_poses(matches, None, 1, query.workers)

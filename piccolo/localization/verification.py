@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
-from ..geometry.sphere import compute_indices
 from ..local_features.hypotheses import count_matches, exact_pose
-from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
+from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import Matches
+from ..local_features.perspective_view import PerspectiveView
 from ..local_features.view_image import render_gray
 from .query import Query
 
@@ -43,7 +43,7 @@ def count_agreeing(query: Query, pose: Pose) -> int:
     Features of a photo of a part of the sphere are matched with the scan drawn at the pose, those of others
     with the map's features.
     """
-    if not (query.photo.is_partial and query.num_halves):
+    if not (query.photo.is_partial and query.num_parts):
         return count_matches(query.matches, pose)
     verified = verify(query, pose)
     return verified.num_matches if is_near(verified.pose, pose) else 0
@@ -77,16 +77,11 @@ def matches_near(query: Query, pose: Pose) -> Matches:
 
 def match_drawn(query: Query, pose: Pose) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
-    is_valid = query.photo.panorama.is_valid
-    is_drawn = cv2.dilate(is_valid.view(np.uint8), np.ones((2 * AROUND + 1,) * 2, np.uint8)) > 0
-    image = render_gray(query.scan_map.octree, pose, is_drawn)
-    drawn = find_keypoints(image.gray, image.is_filled & is_drawn)
-    ranges = image.ranges[compute_indices(drawn.rays, is_valid.shape[1])]
-    is_seen = np.flatnonzero(ranges > 0.0)
-    drawn = drawn.take(is_seen)
-    own = join_keypoints([half().keypoints for half in query.features])
+    own = join_keypoints([part().keypoints for part in query.features])
+    parts = [find_drawn(query, pose, view) for view in query.views]
+    drawn = join_keypoints([keypoints for keypoints, _ in parts])
     mine, theirs = match_pictures(own, drawn)
-    ranges = ranges[is_seen][theirs]
+    ranges = np.concatenate([ranges for _, ranges in parts])[theirs]
     R_map_from_cam = pose.R_cam_from_world.T
     directions = rotate_points(drawn.rays[theirs].astype(np.float64), R_map_from_cam)
     tangents = rotate_points(drawn.tangents[theirs].astype(np.float64), R_map_from_cam)
@@ -101,6 +96,17 @@ def match_drawn(query: Query, pose: Pose) -> Matches:
         drawn.sizes[theirs] * ranges,
         np.ones(len(mine), np.float32),
     )
+
+
+def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, NDArray[np.float32]]:
+    """Draw what a view of the photo would show at a pose; return the keypoints, and their ranges (N,) [m]."""
+    shown = cv2.dilate(view.cut_mask(query.photo.panorama.is_valid), np.ones((2 * AROUND + 1,) * 2, np.uint8))
+    R_view_from_map = view.R_sphere_from_view.T @ pose.R_cam_from_world
+    image = render_gray(query.scan_map.octree, Pose(R_view_from_map, pose.center_world), shown > 0, view.focal)
+    found = find_in_view(image.gray, image.is_filled.view(np.uint8) * shown, view)
+    ranges = image.ranges[view.project(found.rays)]
+    is_seen = np.flatnonzero(ranges > 0.0)
+    return found.take(is_seen), ranges[is_seen]
 
 
 def match_pictures(own: Keypoints, drawn: Keypoints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

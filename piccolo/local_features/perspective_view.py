@@ -1,0 +1,109 @@
+"""Perspective views of a sphere's picture: a set that covers the sphere, or one around what a photo shows."""
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Array
+from ..geometry.sphere import compute_pixels, pixel_rays
+
+FIELD_DEG = 65.0  # of a view of the set, across
+MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
+# azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
+VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
+VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
+HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
+STRETCH = 1.2  # tangent of the angle between the middle of a view around a photo and its edge, at most
+AROUND = 0.07  # [rad] that such a view shows more than the photo
+MULTIPLE = 16  # [px] of the sides of such a view
+
+
+class PerspectiveView(NamedTuple):
+    """A perspective view (h, w) of a sphere's picture."""
+
+    R_sphere_from_view: Array  # (3, 3), +x the view's middle, +y left, +z up
+    focal: float  # [px]
+    columns: NDArray[np.float32]  # (h, w) of each pixel in the sphere's picture with its margin
+    rows: NDArray[np.float32]
+    is_own: NDArray[np.uint8]  # (h, w) 255 where no other view's middle is nearer, and a little beyond
+    middles: Array  # (N, 3) of the views of the set
+    index: int  # of this one
+
+    def cut(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        """Cut the view (h, w) out of a sphere's picture (H, W)."""
+        return np.asarray(cv2.remap(add_margin(picture), self.columns, self.rows, cv2.INTER_LINEAR), np.uint8)
+
+    def cut_mask(self, is_valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+        """Cut the view (h, w) out of a sphere's mask (H, W): 255 where it is valid."""
+        mask = add_margin(is_valid.view(np.uint8) * np.uint8(255))
+        return np.asarray(cv2.remap(mask, self.columns, self.rows, cv2.INTER_NEAREST), np.uint8)
+
+    def find_own(self, rays: NDArray[np.floating]) -> NDArray[np.int64]:
+        """Return the indices of the directions (N, 3) that are nearer to this middle than to any other."""
+        return np.flatnonzero(np.argmax(rays @ self.middles.T, axis=1) == self.index)
+
+    def project(self, rays: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Return rows and columns (N,) of the pixels that contain directions (N, 3) of the sphere."""
+        height, width = self.is_own.shape
+        x, y, z = (rays @ self.R_sphere_from_view).T
+        v = (0.5 * height - self.focal * z / x).astype(np.int64)
+        u = (0.5 * width - self.focal * y / x).astype(np.int64)
+        return np.clip(v, 0, height - 1), np.clip(u, 0, width - 1)
+
+
+@lru_cache(maxsize=4)
+def cover_sphere(width: int) -> list[PerspectiveView]:
+    """Return the perspective views of a sphere's picture of `width`, with its resolution in their middles."""
+    reach = math.tan(math.radians(FIELD_DEG / 2.0))
+    side = round(2.0 * reach * width / (2.0 * math.pi))
+    turns = []
+    for angles in np.radians(VIEWS_DEG):
+        (c, ce), (s, se) = np.cos(angles), np.sin(angles)
+        turns.append(np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]]))
+    middles = np.stack(turns)[:, :, 0]
+    focal = 0.5 * side / reach
+    return [make_view(R, focal, (side, side), width, middles, k) for k, R in enumerate(turns)]
+
+
+def view_around(is_valid: NDArray[np.bool_], focal: float, width: int) -> PerspectiveView | None:
+    """Return a view of all that a mask (H, W) of the sphere shows, None if that is too wide for a picture.
+
+    The view is one of a sphere's picture of `width`, and has a focal length [px] of its own.
+    """
+    rays = pixel_rays(is_valid.shape[1])[is_valid]
+    middle = rays.sum(axis=0)
+    middle /= max(float(np.linalg.norm(middle)), 1e-9)
+    up = np.array([0.0, 0.0, 1.0]) if abs(middle[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
+    left = np.cross(up, middle)
+    left /= np.linalg.norm(left)
+    R_sphere_from_view = np.stack([middle, left, np.cross(middle, left)], axis=1)
+    local = rays @ R_sphere_from_view
+    if not len(rays) or local[:, 0].min() <= 1.0 / math.hypot(1.0, STRETCH):
+        return None
+    half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + AROUND for k in (1, 2))
+    shape = tuple(math.ceil(2.0 * focal * half / MULTIPLE) * MULTIPLE for half in (half_height, half_width))
+    return make_view(R_sphere_from_view, focal, (shape[0], shape[1]), width, middle[None], 0)
+
+
+def make_view(
+    R_sphere_from_view: Array, focal: float, shape: tuple[int, int], width: int, middles: Array, index: int
+) -> PerspectiveView:
+    """Make a view of `shape` (h, w) and a focal length [px] of a sphere's picture of `width`."""
+    height, across = shape
+    left, up = np.meshgrid(
+        (0.5 * across - 0.5 - np.arange(across)) / focal, (0.5 * height - 0.5 - np.arange(height)) / focal
+    )
+    rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
+    columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
+    is_nearest = np.argmax(rays @ middles.T, axis=-1) == index
+    own = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
+    return PerspectiveView(R_sphere_from_view, focal, columns, rows, np.asarray(own, np.uint8), middles, index)
+
+
+def add_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Pad a picture by MARGIN: columns wrap at the seam, the first and the last row are repeated."""
+    return np.pad(np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap"), ((MARGIN, MARGIN), (0, 0)), "edge")
