@@ -7,10 +7,12 @@ import numpy as np
 
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Once, Workers
+from piccolo.local_features.keypoints import join_keypoints
+from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import last_descent, selection
 from piccolo.localization.comparison import Comparison
-from piccolo.localization.query import Cache, Query
+from piccolo.localization.query import Cache, Features, Query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
 
@@ -19,14 +21,17 @@ PARTIAL = SimpleNamespace(is_partial=True, has_tilt=False)
 TILTED_WHOLE = SimpleNamespace(is_partial=False, has_tilt=True)
 TILTED_PARTIAL = SimpleNamespace(is_partial=True, has_tilt=True)
 VIEWS = SimpleNamespace(averages=lambda *_: None, points=lambda *_: None, surroundings=lambda *_: None)
+NO_FEATURES = Once(lambda: Features(join_keypoints([]), NO_MATCHES))
 QUERY = Query(
     photo=WHOLE,
     scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose),
     settings=CoarseToFineSettings(),
     workers=Workers(1),
     method=METHOD,
-    features=(),
+    features=(NO_FEATURES, NO_FEATURES),
+    views=(),
     cache=Cache(VIEWS),
+    num_parts=2,
 )
 
 

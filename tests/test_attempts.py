@@ -71,7 +71,7 @@ def test_features_are_asked_of_what_is_not_clear(how):
 )
 def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
     other = score * (1.0 - margin)
-    asked = replace(compared(monkeypatch, {0.0: score, 3.0: other}, {}), num_halves=0)
+    asked = replace(compared(monkeypatch, {0.0: score, 3.0: other}, {}), num_parts=0)
     assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
 
 
@@ -196,20 +196,20 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     """What is found adds up, and as many features are asked in the end as in the last attempt."""
 
     def run(query, hypotheses, watch):
-        return [*hypotheses, at(query.num_halves, 0.5)], query.num_halves == sure
+        return [*hypotheses, at(query.num_parts, 0.5)], query.num_parts == sure
 
     made = [(k, run) for k in (1, 2, 0)]
     monkeypatch.setattr(method, "plan_attempts", lambda query: made)
     monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
-    monkeypatch.setattr(method, "judge", lambda query, found, fit: (query.num_halves, found))
+    monkeypatch.setattr(method, "judge", lambda query, found, fit: (query.num_parts, found))
     how = CoarseToFineSettings(), Workers(1), Stopwatch()
-    num_halves, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
+    num_parts, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
     assert places(found) == [1, 2, 0][:num_made]
-    assert num_halves == places(found)[-1]
+    assert num_parts == places(found)[-1]
 
 
 @pytest.mark.parametrize(
-    ("num_halves", "num_matches", "is_sure", "kept"),
+    ("num_parts", "num_matches", "is_sure", "kept"),
     [
         (1, 40, True, [9, 1]),
         (1, 39, True, [9]),
@@ -220,15 +220,15 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     ],
 )
 def test_half_of_the_features_count_where_these_leave_no_doubt(
-    monkeypatch, num_halves, num_matches, is_sure, kept
+    monkeypatch, num_parts, num_matches, is_sure, kept
 ):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
     looked = at(9, 0.2)
     monkeypatch.setattr(attempts, "match_poses", lambda query: [] if num_matches is None else ["pose"])
     monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
     monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
-    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_halves, 0.5)])
-    query = replace(QUERY, num_halves=num_halves)
+    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_parts, 0.5)])
+    query = replace(QUERY, num_parts=num_parts)
     found, is_enough = attempts.search_matches(query, [looked], Stopwatch())
     assert places(found) == kept
     assert is_enough == (is_sure and len(kept) == 2)

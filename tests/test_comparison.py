@@ -189,4 +189,4 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg):
     assert is_mirrored(turned_over, doubtful)
     assert not is_mirrored(right, doubtful)
     assert not is_mirrored(turned_over, plain)
-    assert not is_mirrored(dataclasses.replace(turned_over, num_halves=0), doubtful)
+    assert not is_mirrored(dataclasses.replace(turned_over, num_parts=0), doubtful)

@@ -10,17 +10,12 @@ from scipy.spatial import cKDTree
 from piccolo.geometry.pose import yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.local_features.keypoints import (
-    DESCRIPTOR_SIZE,
-    HALVES,
-    VIEWS_DEG,
-    find_keypoints,
-    join_keypoints,
-    perspective_views,
-)
+from piccolo.local_features.keypoints import DESCRIPTOR_SIZE, find_keypoints, join_keypoints
+from piccolo.local_features.perspective_view import HALVES, VIEWS_DEG, cover_sphere
 
 WIDTH = rooms.WIDTH
 PIXEL = 2.0 * np.pi / WIDTH  # [rad]
+VIEWS = cover_sphere(WIDTH)
 
 
 @functools.lru_cache
@@ -32,7 +27,7 @@ def _gray():
 def _found(shift=0):
     """The keypoints of a room's photo turned by some pixels."""
     gray = np.ascontiguousarray(np.roll(_gray(), shift, axis=1))
-    return find_keypoints(gray, np.ones(gray.shape, bool), Workers(2))
+    return find_keypoints(gray, np.ones(gray.shape, bool), VIEWS, Workers(2))
 
 
 def test_rays_and_tangents_are_unit_and_orthogonal():
@@ -70,8 +65,7 @@ def test_turning_the_sphere_turns_the_keypoints():
 
 def test_what_views_share_counts_once():
     """No two keypoints of the same place, size and tangent are of different views."""
-    found, views = _found(), perspective_views(WIDTH)
-    middles = np.stack([view.R_sphere_from_view[:, 0] for view in views])
+    found, middles = _found(), VIEWS[0].middles
     assert len(middles) == len(VIEWS_DEG) == 20
     own = np.argmax(found.rays @ middles.T, axis=1)
     assert len(np.unique(own)) > 10
@@ -86,12 +80,12 @@ def test_halves_of_the_views_are_every_other_one_and_find_what_all_find():
     gray, whole = _gray(), _found()
     is_valid = np.ones(gray.shape, bool)
     assert sorted(HALVES[0] + HALVES[1]) == list(range(len(VIEWS_DEG)))
-    halves = [find_keypoints(gray, is_valid, Workers(2), views) for views in HALVES]
+    halves = [find_keypoints(gray, is_valid, [VIEWS[k] for k in half], Workers(2)) for half in HALVES]
     joined = join_keypoints(halves)
     by_ray = [np.lexsort((found.sizes, *found.rays.T)) for found in (joined, whole)]
     for own, other in zip(joined.take(by_ray[0]), whole.take(by_ray[1]), strict=True):
         np.testing.assert_array_equal(np.sort(own, axis=0), np.sort(other, axis=0))
-    middles = np.stack([view.R_sphere_from_view[:, 0] for view in perspective_views(WIDTH)])
+    middles = VIEWS[0].middles
     for k in range(2):
         assert len(halves[k].rays) > 0.3 * len(whole.rays)
         cosine = middles[list(HALVES[k])] @ middles[list(HALVES[1 - k])].T
@@ -102,26 +96,26 @@ def test_masked_areas_have_none():
     is_valid = np.ones((WIDTH // 2, WIDTH), bool)
     is_valid[:, 100:300] = False
     is_valid[150:] = False
-    found = find_keypoints(_gray(), is_valid)
+    found = find_keypoints(_gray(), is_valid, VIEWS)
     _, nearest = cKDTree(pixel_rays(WIDTH).reshape(-1, 3)).query(found.rays)
     assert len(found.rays) > 50
     assert is_valid.ravel()[nearest].all()
-    nothing = find_keypoints(_gray(), np.zeros_like(is_valid))
+    nothing = find_keypoints(_gray(), np.zeros_like(is_valid), VIEWS)
     assert [len(values) for values in nothing] == [0, 0, 0, 0]
-    flat = find_keypoints(np.full_like(_gray(), 128), np.ones_like(is_valid))
+    flat = find_keypoints(np.full_like(_gray(), 128), np.ones_like(is_valid), VIEWS)
     assert flat.descriptors.shape == (0, DESCRIPTOR_SIZE)
     assert flat.descriptors.dtype == np.uint8
 
 
 def test_same_bits_for_any_number_of_threads():
-    alone = find_keypoints(_gray(), np.ones(_gray().shape, bool), Workers(1))
+    alone = find_keypoints(_gray(), np.ones(_gray().shape, bool), VIEWS, Workers(1))
     for own, other in zip(_found(), alone, strict=True):
         np.testing.assert_array_equal(own, other)
 
 
 def test_keypoints_turned_over_are_those_of_the_picture_turned_over():
     gray = np.ascontiguousarray(_gray()[:, ::-1])
-    expected = find_keypoints(gray, np.ones(gray.shape, bool), Workers(2))
+    expected = find_keypoints(gray, np.ones(gray.shape, bool), VIEWS, Workers(2))
     found = _found().mirror()
     distance, nearest = cKDTree(np.hstack([expected.rays, expected.tangents])).query(
         np.hstack([found.rays, found.tangents])

@@ -120,3 +120,36 @@ def test_gaps_are_filled_with_what_is_around_them(gap, is_closed):
         assert is_filled.all()
         np.testing.assert_allclose(filled, gray, atol=1e-3)
     assert not fill_gaps(0 * gray, 0 * weight)[1].any()
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.5, -0.4, 1.3)])
+def test_a_pinhole_picture_shows_what_the_sphere_shows_along_its_rays(turn):
+    pose = Pose(exp_so3(np.array(turn)), rooms.scene(1)[2].center_world)
+    octree = rooms.scan_map(1).octree
+    focal = WIDTH / (2.0 * np.pi)
+    sphere = render_gray(octree, pose, EVERYWHERE)
+    pinhole = render_gray(octree, pose, np.ones((48, 64), bool), focal)
+    across, up = np.meshgrid(31.5 - np.arange(64), 23.5 - np.arange(48))
+    indices = compute_indices(np.stack([np.full(up.shape, focal), across, up], axis=-1), WIDTH)
+    is_seen = (pinhole.ranges > 0) & (sphere.ranges[indices] > 0)
+    assert is_seen.mean() > 0.8
+    difference = np.abs(pinhole.ranges - sphere.ranges[indices])[is_seen]
+    assert np.median(difference) < 0.02
+    assert (difference < 0.1).mean() > 0.9
+    gray = sphere.gray[indices].astype(float)
+    assert np.corrcoef(pinhole.gray[is_seen], gray[is_seen])[0, 1] > 0.9
+    mirrored = sphere.gray[indices][:, ::-1]
+    assert np.corrcoef(pinhole.gray[is_seen], mirrored[is_seen])[0, 1] < 0.7
+
+
+def test_a_pinhole_picture_shows_nothing_of_what_is_behind_it_or_beside():
+    """A wall behind, and one beside that no pixel shows; edges do not continue at the other side."""
+    behind = _sphere(2.0)
+    behind = behind[behind[:, 0] < 0.5]
+    view = render_gray(_octree((behind, 90)), LEVEL, np.ones((48, 64), bool), 40.0)
+    assert not view.is_filled.any()
+    left = _sphere(2.0, 512)
+    left = left[(left[:, 0] > 0.0) & (left[:, 1] > 0.9 * left[:, 0])]
+    shown = render_gray(_octree((left, 90)), LEVEL, np.ones((48, 64), bool), 30.0)
+    assert shown.is_filled[10:40, :2].all()
+    assert not shown.is_filled[:, 16:].any()

@@ -107,7 +107,7 @@ def test_whole_views_alone_have_no_matches_and_ratios_are_to_the_best(monkeypatc
     found = selection.assess_poses(query, *poses)
     assert [(s.score, s.num_matches) for s in found] == [(0.5, 20), (0.3, 7)]
     assert [s.ratio for s in found] == pytest.approx([1.0, 0.8])
-    by_views = selection.assess_poses(replace(query, num_halves=0), *poses)
+    by_views = selection.assess_poses(replace(query, num_parts=0), *poses)
     assert by_views == [s._replace(num_matches=None) for s in found]
 
 

@@ -31,7 +31,7 @@ class PerspectiveView(NamedTuple):
     rows: NDArray[np.float32]
     is_own: NDArray[np.uint8]  # (h, w) 255 where no other view's middle is nearer, and a little beyond
     middles: Array  # (N, 3) of the views of the set
-    index: int  # of this one
+    place: int  # of this one among them
 
     def cut(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Cut the view (h, w) out of a sphere's picture (H, W)."""
@@ -44,7 +44,7 @@ class PerspectiveView(NamedTuple):
 
     def find_own(self, rays: NDArray[np.floating]) -> NDArray[np.int64]:
         """Return the indices of the directions (N, 3) that are nearer to this middle than to any other."""
-        return np.flatnonzero(np.argmax(rays @ self.middles.T, axis=1) == self.index)
+        return np.flatnonzero(np.argmax(rays @ self.middles.T, axis=1) == self.place)
 
     def project(self, rays: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Return rows and columns (N,) of the pixels that contain directions (N, 3) of the sphere."""
@@ -74,15 +74,17 @@ def view_around(is_valid: NDArray[np.bool_], focal: float, width: int) -> Perspe
 
     The view is one of a sphere's picture of `width`, and has a focal length [px] of its own.
     """
+    if not is_valid.any():
+        return None
     rays = pixel_rays(is_valid.shape[1])[is_valid]
-    middle = rays.sum(axis=0)
-    middle /= max(float(np.linalg.norm(middle)), 1e-9)
+    middle = rays.sum(axis=0) + np.array([1e-9, 0.0, 0.0])  # of the whole sphere it has no direction
+    middle /= np.linalg.norm(middle)
     up = np.array([0.0, 0.0, 1.0]) if abs(middle[2]) < 0.9 else np.array([1.0, 0.0, 0.0])
     left = np.cross(up, middle)
     left /= np.linalg.norm(left)
     R_sphere_from_view = np.stack([middle, left, np.cross(middle, left)], axis=1)
     local = rays @ R_sphere_from_view
-    if not len(rays) or local[:, 0].min() <= 1.0 / math.hypot(1.0, STRETCH):
+    if local[:, 0].min() <= 1.0 / math.hypot(1.0, STRETCH):
         return None
     half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + AROUND for k in (1, 2))
     shape = tuple(math.ceil(2.0 * focal * half / MULTIPLE) * MULTIPLE for half in (half_height, half_width))
@@ -90,7 +92,7 @@ def view_around(is_valid: NDArray[np.bool_], focal: float, width: int) -> Perspe
 
 
 def make_view(
-    R_sphere_from_view: Array, focal: float, shape: tuple[int, int], width: int, middles: Array, index: int
+    R_sphere_from_view: Array, focal: float, shape: tuple[int, int], width: int, middles: Array, place: int
 ) -> PerspectiveView:
     """Make a view of `shape` (h, w) and a focal length [px] of a sphere's picture of `width`."""
     height, across = shape
@@ -99,9 +101,11 @@ def make_view(
     )
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
     columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
-    is_nearest = np.argmax(rays @ middles.T, axis=-1) == index
+    is_nearest = np.argmax(rays @ middles.T, axis=-1) == place
     own = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
-    return PerspectiveView(R_sphere_from_view, focal, columns, rows, np.asarray(own, np.uint8), middles, index)
+    return PerspectiveView(
+        R_sphere_from_view, focal, columns, rows, np.asarray(own, np.uint8), middles, place
+    )
 
 
 def add_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -11,7 +11,7 @@ from ..cloud.octree import Octree, collect, find_level
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel
 from ..geometry.vectors import rotate
-from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
+from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from ..views.view import Scratch, thread_scratch
 
 VOXEL_PER_RANGE = 1.0 / 80.0  # largest voxel, divided by its distance
@@ -39,18 +39,18 @@ class ViewImage(NamedTuple):
 
 @inline_kernel
 def project(
-    x: np.float32, y: np.float32, z: np.float32, r: np.float32, focal: np.float32, height: int, width: int
-) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    x: Scalar, y: Scalar, z: Scalar, r: Scalar, focal: Scalar, height: int, width: int
+) -> tuple[Any, Any, Any, Any]:
     """Return the pixel u, v of a direction of length r, the pixels a radian there, and its radius.
 
-    `focal` [px] is a pinhole's, whose pixel is (-1, -1) behind it, and the radius r. With 0 the picture is the
-    sphere's, stretched across by r / radius.
+    `focal` [px] is a pinhole's, whose pixel is (-1, -1) behind it, and the radius r. With 0 the picture is
+    the sphere's, stretched across by r / radius.
     """
     if focal > F0:
         if x < NEAREST * r:
             return -F1, -F1, focal, r
-        u = HALF * np.float32(width) - focal * y / x
-        return u, HALF * np.float32(height) - focal * z / x, focal * r / x, r
+        per_x = focal / x
+        return HALF * np.float32(width) - y * per_x, HALF * np.float32(height) - z * per_x, r * per_x, r
     rho: Any = math.sqrt(x * x + y * y)  # compiled, float32
     u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
     return u, v, np.float32(width / (2.0 * math.pi)), rho
@@ -97,7 +97,12 @@ def project_voxels(
 
 @kernel
 def draw_voxels(
-    tree: Octree, scratch: Scratch, count: int, wraps: bool, ranges: NDArray[np.float32], sums: NDArray[np.float32]
+    tree: Octree,
+    scratch: Scratch,
+    count: int,
+    wraps: bool,
+    ranges: NDArray[np.float32],
+    sums: NDArray[np.float32],
 ) -> None:
     """Write the nearest range (H, W), and sums (H, W, 2) of weighted grey and of weights near that range.
 

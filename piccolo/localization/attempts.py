@@ -45,7 +45,7 @@ Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Found]
 
 
 def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
-    """Return the searches for a photo in order, each with the number of parts of the features that it matches.
+    """Return the searches for a photo in order, each with the parts of the features that it matches.
 
     A first look by whole views (0 parts) may settle a whole upright sphere. Then come poses from feature
     matches, first of a part of the views, then of all, and at last searches by whole views: with gravity

@@ -35,7 +35,7 @@ LAST_LIMITS = Limits(FULL_LOSS, 30, 1e-7)
 NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
 MAX_LAST_ROUNDS = 6
 SETTLED = 1e-4  # [m] a smaller move ends the last rounds
-MIN_SCORE_LEFT = 0.94  # fraction of the score that a descent on points must keep
+MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
 def refine_to_the_end(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:

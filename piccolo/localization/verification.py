@@ -102,8 +102,10 @@ def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoin
     """Draw what a view of the photo would show at a pose; return the keypoints, and their ranges (N,) [m]."""
     shown = cv2.dilate(view.cut_mask(query.photo.panorama.is_valid), np.ones((2 * AROUND + 1,) * 2, np.uint8))
     R_view_from_map = view.R_sphere_from_view.T @ pose.R_cam_from_world
-    image = render_gray(query.scan_map.octree, Pose(R_view_from_map, pose.center_world), shown > 0, view.focal)
-    found = find_in_view(image.gray, image.is_filled.view(np.uint8) * shown, view)
+    image = render_gray(
+        query.scan_map.octree, Pose(R_view_from_map, pose.center_world), shown > 0, view.focal
+    )
+    found = find_in_view(image.gray, np.where(image.is_filled, shown, np.uint8(0)), view)
     ranges = image.ranges[view.project(found.rays)]
     is_seen = np.flatnonzero(ranges > 0.0)
     return found.take(is_seen), ranges[is_seen]

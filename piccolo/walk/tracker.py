@@ -303,7 +303,7 @@ def find_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 
     Empty if the best has less than the least score.
     """
-    first = brief_query(replace(query, num_halves=0))
+    first = brief_query(replace(query, num_parts=0))
     gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
     starts = search_poses(first, gravity)
     score = score_starts(first, starts)
@@ -319,7 +319,7 @@ def find_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
 def make_states(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
     """Make the states of a frame from its poses, best first, with odds by whole views."""
     ranked = suppress_near(sort_by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
-    asked = replace(query, num_halves=0)
+    asked = replace(query, num_parts=0)
     best, *others = ranked
     covariance = estimate_covariance(query, best.pose)
     standings = assess_poses(asked, best, others)
@@ -338,7 +338,7 @@ def associate(query: Query, states: Sequence[State], found: Hypothesis) -> State
     best = max(states, key=lambda state: state.log_odds)
     if any(is_same(state.pose, found.pose) for state in states):
         return None
-    asked, at_best = replace(query, num_halves=0), Hypothesis(best.pose, best.score)
+    asked, at_best = replace(query, num_parts=0), Hypothesis(best.pose, best.score)
     first, second = posterior(assess_poses(asked, at_best, [found]), None)[:2]
     odds = best.log_odds + log_ratio(float(second), float(first))
     if odds < best.log_odds - OTHER_LOG_ODDS:
