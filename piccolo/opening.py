@@ -101,7 +101,7 @@ def open_scan(  # noqa: PLR0913  options by name
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     cloud_settings = CloudSettings(
-        METRES[units], up, intensity_as_gray, _make_labels(labels, ignore_labels), crs
+        METRES[units], up, intensity_as_gray, False, _make_labels(labels, ignore_labels), crs
     )
     if isinstance(source, np.ndarray):
         cloud = stream_of_arrays(source, colors)

@@ -91,6 +91,7 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--units UNIT", text, type=_metres_of, default=None)
     text = "axis of the cloud that points up; auto: z, or y in glTF (default auto; with preset default only)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
+    option(group, "--ignore-colors", "localize by the shape of the scan alone, with or without colours")
     option(group, "--intensity-as-gray", "use the intensities of clouds without colours as gray values")
     text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
     option(group, "--labels", text)
@@ -237,7 +238,14 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
         crs = None
     if crs:
         check_crs(crs)
-    return CloudSettings(scale, arguments.up, arguments.intensity_as_gray, _labels_from(arguments), crs)
+    return CloudSettings(
+        scale,
+        arguments.up,
+        arguments.intensity_as_gray,
+        arguments.ignore_colors,
+        _labels_from(arguments),
+        crs,
+    )
 
 
 def _labels_from(arguments: argparse.Namespace) -> Labels | None:

@@ -23,6 +23,7 @@ class CloudSettings:
     scale: float = 1.0  # metres per unit of the files
     up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
     intensity_as_gray: bool = False  # where a file has no colours
+    ignore_colors: bool = False  # edges of the surfaces take their place
     labels: Labels | None = None  # the points' labels are taken for their colours
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 

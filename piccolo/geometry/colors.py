@@ -60,3 +60,14 @@ def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None)
 def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
     """Return the colours (N, 3) that `pack_rgbx` packed (N,)."""
     return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]
+
+
+def colors_of_edges(strength: NDArray[np.floating], vertical: NDArray[np.floating]) -> NDArray[np.uint8]:
+    """Return the colours (..., 3) whose opponent channels are edges (...) in [0, 1] and vertical ones of them.
+
+    Luminance is the strength; (R - B) / 2 is the strength of vertical edges minus that of others.
+    """
+    luminance = 0.2 + 0.5 * strength
+    difference = 0.3 * (2.0 * vertical - strength)
+    rgb = np.stack([luminance + difference, luminance, luminance - difference], axis=-1)
+    return np.clip(np.rint(255.0 * rgb), 0.0, 255.0).astype(np.uint8)

@@ -18,6 +18,7 @@ from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches, match
 from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere, view_around
 from ..panorama import Panorama
+from ..panorama.edges import draw_edges
 from ..panorama.gpano import attitude_of_gravity, rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
@@ -165,6 +166,10 @@ def prepare_query(
     down_cam = settings.prior.gravity_vector
     gpano = attitude_of_gravity(down_cam) if down_cam else panorama.gpano
     R_level_from_cam = rotation_to_level(gpano) if gpano else None
+    R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
+    if scan_map.has_shape:
+        panorama = draw_edges(panorama, R_cam_from_level)
+        method = method._replace(uses_features=False)
     width = method.scales.full.width
     resized = resize(panorama, width)
     photo = Photo(
@@ -173,7 +178,7 @@ def prepare_query(
         make_images(resized, method.scales),
         make_texels(resize(resized, COMPARED_WIDTH)),
         Once(partial(make_texels, panorama)),
-        np.eye(3) if R_level_from_cam is None else R_level_from_cam.T,
+        R_cam_from_level,
         R_level_from_cam is not None,
         math.tau / min(panorama.rgb.shape[1], width),
     )

@@ -120,7 +120,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
             if remembers:
                 remember(what, archive.status, "")
         warnings = clean_warnings(path, arrays["warnings"])
-    own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "scan_sha256")}
+    own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "has_shape", "scan_sha256")}
     parts: dict[str, Any] = {name: arrays[f"octree_{name}"] for name in Octree._fields}
     octree = Octree(**{**parts, "leaf_size": float(arrays["octree_leaf_size"])})
     scan_map = ScanMap(
@@ -128,6 +128,7 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
         views=CandidateViews(octree, arrays["centers"]),
         local_features=FeatureMap(**{name: arrays[f"local_{name}"] for name in FeatureMap._fields}),
         has_labels=bool(arrays["has_labels"]),
+        has_shape=bool(arrays["has_shape"]),
         scan_names=tuple(map(str, arrays["scan_names"])),
         warnings=warnings,
         scan_sha256=str(arrays["scan_sha256"]),

@@ -51,6 +51,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "local_middles": ("|i1", ("lists", NUM_COMPONENTS)),
     "local_list_start": ("<i4", ("list_starts",)),
     "has_labels": ("|b1", ()),
+    "has_shape": ("|b1", ()),
     "scan_sha256": ("<U64", ()),
     "crs": ("|u1", ("characters",)),  # UTF-8
 }

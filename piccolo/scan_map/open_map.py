@@ -69,7 +69,13 @@ def open_map(
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
         scan_map = prepare_map(
-            cloud, workers, cloud_settings.up, watch, prior=prior, has_features=has_features
+            cloud,
+            workers,
+            cloud_settings.up,
+            watch,
+            prior=prior,
+            has_features=has_features,
+            has_shape=cloud_settings.ignore_colors,
         )
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=read_crs(paths))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree, build_octree
+from ..cloud.shape import paint_shape
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
@@ -70,6 +71,7 @@ class ScanMap:
     views: CandidateViews  # of fine cells, made when they are asked for; not in files
     local_features: FeatureMap  # none of any view where they are made late; asked for by `features_now`
     has_labels: bool = False  # colours are those of labels
+    has_shape: bool = False  # colours are edges of the surfaces, of a scan without colours
     scan_names: tuple[str, ...] = ()  # of the scans put together; none if none was named
     warnings: tuple[str, ...] = ()
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
@@ -106,7 +108,7 @@ class ScanMap:
     @property
     def lacks_features(self) -> bool:
         """True if no view was searched for local features, though there are candidates."""
-        return len(self.local_features.view_centers) == 0 < len(self.centers)
+        return len(self.local_features.view_centers) == 0 < len(self.centers) and not self.has_shape
 
     def features_now(self, workers: Workers) -> FeatureMap:
         """Return the local features, made now if they were deferred."""
@@ -164,8 +166,11 @@ def prepare_map(
     view: ViewConfig = SEARCH_VIEW,
     prior: Prior = NOTHING_KNOWN,
     has_features: bool = True,
+    has_shape: bool = False,
 ) -> ScanMap:
     """Prepare a map of a cloud, with local features, or without until a photo needs them.
+
+    With `has_shape` it holds the edges of the surfaces in place of colours, and no local features.
 
     The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
     whole only the surroundings of the prior's place are prepared; TooManyPositionsError if the prior has no
@@ -183,6 +188,8 @@ def prepare_map(
     for warning in warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):
+        if has_shape:
+            octree = paint_shape(octree, workers)
         centers, notes = find_candidates(octree, R_map_from_world, origin_world, prior, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], view, workers)
@@ -200,7 +207,10 @@ def prepare_map(
             local_features=make_feature_map(octree, centers[:0], Workers()),
             warnings=warnings + notes,
             is_partial=bool(notes),
+            has_shape=has_shape,
         )
+        if has_shape:
+            return scan_map
         scan_map = defer_features(scan_map)
         return add_features(scan_map, workers) if has_features else scan_map
 

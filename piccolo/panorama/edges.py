@@ -1,0 +1,69 @@
+"""Edges of a photo, as `cloud.shape` paints those of a scan without colours."""
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.colors import colors_of_edges
+from ..geometry.pose import Array
+from ..geometry.sphere import pixel_rays
+from .model import Panorama, resize
+
+WIDTH = 1024  # [px] of the sphere on which gradients are taken
+DARK = 12.0  # [levels] added before the logarithm
+SMOOTHING = 0.8  # [px] before the gradient is taken
+FULL_GRADIENT = 0.25  # of the logarithm, a pixel; the strength is the root of the fraction
+VERTICAL = 0.9, 0.98  # cosine of a gradient's angle to the horizontal: no vertical edge at all, and fully
+SPREAD = 3.0  # [px] the painted edges of a scan are wide
+MARGIN = 32  # [px] beyond the seam
+
+
+def draw_edges(panorama: Panorama, R_cam_from_level: Array) -> Panorama:
+    """Return a panorama of the edges of another, of WIDTH, taken with a camera of a known tilt (3, 3)."""
+    source = resize(panorama, WIDTH)
+    gray = np.log(source.rgb.astype(np.float32).mean(axis=2) + np.float32(DARK))
+    across, down = gradients(gray)
+    strength = np.hypot(across, down)
+    horizontal = np.abs(np.sum(tangents(WIDTH, R_cam_from_level) * np.stack([across, down], -1), axis=-1))
+    cosine = horizontal / np.maximum(strength, 1e-9)
+    strength = np.clip(np.sqrt(strength / FULL_GRADIENT), 0.0, 1.0)
+    vertical = strength * np.clip((cosine - VERTICAL[0]) / (VERTICAL[1] - VERTICAL[0]), 0.0, 1.0)
+    is_inner = cv2.erode(source.is_valid.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    shown = is_inner.astype(np.float32)
+    weight = np.maximum(spread(shown), 1e-6)
+    drawn = colors_of_edges(spread(strength * shown) / weight, spread(vertical * shown) / weight)
+    return Panorama(drawn, source.is_valid)
+
+
+def gradients(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Return the derivatives (H, W) of an equirectangular image a pixel of its middle row, across and down."""
+    smooth = cv2.GaussianBlur(wrap(image), (0, 0), SMOOTHING)
+    across, down = (
+        cv2.Scharr(smooth, cv2.CV_32F, *axis)[MARGIN:-MARGIN, MARGIN:-MARGIN] / 32.0 for axis in ((1, 0), (0, 1))
+    )
+    elevation = (0.5 - (np.arange(len(image)) + 0.5) / len(image)) * np.pi
+    return across / np.maximum(np.cos(elevation), 0.2)[:, None].astype(np.float32), down
+
+
+def tangents(width: int, R_cam_from_level: Array) -> NDArray[np.float64]:
+    """Return the horizontal direction (H, W, 2) at each pixel, as its parts across and down the image."""
+    rays = pixel_rays(width)
+    x, y, z = np.moveaxis(rays, -1, 0)
+    rho = np.maximum(np.hypot(x, y), 1e-9)
+    right = np.stack([y / rho, -x / rho, np.zeros_like(x)], axis=-1)
+    below = np.stack([x * z / rho, y * z / rho, -rho], axis=-1)
+    horizontal = np.cross(R_cam_from_level[:, 2], rays)
+    horizontal /= np.maximum(np.linalg.norm(horizontal, axis=-1, keepdims=True), 1e-9)
+    return np.stack([(horizontal * right).sum(axis=-1), (horizontal * below).sum(axis=-1)], axis=-1)
+
+
+def spread(image: NDArray[np.floating]) -> NDArray[np.float32]:
+    """Blur an equirectangular image (H, W) by SPREAD."""
+    blurred = cv2.GaussianBlur(wrap(image.astype(np.float32)), (0, 0), SPREAD)
+    return np.asarray(blurred[MARGIN:-MARGIN, MARGIN:-MARGIN], np.float32)
+
+
+def wrap(image: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return an equirectangular image (H, W) with a margin on all sides, across the seam."""
+    wide = np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap")
+    return np.pad(wide, ((MARGIN, MARGIN), (0, 0)), mode="edge")
