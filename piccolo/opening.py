@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from .arguments import check_arguments
 from .cloud import open_cloud
+from .cloud.readers.reader import GRAY
 from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .errors import InputError
@@ -38,6 +39,7 @@ def open_scan(  # noqa: PLR0913  options by name
     units: Units = "m",
     up: UpAxis = "auto",
     intensity_as_gray: bool = False,
+    ignore_colors: bool = False,
     labels: bool = False,
     ignore_labels: Sequence[int] = (),
     crs: str | None = None,
@@ -61,6 +63,8 @@ def open_scan(  # noqa: PLR0913  options by name
         Axis of the scan that points up. By default "auto": z, in glTF files y.
     intensity_as_gray
         Use intensities as grey levels where a file has no colours. False by default.
+    ignore_colors
+        Use the shape of the scan alone, whether it has colours or not. False by default.
     labels
         Use semantic labels in place of colours, in scan and panoramas. False by default.
     ignore_labels
@@ -86,7 +90,7 @@ def open_scan(  # noqa: PLR0913  options by name
     ------
     InputError
         A file is missing or damaged, has no colours, or is of an unknown format; or an option is invalid.
-        A prepared map takes no `units`, `up` and `intensity_as_gray`.
+        A prepared map takes no `units`, `up`, `intensity_as_gray` and `ignore_colors`.
 
     Examples
     --------
@@ -101,10 +105,10 @@ def open_scan(  # noqa: PLR0913  options by name
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     cloud_settings = CloudSettings(
-        METRES[units], up, intensity_as_gray, False, _make_labels(labels, ignore_labels), crs
+        METRES[units], up, intensity_as_gray, ignore_colors, _make_labels(labels, ignore_labels), crs
     )
     if isinstance(source, np.ndarray):
-        cloud = stream_of_arrays(source, colors)
+        cloud = stream_of_arrays(source, np.full(source.shape, GRAY, np.uint8) if ignore_colors else colors)
         return Scan(scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch()))
     if colors is not None:
         raise InputError("colors: found files, wanted an array of points")
@@ -155,7 +159,15 @@ def scan_of(
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
         prior = settings.prior
-        prepared = prepare_map(cloud, workers, cloud_settings.up, watch, prior=prior, has_features=False)
+        prepared = prepare_map(
+            cloud,
+            workers,
+            cloud_settings.up,
+            watch,
+            prior=prior,
+            has_features=False,
+            has_shape=cloud_settings.ignore_colors,
+        )
     else:
         with watch.stage("read"):
             points = cloud.read()

@@ -1,6 +1,7 @@
 """Opening files of point clouds: the format follows from a file's first bytes, or else from its name."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import InputError
@@ -50,9 +51,23 @@ def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
         if settings.labels and not format_.has_labels:
             known = ", ".join(f.name for f in FORMATS if f.has_labels)
             raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
-        return format_.open_source(path, settings)
+        try:
+            return format_.open_source(path, settings)
+        except InputError as error:
+            raise InputError(f"{error}{_hint(format_, path, settings)}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
+
+
+def _hint(format_: CloudFormat, path: Path, settings: CloudSettings) -> str:
+    """Return what to add to the refusal of a file that would be read without its colours."""
+    if settings.ignore_colors or settings.labels:
+        return ""
+    try:
+        format_.open_source(path, replace(settings, intensity_as_gray=False, ignore_colors=True))
+    except InputError:
+        return ""
+    return "; `ignore_colors` localizes by the shape alone"
 
 
 def _format_of(path: Path) -> CloudFormat:

@@ -28,9 +28,12 @@ class CloudSettings:
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 
     def __post_init__(self) -> None:
-        """Raise InputError for invalid values, and for labels together with intensity."""
+        """Raise InputError for invalid values, and for labels, intensity or neither at once."""
         if self.intensity_as_gray and self.labels:
             raise InputError("`labels`, `intensity_as_gray`: found both, wanted one of them")
+        if self.ignore_colors and (self.labels or self.intensity_as_gray):
+            other = "labels" if self.labels else "intensity_as_gray"
+            raise InputError(f"`ignore_colors`, `{other}`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):
             raise InputError(f"`up`: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if not (math.isfinite(self.scale) and self.scale > 0.0):

@@ -23,14 +23,7 @@ class Standing(NamedTuple):
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int | None  # local features that agree with it; None: whole views alone were compared
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
-    is_drawn: bool = False  # the matches are with the scan drawn at the pose, else with the map's features
-
-    @property
-    def kind(self) -> str:
-        """Key in MODELS: what the photo was compared with."""
-        if self.num_matches is None:
-            return "whole views alone"
-        return "scan drawn at the pose" if self.is_drawn else "features of the map"
+    kind: str = "whole views alone"  # key in MODELS: what the photo was compared with
 
 
 class ChoiceModel(NamedTuple):
@@ -51,6 +44,7 @@ NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at m
 FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODELS = {
+    "shape alone": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
     "whole views alone": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
     "features of the map": ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82)),
     "scan drawn at the pose": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),

@@ -63,7 +63,7 @@ def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
 
 
 def colors_of_edges(strength: NDArray[np.floating], vertical: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return the colours (..., 3) whose opponent channels are edges (...) in [0, 1] and vertical ones of them.
+    """Return the colours (..., 3) that stand for edges (...) in [0, 1], and for the vertical ones of them.
 
     Luminance is the strength; (R - B) / 2 is the strength of vertical edges minus that of others.
     """

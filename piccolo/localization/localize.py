@@ -20,8 +20,9 @@ from .focal_length import WIDE, FocalFit, calibrate, change_camera
 from .last_descent import HOPELESS_SCORE, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
-from .selection import Selection
+from .selection import CLEAR_MARGIN, Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
+from .shape import CLEAR_SHAPE, find_tilts, is_tilt_known
 from .verdict import judge
 
 GUESSES = (
@@ -71,6 +72,32 @@ def find_pose(
         return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
     if not panorama.is_valid.any():
         return Localization(warnings=(NO_PIXEL,))
+    if not scan_map.has_shape:
+        return find_once(scan_map, allowed_map, panorama, settings, workers, watch, method)
+    # most cameras are about level
+    level = find_once(
+        scan_map, allowed_map, panorama, replace(settings, gravity="known"), workers, watch, method
+    )
+    if is_tilt_known(panorama, settings) or (
+        level.selection.best.score > CLEAR_SHAPE and level.selection.margin > CLEAR_MARGIN
+    ):
+        return level
+    with watch.stage("search"):
+        tilts = find_tilts(allowed_map, panorama, settings, workers, method)
+    found = [find_once(scan_map, allowed_map, panorama, tilt, workers, watch, method) for tilt in tilts]
+    return max([level, *found], key=lambda one: one.selection.best.score)
+
+
+def find_once(
+    scan_map: ScanMap,
+    allowed_map: ScanMap,
+    panorama: Panorama,
+    settings: CoarseToFineSettings,
+    workers: Workers,
+    watch: Stopwatch,
+    method: MethodConfig,
+) -> Found:
+    """Search what the prior allows of a map, and refine."""
     with watch.stage("search"):
         query = prepare_query(panorama, allowed_map, settings, workers, method)
     images = query.photo.images
@@ -85,7 +112,7 @@ def find_pose(
         hypotheses += search_beyond_prior(query, scan_map, watch)
         with watch.stage("refine"):
             found = refine_to_the_end(query, hypotheses)
-            if panorama.focal_prior is None or found.best.score < HOPELESS_SCORE:
+            if query.photo.given.focal_prior is None or found.best.score < HOPELESS_SCORE:
                 return Found(query, found, None)
             return Found(*calibrate(query, found))
 

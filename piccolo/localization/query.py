@@ -183,7 +183,7 @@ def prepare_query(
         math.tau / min(panorama.rgb.shape[1], width),
     )
     photo.images.search()  # each search begins with it
-    parts = find_parts(photo)
+    parts = [] if scan_map.has_shape else find_parts(photo)
     features = tuple(Once(partial(find_features, resized, scan_map, workers, views)) for views in parts)
     cache = Cache(RecentViews(scan_map.octree))
     views = tuple(view for part in parts for view in part)

@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 
 from ..geometry.colors import colors_of_edges
 from ..geometry.pose import Array
-from ..geometry.sphere import pixel_rays
+from ..geometry.sphere import make_grid, pixel_rays
 from .model import Panorama, resize
 
 WIDTH = 1024  # [px] of the sphere on which gradients are taken
@@ -16,6 +16,13 @@ FULL_GRADIENT = 0.25  # of the logarithm, a pixel; the strength is the root of t
 VERTICAL = 0.9, 0.98  # cosine of a gradient's angle to the horizontal: no vertical edge at all, and fully
 SPREAD = 3.0  # [px] the painted edges of a scan are wide
 MARGIN = 32  # [px] beyond the seam
+AXES_WIDTH = 512  # [px] of the sphere on which the directions of lines are found
+FLAT_SHARE = 0.85  # of the pixels, with the weakest gradients: no edges
+AXES_RINGS = 60  # of the grid of directions that are tried: 3 degrees apart
+ACROSS = 0.035  # sine of the angle to the right angle, at most
+SHARPENINGS = 4
+LEAST_COS = 0.35  # of the elevation: nearer to the poles gradients are rough
+SQUARE = 0.1  # cosine of two of the axes, at most
 
 
 def draw_edges(panorama: Panorama, R_cam_from_level: Array) -> Panorama:
@@ -36,22 +43,68 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array) -> Panorama:
 
 
 def gradients(image: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the derivatives (H, W) of an equirectangular image a pixel of its middle row, across and down."""
+    """Return the derivatives (H, W) of an equirectangular image, across and down, a pixel of its middle."""
     smooth = cv2.GaussianBlur(wrap(image), (0, 0), SMOOTHING)
-    across, down = (
-        cv2.Scharr(smooth, cv2.CV_32F, *axis)[MARGIN:-MARGIN, MARGIN:-MARGIN] / 32.0 for axis in ((1, 0), (0, 1))
-    )
+    inner = slice(MARGIN, -MARGIN)
+    across = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 1, 0)[inner, inner], np.float32) / np.float32(32.0)
+    down = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 0, 1)[inner, inner], np.float32) / np.float32(32.0)
     elevation = (0.5 - (np.arange(len(image)) + 0.5) / len(image)) * np.pi
-    return across / np.maximum(np.cos(elevation), 0.2)[:, None].astype(np.float32), down
+    across /= np.maximum(np.cos(elevation), 0.2)[:, None].astype(np.float32)
+    return across, down
+
+
+def find_axes(panorama: Panorama) -> list[Array]:
+    """Return unit vectors (3,) along three directions of the lines in a photo, in both senses.
+
+    The directions are at right angles to each other. A line's gradients are at right angles to it, wherever
+    it is seen: the direction is the one at right angles to most gradients (Coughlan and Yuille, "Manhattan
+    World", ICCV 1999). The nearest to +z is the first.
+    """
+    source = resize(panorama, AXES_WIDTH)
+    gray = np.log(source.rgb.astype(np.float32).mean(axis=2) + np.float32(DARK))
+    across, down = gradients(gray)
+    right, below = tangent_axes(AXES_WIDTH)
+    strength = np.hypot(across, down)
+    is_inner = cv2.erode(source.is_valid.view(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    elevation = (0.5 - (np.arange(AXES_WIDTH // 2) + 0.5) / (AXES_WIDTH // 2)) * np.pi
+    is_inner &= np.cos(elevation)[:, None] > LEAST_COS
+    if not is_inner.any():
+        return []
+    is_edge = is_inner & (strength > np.quantile(strength[is_inner], FLAT_SHARE))
+    normals = (across[..., None] * right + down[..., None] * below)[is_edge] / strength[is_edge][:, None]
+    weights = np.cos(elevation)[np.nonzero(is_edge)[0]]
+    tried = make_grid(AXES_RINGS).directions.astype(np.float64)
+    votes = np.array([weights @ (np.abs(normals @ direction) < ACROSS) for direction in tried])
+    first = sharpen_axis(normals, weights, tried[np.argmax(votes)])
+    votes[np.abs(tried @ first) > SQUARE] = -1.0
+    second = sharpen_axis(normals, weights, tried[np.argmax(votes)])
+    second -= first * (first @ second)
+    second /= np.linalg.norm(second)
+    axes = [first, second, np.cross(first, second)]
+    return sorted([*axes, *(-axis for axis in axes)], key=lambda axis: -float(axis[2]))
+
+
+def sharpen_axis(normals: Array, weights: Array, axis: Array) -> Array:
+    """Return the axis (3,) at right angles to the normals (N, 3) that nearly are, by least squares."""
+    for _ in range(SHARPENINGS):
+        near = np.abs(normals @ axis) < ACROSS
+        moments = (normals[near] * weights[near, None]).T @ normals[near]
+        axis = np.linalg.eigh(moments)[1][:, 0]
+    return np.asarray(axis)
+
+
+def tangent_axes(width: int) -> tuple[Array, Array]:
+    """Return the unit directions (H, W, 3), across to the right and down, at each pixel."""
+    x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
+    rho = np.maximum(np.hypot(x, y), 1e-9)
+    right = np.stack([y / rho, -x / rho, np.zeros_like(x)], axis=-1)
+    return right, np.stack([x * z / rho, y * z / rho, -rho], axis=-1)
 
 
 def tangents(width: int, R_cam_from_level: Array) -> NDArray[np.float64]:
     """Return the horizontal direction (H, W, 2) at each pixel, as its parts across and down the image."""
     rays = pixel_rays(width)
-    x, y, z = np.moveaxis(rays, -1, 0)
-    rho = np.maximum(np.hypot(x, y), 1e-9)
-    right = np.stack([y / rho, -x / rho, np.zeros_like(x)], axis=-1)
-    below = np.stack([x * z / rho, y * z / rho, -rho], axis=-1)
+    right, below = tangent_axes(width)
     horizontal = np.cross(R_cam_from_level[:, 2], rays)
     horizontal /= np.maximum(np.linalg.norm(horizontal, axis=-1, keepdims=True), 1e-9)
     return np.stack([(horizontal * right).sum(axis=-1), (horizontal * below).sum(axis=-1)], axis=-1)

@@ -120,7 +120,9 @@ def load_map(path: Path, remembers: bool = False) -> ScanMap:
             if remembers:
                 remember(what, archive.status, "")
         warnings = clean_warnings(path, arrays["warnings"])
-    own: dict[str, Any] = {name: arrays[name] for name in ARRAYS if name not in ("has_labels", "has_shape", "scan_sha256")}
+    own: dict[str, Any] = {
+        name: arrays[name] for name in ARRAYS if name not in ("has_labels", "has_shape", "scan_sha256")
+    }
     parts: dict[str, Any] = {name: arrays[f"octree_{name}"] for name in Octree._fields}
     octree = Octree(**{**parts, "leaf_size": float(arrays["octree_leaf_size"])})
     scan_map = ScanMap(

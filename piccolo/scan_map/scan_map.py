@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.octree import Octree, build_octree
-from ..cloud.shape import paint_shape
 from ..cloud.settings import R_z_from_axis, UpAxis
+from ..cloud.shape import paint_shape
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import Voxels

@@ -301,6 +301,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
     option(parser, "--photos N", "cut so many photos out of each panorama of the scenes", default=0)
+    option(parser, "--ignore-colors", "localize by the shape of the scans alone")
     option(parser, "--out FILE", "write a JSON line per trial", required=True)
     option(parser, "--threads N", "number of threads", default=num_cores())
 
@@ -312,7 +313,7 @@ def run(arguments: argparse.Namespace) -> int:
     with arguments.out.open("w") as file:
         for scene, (points, colors), trials in all_trials(arguments, workers):
             cloud = stream_points(Path("trial"), RawCloud(points.astype(np.float64), colors))
-            scan_map = prepare_map(cloud, workers, has_features=False)
+            scan_map = prepare_map(cloud, workers, has_features=False, has_shape=arguments.ignore_colors)
             for trial in trials:
                 settings = CoarseToFineSettings(gravity=trial.gravity)
                 photo = read_photo(trial.rgb, ReadOptions(focal_px=trial.focal_px), trial.is_masked)

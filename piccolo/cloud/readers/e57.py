@@ -10,6 +10,7 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
@@ -28,7 +29,7 @@ from .e57_file import (
     refusing,
     text_of,
 )
-from .reader import CHUNK, OPTION, CloudFormat, PointSource, RawCloud, intensity_reader
+from .reader import CHUNK, OPTION, CloudFormat, PointSource, RawCloud, bare_points, intensity_reader
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -57,7 +58,7 @@ class E57Scan:
     label: str  # for messages
     num_points: int
     coordinates: tuple[str, ...]  # CARTESIAN or SPHERICAL
-    channels: tuple[str, ...]  # COLORS or INTENSITY alone
+    channels: tuple[str, ...]  # COLORS, or INTENSITY alone, or none
     invalid: tuple[str, ...]  # fields that are 0 in valid points
     color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
     pose: Pose | None  # the scanner is the camera
@@ -74,6 +75,8 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     range is the scan's colorLimits, or else that of the field's declaration; it is never guessed. If only
     some scans have colours, the others are left out, with a warning.
     """
+    if options.ignore_colors:
+        return _bare_source(path)
     with open_file(path) as file:
         scans, left_out = _scans(file, COLORS)
         measured, not_measured = ([], []) if scans else _scans(file, (INTENSITY,))
@@ -86,11 +89,31 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     read_chunks = intensity_reader(path, lambda: ((p, v[:, 0]) for _, p, v in _read(path, measured)))
     if scans:
         read_chunks = partial(_read_colored, path, scans)
-    poses = [scan.pose for scan in scans or measured if scan.pose is not None]
+    return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans or measured))
+
+
+def _bare_source(path: Path) -> PointSource:
+    """Return the points of all scans, of which only the shape counts."""
+    with open_file(path) as file:
+        scans, left_out = _scans(file, ())
+    if not scans:
+        raise InputError(f"{path}: {left_out[0] if left_out else 'no scans'}, wanted scans with points")
+    warnings = tuple(f"{path}: {what}; left out" for what in left_out)
+    num_points = sum(scan.num_points for scan in scans)
+    read_chunks = partial(_read_bare, path, scans)
+    return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans))
+
+
+def _read_bare(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
+    return bare_points(points for _, points, _ in _read(path, scans))
+
+
+def _station_axes(scans: list[E57Scan]) -> tuple[NDArray[np.float64], ...]:
+    """Return the z axes (3,) of the scanners whose poses are known."""
+    poses = [scan.pose for scan in scans if scan.pose is not None]
     # programs that know of no scanner write the identity
     placed = [p for p in poses if not np.array_equal(p.R_cam_from_world, np.eye(3)) or p.center_world.any()]
-    axes = tuple(pose.R_cam_from_world[2] for pose in placed)
-    return PointSource(path, read_chunks, num_points, warnings, axes)
+    return tuple(pose.R_cam_from_world[2] for pose in placed)
 
 
 def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:
@@ -122,9 +145,10 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise _UnusableError("has neither cartesian nor spherical coordinates")
     if not fields.keys() >= set(channels):
         raise _UnusableError("has no colours" if channels == COLORS else "has no intensity")
-    if channels != COLORS and fields.keys() >= set(COLORS):
+    if channels == (INTENSITY,) and fields.keys() >= set(COLORS):
         raise _UnusableError("has colours, but without a range")
-    invalid = (INVALID[coordinates], INVALID_COLOR if channels == COLORS else INVALID_INTENSITY)
+    of_channels = {COLORS: (INVALID_COLOR,), (INTENSITY,): (INVALID_INTENSITY,)}
+    invalid = (INVALID[coordinates], *of_channels.get(channels, ()))
     num_bits = sum(_num_bits(file.path, field) for field in prototype.iter())
     if num_bits == 0 or num_points * num_bits > 8 * file.size:
         found = f"promises {num_points} points of {num_bits} bits, found a file of {file.size} bytes"
@@ -182,11 +206,11 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
     with open_file(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
-                is_valid = np.ones(len(columns[scan.channels[0]]), dtype=np.bool_)
+                is_valid = np.ones(len(columns[scan.coordinates[0]]), dtype=np.bool_)
                 for name in scan.invalid:
                     is_valid &= columns[name] == 0
                 a, b, c = (columns[name][is_valid] for name in scan.coordinates)
-                channels = np.stack([columns[name][is_valid] for name in scan.channels], axis=1)
+                channels = np.array([columns[name][is_valid] for name in scan.channels]).reshape(-1, len(a)).T
                 with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
                     if scan.coordinates == SPHERICAL:
                         a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)

@@ -26,6 +26,7 @@ from .reader import (
     PointSource,
     PointsWithScalar,
     RawCloud,
+    bare_points,
     intensity_reader,
     label_reader,
     quote_line,
@@ -297,6 +298,8 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     if options.labels:
         read_chunks = label_reader(path, lambda: _read_scalar(header, layout, "class"), options.labels)
         return PointSource(path, read_chunks, header.num_points)
+    if options.ignore_colors:
+        return PointSource(path, lambda: _read_bare(header, layout), header.num_points)
     brightest, num_samples = _largest(header, layout, "rgb") if header.has_colors else (0, 0)
     if brightest == 0:
         return _gray_source(header, layout, options, num_samples)
@@ -308,6 +311,10 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         header.num_points,
         (f"{note} (largest value {brightest} in {num_samples} points checked)",) if is_8_bit else (),
     )
+
+
+def _read_bare(header: LasHeader, layout: LasLayout) -> Iterator[RawCloud]:
+    return bare_points(_points(header, records)[0] for records in _chunks(header, layout))
 
 
 def _gray_source(

@@ -168,17 +168,18 @@ def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """
     content = path.read_bytes()
     is_gltf = content.startswith(GLB_MAGIC) or path.suffix.lower() in (".glb", ".gltf")
-    return _source((load_gltf if is_gltf else load_obj)(path, content), options.scale)
+    return _source((load_gltf if is_gltf else load_obj)(path, content), options)
 
 
 def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return points on the faces of a PLY file, like `open_mesh`; textured if a comment names a texture."""
-    return _source(load_ply(path), options.scale)
+    return _source(load_ply(path), options)
 
 
-def _source(loaded: Loaded, scale: float) -> PointSource:
+def _source(loaded: Loaded, options: CloudSettings) -> PointSource:
     path = loaded.path
-    instances, notes = _instances(loaded)
+    scale = options.scale
+    instances, notes = _instances(loaded, options.ignore_colors)
     num_triangles = sum(len(instance.surface.triangles) for instance in instances)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
@@ -206,8 +207,8 @@ def _source(loaded: Loaded, scale: float) -> PointSource:
     return PointSource(path, read_chunks, num_points, tuple(notes), up=up)
 
 
-def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
-    """Return the coloured surfaces with the scene's transforms, and warnings for the user."""
+def _instances(loaded: Loaded, is_bare: bool) -> tuple[list[SurfaceInstance], list[str]]:
+    """Return the coloured surfaces with the scene's transforms, and warnings; bare, all in grey."""
     scene = loaded.scene
     path = loaded.path
     meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
@@ -220,18 +221,26 @@ def _instances(loaded: Loaded) -> tuple[list[SurfaceInstance], list[str]]:
         surface = surfaces.get(name)
         if surface is None:
             continue
+        if is_bare:
+            surface = make_gray(surface)
         if surface.colors is None and surface.texture is None:
             num_bare += 1
             continue
         instances.append(SurfaceInstance(surface, np.array(matrix, dtype=np.float64)))
     if not instances and not num_bare:
         raise InputError(f"{path}: no triangles, {WANTED}")
-    if not instances or _is_one_color([instance.surface for instance in instances]):
+    if not instances or (not is_bare and _is_one_color([instance.surface for instance in instances])):
         raise InputError(f"{path}: no colours, {WANTED}")
     # surfaces of one texture next to each other: it is decoded once
     first = {id(instance.surface.texture): i for i, instance in reversed(list(enumerate(instances)))}
     instances.sort(key=lambda instance: first[id(instance.surface.texture)])
     return instances, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
+
+
+def make_gray(surface: Surface) -> Surface:
+    """Return the triangles of a surface in grey."""
+    corners = np.broadcast_to(np.int64(0), surface.triangles.shape)
+    return Surface(surface.vertices, surface.triangles, colors=np.full((1, 3), 0.5), corners=corners)
 
 
 def _is_one_color(surfaces: list[Surface]) -> bool:

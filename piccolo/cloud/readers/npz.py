@@ -23,6 +23,7 @@ from .reader import (
     BRIGHTEST,
     CloudFormat,
     PointSource,
+    bare_points,
     color_chunks,
     find_full_brightness,
     in_chunks,
@@ -73,8 +74,11 @@ class ArrayInFile(NamedTuple):
 def open_npy(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """Return the points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255."""
     array = _open_array(path, None, path.stat().st_size)
-    if len(array.shape) != 2 or array.shape[1] != 6 or array.dtype.kind not in "fiu":
+    is_bare = options.ignore_colors and array.shape[1:] == (3,)
+    if len(array.shape) != 2 or not (is_bare or array.shape[1] == 6) or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
+    if options.ignore_colors:
+        return _bare_source(path, array)
     brightest = BRIGHTEST["u1"]
     return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
 
@@ -85,11 +89,22 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     The range of colours follows from their type: uint8 0-255, uint16 0-65535, float 0-1. An archive whose
     arrays promise more than 200 times the size of the file, or 16 GB, is refused.
     """
-    points, colors = (_open_array(path, info.filename, info.file_size) for info in _members(path))
+    arrays = [_open_array(path, m.filename, m.file_size) for m in _members(path, options.ignore_colors)]
+    points = arrays[0]
+    if options.ignore_colors and points.shape[1:] == (3,) and points.dtype.kind in "fiu":
+        return _bare_source(path, points)
+    colors = arrays[-1]
     if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {points} and {colors}, {WANTED}")
     brightest = find_full_brightness(path, [colors.dtype.str[1:]])
     return _source(path, lambda: zip(points.read_rows(), colors.read_rows(), strict=True), brightest, points)
+
+
+def _bare_source(path: Path, rows: ArrayInFile) -> PointSource:
+    """Return the source of points alone, in the first three columns."""
+    return PointSource(
+        path, lambda: bare_points(np.asarray(r[:, :3], np.float64) for r in rows.read_rows()), rows.shape[0]
+    )
 
 
 def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
@@ -125,12 +140,13 @@ def _open(path: Path, member: str | None) -> IO[bytes]:
         return archive.open(member)  # it outlives the archive
 
 
-def _members(path: Path) -> list[zipfile.ZipInfo]:
-    """Return an archive's arrays of points and of colours."""
+def _members(path: Path, is_bare: bool) -> list[zipfile.ZipInfo]:
+    """Return an archive's arrays of points and of colours; of points alone if only the shape counts."""
     with naming_damage(path), zipfile.ZipFile(path) as archive:
         members = {info.filename.removesuffix(".npy"): info for info in archive.infolist()}
-    names = [name for names in (POINTS_NAMES, COLORS_NAMES) for name in names if name in members]
-    if [name in COLORS_NAMES for name in names] != [False, True]:
+    kinds = (POINTS_NAMES,) if is_bare else (POINTS_NAMES, COLORS_NAMES)
+    names = [name for kind in kinds for name in kind if name in members]
+    if [name in COLORS_NAMES for name in names] != [False, True][: len(kinds)]:
         listed = quote_line(" ".join(list(members)[:12]).encode())
         raise InputError(f"{path}: the arrays are {listed}, {WANTED}")
     infos = [members[name] for name in names]

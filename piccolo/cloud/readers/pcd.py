@@ -197,7 +197,7 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
-    if fields[3].name in PACKED_NAMES:
+    if len(fields) > 3 and fields[3].name in PACKED_NAMES:
         read_chunks = partial(_read_packed, header, fields[3].type, read_columns)
         return PointSource(path, read_chunks, header.num_points)
     types = [field.type for field in fields[3:]]
@@ -211,11 +211,16 @@ def _select_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField,
     if options.labels:
         more = (LABEL,) * (LABEL in found)
         wanted = "wanted x y z and label"
+    elif options.ignore_colors:
+        more = ()
+        wanted = "wanted x y z"
     else:
         color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
         more = color or (INTENSITY,) * (INTENSITY in found)
         wanted = WANTED
-    if not more or not all(names.count(axis) == 1 and axis in found for axis in "xyz"):
+    if not (more or options.ignore_colors) or not all(
+        names.count(axis) == 1 and axis in found for axis in "xyz"
+    ):
         listed = " ".join(names[:12]) or "none"
         raise InputError(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
     if more == (INTENSITY,):

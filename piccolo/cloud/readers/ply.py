@@ -147,6 +147,8 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
 def _property_names(header: PlyHeader, options: CloudSettings) -> tuple[str, ...]:
     """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
     found = [prop.name for prop in header.vertices.properties]
+    if options.ignore_colors and {*"xyz"} <= {*found}:
+        return tuple("xyz")
     colors = () if options.labels else color_names(found)
     scalars = [name for name in found if name.lower() in INTENSITY_NAMES]
     if options.labels:

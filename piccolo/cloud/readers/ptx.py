@@ -18,7 +18,15 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import transform_points
 from ..settings import IN_METRES, CloudSettings
-from .reader import CloudFormat, PointSource, RawCloud, check_option, intensity_reader, quote_line
+from .reader import (
+    CloudFormat,
+    PointSource,
+    RawCloud,
+    bare_points,
+    check_option,
+    intensity_reader,
+    quote_line,
+)
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
@@ -50,7 +58,8 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         count, T_world_from_scanner = header
         last_of_header = lines.num_taken - 1
         if not scans and len((lines.peek() or b"").split()) == NUM_WITH_INTENSITY:
-            check_option(path, options, WANTED)
+            if not options.ignore_colors:
+                check_option(path, options, WANTED)
             has_colors = False
         found = lines.skip(count)
         if found < count:
@@ -62,6 +71,8 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
     read = partial(_read, path, COLORED if has_colors else WITH_INTENSITY, scans)
     read_chunks = (lambda: starmap(RawCloud, read())) if has_colors else intensity_reader(path, read)
+    if options.ignore_colors:
+        read_chunks = lambda: bare_points(points for points, _ in read())  # noqa: E731
     num_points = sum(scan.num_points for scan in scans)
     return PointSource(path, read_chunks, num_points, tuple(warnings), tuple(_station_axes(scans)))
 

@@ -44,6 +44,7 @@ OPTION = "`intensity_as_gray` uses it as gray values"
 BLACK, WHITE = 0.01, 0.99  # fraction of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
+GRAY = 128  # of points of which only the shape counts
 # as in PLY files, in lower case; the first that is found counts. CloudCompare prefixes `scalar_`
 LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
 MOST = 2.0**32  # labels are below it, and above its negative
@@ -164,7 +165,12 @@ def points_of(columns: Columns) -> NDArray[np.float64]:
 def column_source(
     path: Path, read_columns: ColumnReader, types: Sequence[str], num_points: int, labels: Labels | None
 ) -> PointSource:
-    """Return points with colours of three types, such as "u1", or with one scalar: label, else intensity."""
+    """Return points with colours of three types, such as "u1", or with one scalar: label, else intensity.
+
+    Without types only the shape counts: the points are grey.
+    """
+    if not types:
+        return PointSource(path, lambda: bare_points(map(points_of, read_columns())), num_points)
     if len(types) == 3:
         read_chunks: ChunkReader = partial(
             _read_colored, path, read_columns, find_full_brightness(path, types)
@@ -179,6 +185,11 @@ def column_source(
 def _read_colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
     parts = ((np.stack(c[:3], axis=1), np.stack(c[3:], axis=1)) for c in read_columns())
     return color_chunks(parts, brightest, partial(point_label, path))
+
+
+def bare_points(chunks: Iterable[NDArray[np.float64]]) -> Iterator[RawCloud]:
+    """Yield points (N, 3) of which only the shape counts, in grey."""
+    return (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points in chunks)
 
 
 def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:

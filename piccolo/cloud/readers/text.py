@@ -23,6 +23,7 @@ from .reader import (
     CloudFormat,
     PointSource,
     RawCloud,
+    bare_points,
     check_option,
     color_chunks,
     color_names,
@@ -211,6 +212,9 @@ def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: 
     def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
         return NumberLines(path, layout, wanted).read_points()
 
+    if options.ignore_colors:
+        bare = layout._replace(columns=layout.columns[:3])
+        return PointSource(path, lambda: bare_points(NumberLines(path, bare, wanted).read_rows()))
     if len(layout.columns) > NUM_WITH_INTENSITY:
         return PointSource(path, lambda: starmap(RawCloud, read()))
     check_option(path, options, wanted)
@@ -225,11 +229,11 @@ def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     Without one the first six columns are read; four are x y z and intensity.
     """
     with path.open("rb") as file:
-        layout = _layout(path, file.read(HEAD_SIZE))
+        layout = _layout(path, file.read(HEAD_SIZE), options.ignore_colors)
     return line_source(path, layout, options, WANTED)
 
 
-def _layout(path: Path, head: bytes) -> LineLayout:
+def _layout(path: Path, head: bytes, is_bare: bool) -> LineLayout:
     """Return the layout of a file, from its first lines."""
     if b"\0" in head:
         raise InputError(f"{path}: holds bytes that are no text, {WANTED}")
@@ -242,7 +246,7 @@ def _layout(path: Path, head: bytes) -> LineLayout:
         fields = text.split(_delimiter(text))
         if _begins_numbers(line.strip(), fields):
             break
-        named = _find_columns(text) or named
+        named = _find_columns(text, is_bare) or named
         if {*"xyz"} <= {*_names(text)}:
             header = text
         start += len(line)
@@ -252,7 +256,7 @@ def _layout(path: Path, head: bytes) -> LineLayout:
     if not named and len(_names(header)) == len(fields):
         raise InputError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
     has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
-    columns = named or tuple(range(NUM_WITH_INTENSITY if has_intensity else 6))
+    columns = named or tuple(range(3 if is_bare else NUM_WITH_INTENSITY if has_intensity else 6))
     if len(fields) <= max(columns):
         found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quote_line(line)}"
         raise InputError(f"{path}: {found}, {WANTED}")
@@ -275,13 +279,17 @@ def _names(header: str) -> list[str]:
     return [name.strip(' "').lower() for name in names.split(_delimiter(names))]
 
 
-def _find_columns(header: str) -> tuple[int, ...]:
-    """Return the columns of x, y, z and r, g, b, or of x, y, z and intensity; empty if not all are named."""
+def _find_columns(header: str, is_bare: bool) -> tuple[int, ...]:
+    """Return the columns of x, y, z and r, g, b, or of x, y, z and intensity; empty if not all are named.
+
+    Of x, y, z alone where only the shape counts.
+    """
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
     more = color_names(once) or tuple(name for name in once if name in INTENSITY_NAMES)[:1]
-    wanted = (*"xyz", *more)
-    return tuple(names.index(name) for name in wanted) if more and set(wanted) <= set(once) else ()
+    wanted = tuple("xyz") if is_bare else (*"xyz", *more)
+    is_found = (is_bare or more) and set(wanted) <= set(once)
+    return tuple(names.index(name) for name in wanted) if is_found else ()
 
 
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
@@ -299,6 +307,8 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     if line is None:
         raise InputError(f"{path}: no line of numbers, {PTS_WANTED}")
     num_columns = len(line.split())
+    if options.ignore_colors and num_columns >= 3:
+        return line_source(path, LineLayout((0, 1, 2), num_columns, has_counts=True), options, PTS_WANTED)
     if min(num_columns, 7) not in COLUMNS:
         found = f"{num_columns} columns, no colours: {quote_line(line)}"
         raise InputError(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
