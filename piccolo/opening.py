@@ -168,6 +168,8 @@ def scan_of(
             has_features=False,
             has_shape=cloud_settings.ignore_colors,
         )
+    elif cloud_settings.ignore_colors:
+        raise InputError("`ignore_colors`: not an option of the preset paper")
     else:
         with watch.stage("read"):
             points = cloud.read()

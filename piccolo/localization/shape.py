@@ -1,4 +1,4 @@
-"""How a photo was tilted, for a scan without colours: its lines against the vertical of the scan."""
+"""The tilt of a photo in a scan without colours: its lines against the vertical of the scan."""
 
 from dataclasses import replace
 

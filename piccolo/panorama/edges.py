@@ -18,6 +18,8 @@ SPREAD = 2.0  # [px] the painted edges of a scan are wide
 MARGIN = 32  # [px] beyond the seam
 AXES_WIDTH = 512  # [px] of the sphere on which the directions of lines are found
 FLAT_SHARE = 0.85  # of the pixels, with the weakest gradients: no edges
+LEAST_EDGE = 1e-4  # of the gradient of the logarithm
+LEAST_EDGES = 100  # [px] fewer say nothing
 AXES_RINGS = 60  # of the grid of directions that are tried: 3 degrees apart
 ACROSS = 0.035  # sine of the angle to the right angle, at most
 SHARPENINGS = 4
@@ -70,7 +72,9 @@ def find_axes(panorama: Panorama) -> list[Array]:
     is_inner &= np.cos(elevation)[:, None] > LEAST_COS
     if not is_inner.any():
         return []
-    is_edge = is_inner & (strength > np.quantile(strength[is_inner], FLAT_SHARE))
+    is_edge = is_inner & (strength > max(float(np.quantile(strength[is_inner], FLAT_SHARE)), LEAST_EDGE))
+    if is_edge.sum() < LEAST_EDGES:
+        return []
     normals = (across[..., None] * right + down[..., None] * below)[is_edge] / strength[is_edge][:, None]
     weights = np.cos(elevation)[np.nonzero(is_edge)[0]]
     tried = make_grid(AXES_RINGS).directions.astype(np.float64)

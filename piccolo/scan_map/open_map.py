@@ -119,6 +119,8 @@ def extend_map(
         digest = sha256_of_files(paths)
         crs = read_crs(paths)
     check_labels(map_path, old, cloud_settings)
+    if old.has_shape or cloud_settings.ignore_colors:
+        raise InputError(f"{map_path}: `add`: not with the shape alone")
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map; the map's is used")
     old = add_features(old, workers)

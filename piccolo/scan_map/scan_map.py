@@ -26,6 +26,7 @@ from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candi
 from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
 
+SHAPE_ALONE = "photos are localized by the shape of the scan alone, without colours"
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
 
 
@@ -185,6 +186,8 @@ def prepare_map(
         warnings = voxels.warnings
         if isinstance(up, str) and up == "auto":
             warnings += check_up(octree, R_map_from_world, cloud.up)
+    if has_shape:
+        warnings += (SHAPE_ALONE,)
     for warning in warnings:  # now: a wrong unit makes what follows long
         workers.warn(warning)
     with watch.stage("prepare"):

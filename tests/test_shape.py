@@ -1,0 +1,237 @@
+"""Scans without colours: edges of surfaces and of photos, the tilt by lines, and photos found by both."""
+
+import functools
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import rooms
+
+import piccolo
+from piccolo.cli import localize as command_line
+from piccolo.cloud import read_cloud
+from piccolo.cloud.octree import build_octree
+from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.shape import paint_shape
+from piccolo.cloud.stream import Cloud
+from piccolo.errors import InputError
+from piccolo.geometry.pose import exp_so3
+from piccolo.geometry.sphere import compute_indices, pixel_rays
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.panorama import Panorama
+from piccolo.panorama.edges import draw_edges, find_axes
+from piccolo.scan_map.map_file import load_map, save_map
+from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
+
+WIDTH = 1024
+SEED = 6  # of a room whose walls are plain: strong patterns hide its edges
+NUM_POINTS = 200_000
+LEVEL = np.eye(3)
+TILTED = exp_so3(np.array([0.5, 0.3, 0.2]))
+
+
+def _opponent(rgb):
+    """Strength of edges, and of vertical ones less others, each about in [0, 1] and [-1, 1]."""
+    r, g, b = np.moveaxis(rgb.astype(float) / 255.0, -1, 0)
+    return ((r + g + b) / 3.0 - 0.2) / 0.5, (r - b) / 2.0 / 0.3
+
+
+@functools.lru_cache
+def _shape_map():
+    cloud = rooms.room(SEED, NUM_POINTS)[1]
+    made = prepare_map(cloud, Workers(2), has_features=False, has_shape=True)
+    return replace(made, scan_sha256=64 * "0")
+
+
+def _turned(rgb, R_new_from_old):
+    """A panorama as a camera turned by a rotation takes it."""
+    indices = compute_indices(pixel_rays(rgb.shape[1]) @ R_new_from_old, rgb.shape[1])
+    return Panorama(rgb[indices], np.ones(indices[0].shape, bool))
+
+
+def _plane(axis, offset, low, high, step=0.015):
+    """Points (N, 3) of a part of a plane across an axis."""
+    a, b = np.meshgrid(np.arange(low, high, step), np.arange(low, high, step))
+    points = np.insert(np.stack([a.ravel(), b.ravel()], axis=1), axis, offset, axis=1)
+    return points + np.random.default_rng(axis).normal(0.0, 0.001, points.shape)
+
+
+@functools.lru_cache
+def _painted():
+    """A corner of walls and floor, and a plate: positions, strength of edges, vertical less others."""
+    plate = _plane(1, 4.0, 1.4, 2.2)
+    corner = [_plane(0, 0.0, 0.0, 3.0), _plane(1, 0.0, 0.0, 3.0), _plane(2, 0.0, 0.0, 3.0)]
+    points = np.concatenate([*corner, plate]).astype(np.float32)
+    voxels = Cloud(points, np.full(points.shape, 128, np.uint8), np.zeros(3)).voxels(np.eye(3))
+    leaves = paint_shape(build_octree(voxels), Workers(2)).level(0.02)
+    return leaves[:, :3] + voxels.origin, *_opponent(leaves[:, 3:] * 255.0)
+
+
+def _near(points, low, high):
+    return np.all((points > low) & (points < high), axis=1)
+
+
+def test_creases_are_painted_and_planes_are_not():
+    points, strength, vertical = _painted()
+    inner = _near(points, (-0.1, 0.5, 0.5), (0.1, 2.5, 2.5))
+    upright = _near(points, (-0.03, -0.03, 0.5), (0.03, 0.03, 2.5))
+    lying = _near(points, (-0.03, 0.5, -0.03), (0.03, 2.5, 0.03))
+    assert min(inner.sum(), upright.sum(), lying.sum()) > 50
+    assert np.median(strength[inner]) < 0.1
+    assert np.median(strength[upright]) > 0.7
+    assert np.median(strength[lying]) > 0.7
+    assert np.median(vertical[upright]) > 0.5
+    assert np.median(vertical[lying]) < -0.5
+
+
+def test_borders_of_surfaces_are_painted():
+    points, strength, vertical = _painted()
+    middle = _near(points, (1.65, 3.9, 1.65), (1.95, 4.1, 1.95))
+    side = _near(points, (1.38, 3.9, 1.6), (1.44, 4.1, 2.0))
+    below = _near(points, (1.6, 3.9, 1.38), (2.0, 4.1, 1.44))
+    assert np.median(strength[middle]) < 0.1
+    for edge, sign in ((side, 1.0), (below, -1.0)):
+        assert np.median(strength[edge]) > 0.5
+        assert np.median(sign * vertical[edge]) > 0.4
+
+
+def test_the_same_bits_with_any_number_of_threads():
+    octree = rooms.scan_map(1).octree
+    one, two = (paint_shape(octree, Workers(count)) for count in (1, 2))
+    np.testing.assert_array_equal(one.nodes, two.nodes)
+    np.testing.assert_array_equal(one.nodes[:, :3], octree.nodes[:, :3])
+
+
+@pytest.mark.parametrize("R_cam_from_level", [LEVEL, TILTED])
+def test_edges_of_a_photo_are_told_by_their_direction(R_cam_from_level):
+    """Before a bright square on a wall ahead, seen by a camera of known tilt."""
+    rays = pixel_rays(2 * WIDTH) @ R_cam_from_level
+    x, y, z = np.moveaxis(rays, -1, 0)
+    is_bright = (x > 0.0) & (np.abs(y) < 0.4 * x) & (np.abs(z) < 0.3 * x)
+    rgb = np.where(is_bright[..., None], np.uint8(200), np.uint8(60)).repeat(3, axis=2)
+    drawn = draw_edges(Panorama(rgb, np.ones(rgb.shape[:2], bool)), R_cam_from_level)
+    assert drawn.rgb.shape == (WIDTH // 2, WIDTH, 3)
+    strength, vertical = _opponent(drawn.rgb)
+
+    def at(x, y, z):
+        return compute_indices(R_cam_from_level @ np.array([x, y, z]), WIDTH)
+
+    side, top, inside = at(1.0, 0.4, 0.05), at(1.0, 0.05, 0.3), at(1.0, 0.1, 0.1)
+    assert min(strength[side], strength[top]) > 0.4
+    assert abs(strength[inside]) < 0.03
+    assert vertical[side] > 0.3
+    assert vertical[top] < -0.3
+
+
+def test_masked_pixels_have_no_edges_and_stay_masked():
+    rgb = rooms.query(1, width=WIDTH).rgb.copy()
+    is_valid = np.ones(rgb.shape[:2], bool)
+    is_valid[:, 300:500] = False
+    other = rgb.copy()
+    other[:, 302:498] = 255
+    one, two = (draw_edges(Panorama(picture, is_valid), LEVEL) for picture in (rgb, other))
+    np.testing.assert_array_equal(one.is_valid, is_valid)
+    np.testing.assert_array_equal(one.rgb[is_valid], two.rgb[is_valid])
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, -0.3, 1.0), (1.5, 0.2, 0.0), (2.9, 0.3, 0.0)])
+def test_the_vertical_is_among_the_axes_of_a_photos_lines(turn):
+    R = exp_so3(np.array(turn))
+    axes = np.array(find_axes(_turned(rooms.query(1, width=WIDTH).rgb, R)))
+    assert len(axes) == 6
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=1), 1.0)
+    assert np.degrees(np.arccos((axes @ R[:, 2]).max())) < 4.0
+    assert (np.diff(axes[:, 2]) <= 1e-12).all()
+    nothing = np.zeros((64, 128), bool)
+    assert find_axes(Panorama(np.zeros((64, 128, 3), np.uint8), nothing)) == []
+
+
+@pytest.mark.parametrize(("gravity", "R"), [("known", LEVEL), ("auto", LEVEL), ("auto", TILTED)])
+def test_a_photo_is_found_by_shape(gravity, R):
+    taken = rooms.query(SEED, width=WIDTH)
+    settings = CoarseToFineSettings(gravity=gravity)
+    found = localize(_shape_map(), _turned(taken.rgb, R), settings, Workers(2), Stopwatch())
+    true_pose = replace(taken.pose, R_cam_from_world=R @ taken.pose.R_cam_from_world)
+    distance, angle_deg = rooms.errors(found.pose, true_pose)
+    assert distance < 0.1
+    assert angle_deg < 4.0
+    assert found.evidence.num_matches is None
+    assert all(standing.kind == "shape alone" for standing in found.standings)
+
+
+def test_a_photo_of_another_room_is_not_localized():
+    photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
+    found = localize(_shape_map(), photo, CoarseToFineSettings(), Workers(2), Stopwatch())
+    assert found.status == "not_localized"
+
+
+def test_a_map_of_the_shape_is_kept_as_one(tmp_path):
+    save_map(_shape_map(), tmp_path / "bare.map")
+    back = load_map(tmp_path / "bare.map")
+    assert back.has_shape
+    assert SHAPE_ALONE in back.warnings
+    np.testing.assert_array_equal(back.octree.nodes, _shape_map().octree.nodes)
+    assert not rooms.scan_map(1).has_shape
+
+
+def _bare_files(folder, points):
+    """Files of points without colours, one of each format that needs nothing else."""
+    rows = [" ".join(f"{value:.4f}" for value in point) for point in points]
+    header = "ply\nformat ascii 1.0\nelement vertex {}\n" + "property double {}\n" * 3 + "end_header\n"
+    pcd = "VERSION 0.7\nFIELDS x y z\nSIZE 8 8 8\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {}\nHEIGHT 1\n"
+    pcd += "VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {}\nDATA ascii\n"
+    body = "\n".join(rows) + "\n"
+    texts = {
+        "bare.ply": header.format(len(points), *"xyz") + body,
+        "bare.pcd": pcd.format(len(points), len(points)) + body,
+        "bare.txt": body,
+        "named.txt": "x y z\n" + body,
+        "bare.pts": body,
+    }
+    for name, text in texts.items():
+        (folder / name).write_text(text)
+    np.save(folder / "bare.npy", points)
+    np.savez(folder / "bare.npz", points=points)
+    return [*texts, "bare.npy", "bare.npz"]
+
+
+def test_files_of_points_alone_are_read_and_others_say_how(tmp_path):
+    points = np.round(np.asarray(rooms.room(1)[1].points[:1500], np.float64), 4)
+    for name in _bare_files(tmp_path, points):
+        cloud = read_cloud(tmp_path / name, CloudSettings(ignore_colors=True))
+        found = np.asarray(cloud.points, np.float64) + cloud.origin_world
+        np.testing.assert_allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=1e-3)
+        with pytest.raises(InputError, match="`ignore_colors` localizes by the shape alone"):
+            read_cloud(tmp_path / name)
+    damaged = tmp_path / "broken.ply"
+    damaged.write_text("ply\nformat ascii 1.0\nend_header\n")
+    with pytest.raises(InputError, match="no element 'vertex'") as refused:
+        read_cloud(damaged)
+    assert "ignore_colors" not in str(refused.value)
+
+
+def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
+    for more in ({"labels": True}, {"intensity_as_gray": True}):
+        with pytest.raises(InputError, match="`ignore_colors`"):
+            piccolo.open_scan(tmp_path / "a.ply", ignore_colors=True, **more)
+    with pytest.raises(InputError, match="not an option of the preset paper"):
+        piccolo.open_scan(rooms.room(1)[1].points, ignore_colors=True, settings=piccolo.PaperSettings())
+
+
+def test_the_command_localizes_in_a_scan_without_colours(tmp_path, capsys):
+    cloud = rooms.room(SEED, NUM_POINTS)[1]
+    np.save(tmp_path / "bare.npy", np.asarray(cloud.points, np.float64) + cloud.origin_world)
+    taken = rooms.query(SEED, width=WIDTH)
+    cv2.imwrite(str(tmp_path / "a photo.png"), taken.rgb[..., ::-1])
+    arguments = ["--cloud", str(tmp_path / "bare.npy"), "--pano", str(tmp_path / "a photo.png")]
+    code = command_line.main([*arguments, "--ignore-colors", "--cache", "none", "--quiet"])
+    out = json.loads(capsys.readouterr().out)
+    found = out if out["center_world"] else out["best_guess"]
+    assert np.linalg.norm(np.array(found["center_world"]) - taken.pose.center_world) < 0.1
+    assert SHAPE_ALONE in out["warnings"]
+    assert code == (0 if out["status"] == "localized" else 1)
