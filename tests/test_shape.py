@@ -5,14 +5,18 @@ import json
 from dataclasses import replace
 
 import cv2
+import e57_files
 import numpy as np
 import pytest
 import rooms
+from las_files import OFFSETS, las_bytes
+from meshes import SQUARE, write_obj
 
 import piccolo
 from piccolo.cli import localize as command_line
 from piccolo.cloud import read_cloud
 from piccolo.cloud.octree import build_octree
+from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.shape import paint_shape
 from piccolo.cloud.stream import Cloud
@@ -24,7 +28,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
-from piccolo.panorama.edges import draw_edges, find_axes
+from piccolo.panorama.edges import draw_edges
+from piccolo.panorama.manhattan import find_axes
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 
@@ -197,17 +202,25 @@ def _bare_files(folder, points):
         (folder / name).write_text(text)
     np.save(folder / "bare.npy", points)
     np.savez(folder / "bare.npz", points=points)
-    return [*texts, "bare.npy", "bare.npz"]
+    (folder / "bare.las").write_bytes(las_bytes(RawCloud(points + OFFSETS, points), point_format=1))
+    columns = {f"cartesian{axis}": points[:, k] for k, axis in enumerate("XYZ")}
+    e57_files.write(folder / "bare.e57", [e57_files.ScanToWrite(columns)])
+    return [*texts, "bare.npy", "bare.npz", "bare.las", "bare.e57"]
 
 
 def test_files_of_points_alone_are_read_and_others_say_how(tmp_path):
     points = np.round(np.asarray(rooms.room(1)[1].points[:1500], np.float64), 4)
     for name in _bare_files(tmp_path, points):
         cloud = read_cloud(tmp_path / name, CloudSettings(ignore_colors=True))
-        found = np.asarray(cloud.points, np.float64) + cloud.origin_world
-        np.testing.assert_allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=1e-3)
+        found = (
+            np.asarray(cloud.points, np.float64) + cloud.origin_world - (OFFSETS if "las" in name else 0.0)
+        )
+        np.testing.assert_allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=2e-3)
         with pytest.raises(InputError, match="`ignore_colors` localizes by the shape alone"):
             read_cloud(tmp_path / name)
+    mesh = write_obj(tmp_path, mtl="", uv=None, library="", material="", vertices=3.0 * SQUARE)
+    cloud = read_cloud(mesh, CloudSettings(ignore_colors=True))
+    assert len(cloud.points) == pytest.approx(90_000, rel=0.01)
     damaged = tmp_path / "broken.ply"
     damaged.write_text("ply\nformat ascii 1.0\nend_header\n")
     with pytest.raises(InputError, match="no element 'vertex'") as refused:

@@ -71,7 +71,10 @@ def project_voxels(
     `turns` half of the height and of the width that is drawn for it [px].
     """
     height, width = is_drawn.shape
-    nodes, pixels, up, across = scratch.nodes, scratch.directions, scratch.ranges, scratch.turns
+    nodes = scratch.nodes
+    pixels = scratch.directions
+    up = scratch.ranges
+    across = scratch.turns
     count = collect(tree, center, VOXEL_PER_RANGE, nodes, pixels)
     num = 0
     for k in range(count):
@@ -113,8 +116,11 @@ def draw_voxels(
     sums[:] = F0
     for is_second in range(2):
         for k in range(count):
-            u, v, r = scratch.directions[0, k], scratch.directions[1, k], scratch.directions[2, k]
-            reach, across = scratch.ranges[k], scratch.turns[k]
+            u = scratch.directions[0, k]
+            v = scratch.directions[1, k]
+            r = scratch.directions[2, k]
+            reach = scratch.ranges[k]
+            across = scratch.turns[k]
             node = tree.nodes[scratch.nodes[k]]
             gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
             top: Any = max(np.int32(math.ceil(v - reach - HALF)), 0)

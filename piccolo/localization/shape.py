@@ -4,7 +4,7 @@ from dataclasses import replace
 
 from ..jobs.threads import Workers
 from ..panorama import Panorama
-from ..panorama.edges import find_axes
+from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import brief_query, score_starts
 from .query import prepare_query
