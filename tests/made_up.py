@@ -24,7 +24,7 @@ VIEWS = SimpleNamespace(averages=lambda *_: None, points=lambda *_: None, surrou
 NO_FEATURES = Once(lambda: Features(join_keypoints([]), NO_MATCHES))
 QUERY = Query(
     photo=WHOLE,
-    scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose),
+    scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose, has_shape=False),
     settings=CoarseToFineSettings(),
     workers=Workers(1),
     method=METHOD,

@@ -50,12 +50,13 @@ def test_right_and_wrong_evidence():
 
 
 def test_each_kind_of_evidence_has_a_model_of_its_own():
-    """Whole views alone have two features; local features count once they were asked, even if none agrees."""
+    """Shape and whole views alone have two features; local features count once they were asked, even if none agrees."""
     views = Standing(0.5, 0.2, None)
     np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
-    standings = [views, views._replace(num_matches=0), views._replace(num_matches=0, is_drawn=True)]
+    asked = views._replace(num_matches=0)
+    standings = [views._replace(is_shape=True), views, asked, asked._replace(is_drawn=True)]
     assert [standing.kind for standing in standings] == list(rule.MODELS)
-    assert [len(model.weights) for model in rule.MODELS.values()] == [2, 3, 3]
+    assert [len(model.weights) for model in rule.MODELS.values()] == [2, 2, 3, 3]
     for standing in standings:
         model = rule.MODELS[standing.kind]
         expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0

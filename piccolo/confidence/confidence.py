@@ -23,7 +23,17 @@ class Standing(NamedTuple):
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int | None  # local features that agree with it; None: whole views alone were compared
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
-    kind: str = "whole views alone"  # key in MODELS: what the photo was compared with
+    is_drawn: bool = False  # the matches are with the scan drawn at the pose, else with the map's features
+    is_shape: bool = False  # edges were compared in place of colours
+
+    @property
+    def kind(self) -> str:
+        """Key in MODELS: what the photo was compared with."""
+        if self.is_shape:
+            return "shape alone"
+        if self.num_matches is None:
+            return "whole views alone"
+        return "scan drawn at the pose" if self.is_drawn else "features of the map"
 
 
 class ChoiceModel(NamedTuple):

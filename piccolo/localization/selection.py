@@ -65,18 +65,11 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     standings = []
     for h, wrong in zip(hypotheses, is_wrong, strict=True):
         num_matches = count_agreeing(query, h.pose) if query.num_parts else None
-        log_odds_prior = log_prior if wrong else 0.0
-        standings.append(Standing(1.0, h.score, num_matches, log_odds_prior, kind_of_evidence(query)))
+        of_prior = log_prior if wrong else 0.0
+        is_drawn = query.photo.is_partial
+        is_shape = query.scan_map.has_shape
+        standings.append(Standing(1.0, h.score, num_matches, of_prior, is_drawn, is_shape))
     return standings
-
-
-def kind_of_evidence(query: Query) -> str:
-    """Return the key in MODELS of what a photo is compared with."""
-    if query.scan_map.has_shape:
-        return "shape alone"
-    if not query.num_parts:
-        return "whole views alone"
-    return "scan drawn at the pose" if query.photo.is_partial else "features of the map"
 
 
 def select(query: Query, found: Selection) -> Selection:

@@ -35,7 +35,7 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array) -> Panorama:
 
 
 def gradients(panorama: Panorama) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return the derivatives (H, W) of the grey's logarithm, to the right and down, a pixel of the equator."""
+    """Return the derivatives (H, W) of the grey's logarithm, right and down, by pixels of the equator."""
     gray = np.log(panorama.rgb.astype(np.float32).mean(axis=2) + np.float32(DARK))
     smooth = cv2.GaussianBlur(wrap(gray), (0, 0), SMOOTHING)
     inner = slice(MARGIN, -MARGIN)
