@@ -50,7 +50,7 @@ def test_right_and_wrong_evidence():
 
 
 def test_each_kind_of_evidence_has_a_model_of_its_own():
-    """Shape and whole views alone have two features; local features count once they were asked, even if none agrees."""
+    """Shape and whole views alone have two features; local features count once asked, even if none agrees."""
     views = Standing(0.5, 0.2, None)
     np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
     asked = views._replace(num_matches=0)
