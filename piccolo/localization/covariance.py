@@ -23,6 +23,8 @@ MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
+SHAPE_TURN = 0.005  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
+SHAPE_MOVE = 0.02  # [m]
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
@@ -154,7 +156,7 @@ def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the photo and of the scan.
 
     These are correlated over many blocks: a photo's grid and stitching, in pixels, and a scan's noise and
-    doubled surfaces, by `surface_noise`. The median range converts angles to displacements.
+    doubled surfaces, by `surface_noise`; of shape alone, its edges. The median range converts angles to displacements.
     """
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
     turn = pixel_share * query.photo.pixel
@@ -162,6 +164,9 @@ def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
     covariance = np.zeros((6, 6))
     covariance[:3, :3] = np.eye(3) * (turn**2 + np.trace(surface) / 3.0 / median_range**2)
     covariance[3:, 3:] = np.eye(3) * (turn * median_range) ** 2 + surface
+    if query.scan_map.has_shape:
+        covariance[:3, :3] += np.eye(3) * SHAPE_TURN**2
+        covariance[3:, 3:] += np.eye(3) * SHAPE_MOVE**2
     return covariance
 
 
