@@ -156,7 +156,8 @@ def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the photo and of the scan.
 
     These are correlated over many blocks: a photo's grid and stitching, in pixels, and a scan's noise and
-    doubled surfaces, by `surface_noise`; of shape alone, its edges. The median range converts angles to displacements.
+    doubled surfaces, by `surface_noise`; of shape alone, those of its edges. The median range converts angles
+    to displacements.
     """
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
     turn = pixel_share * query.photo.pixel
