@@ -57,18 +57,18 @@ def test_camera_is_found_by_labels(scene, capsys, preset):
 
 def test_ignored_labels_stand_in_the_result_and_everything_ignored_is_refused(scene, capsys):
     ceiling = str(LABEL_NAMES.index("ceiling"))
-    result, _, _ = _localized(scene, capsys, "--labels", "--ignore-labels", "99", ceiling)
+    result, _, _ = _localized(scene, capsys, "--labels", "99", ceiling)
     assert errors(result.pose, read_scene(scene).queries[0].pose)[0] < 0.05
     assert result.settings["cloud"]["labels"] == {"ignored": [int(ceiling), 99]}
     everything = map(str, range(len(LABEL_NAMES)))
-    _, code, err = _localized(scene, capsys, "--labels", "--ignore-labels", *everything)
+    _, code, err = _localized(scene, capsys, "--labels", *everything)
     assert code == 3
     assert "cloud.ply: found 0 finite points" in err
 
 
 def test_wrong_use_of_labels_is_refused(scene, capsys):
     for code, options, message in (
-        (2, "--ignore-labels 3", "--ignore-labels: only with --labels"),
+        (2, "--labels x", "argument --labels: invalid int value: 'x'"),
         (2, "--labels --intensity-as-gray", "--labels, --intensity-as-gray: found both"),
         (2, "--labels --fov 90", "--labels: found --fov or --projection too"),
         (3, "--labels", "clean_0.jpg: this kind of picture holds no labels, wanted a PNG"),

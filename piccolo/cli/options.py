@@ -94,8 +94,7 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--ignore-colors", "localize by the shape of the scan alone, with or without colours")
     option(group, "--intensity-as-gray", "use the intensities of clouds without colours as gray values")
     text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
-    option(group, "--labels", text)
-    option(group, "--ignore-labels N ...", "remove points with these labels, and mask their pixels")
+    option(group, "--labels N ...", f"{text}; points and pixels with labels N are left out", nargs="*")
 
 
 def _metres_of(text: str) -> float:
@@ -250,9 +249,7 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
 
 def _labels_from(arguments: argparse.Namespace) -> Labels | None:
     """Return how labels are to be read, None for colours."""
-    if arguments.ignore_labels and not arguments.labels:
-        raise InputError("--ignore-labels: only with --labels")
-    return Labels(tuple(sorted(set(arguments.ignore_labels or ())))) if arguments.labels else None
+    return None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
 
 
 def cache_from(arguments: argparse.Namespace) -> CachePolicy:

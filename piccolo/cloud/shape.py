@@ -5,9 +5,10 @@ is where a surface ends: the points around lie to one side. Both are painted as 
 channels of a colour: how strong the edge is, and how much stronger vertical ones are than the others.
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 from ..geometry.colors import colors_of_edges
 from ..geometry.pose import Array
@@ -43,6 +44,8 @@ def paint_shape(octree: Octree, workers: Workers) -> Octree:
 
 def find_edges(points: Array, workers: Workers) -> NDArray[np.uint8]:
     """Return the colours (N, 3) of the edges of surfaces at points (N, 3) [m], about SIZE apart, z up."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
+
     tree = cKDTree(points)
     parts = [slice(lo, lo + AT_ONCE) for lo in range(0, len(points), AT_ONCE)]
     normals = np.concatenate(
@@ -52,14 +55,14 @@ def find_edges(points: Array, workers: Workers) -> NDArray[np.uint8]:
     return np.concatenate(found or [np.empty((0, 3), np.uint8)])
 
 
-def neighbors(tree: cKDTree, points: Array, count: int, radius: float) -> tuple[NDArray[np.intp], Array]:
+def neighbors(tree: Any, points: Array, count: int, radius: float) -> tuple[NDArray[np.intp], Array]:
     """Return the indices (N, count) of the nearest points within a radius, and 1 for each that is there."""
     distances, indices = tree.query(points, count, distance_upper_bound=radius)
     is_there = np.isfinite(distances)
     return np.where(is_there, indices, 0), is_there.astype(np.float64)
 
 
-def find_normals(points: Array, tree: cKDTree, part: slice) -> Array:
+def find_normals(points: Array, tree: Any, part: slice) -> Array:
     """Return the unit normals (N, 3), of either sign, at a part of the points."""
     indices, weights = neighbors(tree, points[part], NUM_NORMAL, NORMAL_RADIUS)
     around = points[indices] - points[part][:, None]
@@ -69,7 +72,7 @@ def find_normals(points: Array, tree: cKDTree, part: slice) -> Array:
     return np.linalg.eigh(second - middle[:, :, None] * middle[:, None])[1][:, :, 0]
 
 
-def edges_of(points: Array, tree: cKDTree, normals: Array, part: slice) -> NDArray[np.uint8]:
+def edges_of(points: Array, tree: Any, normals: Array, part: slice) -> NDArray[np.uint8]:
     """Return the colours (N, 3) of the edges at a part of the points with normals (N, 3)."""
     indices, weights = neighbors(tree, points[part], NUM_EDGE, EDGE_RADIUS)
     total = weights.sum(axis=1)
