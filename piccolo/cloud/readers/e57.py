@@ -210,11 +210,8 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
                 for name in scan.invalid:
                     is_valid &= columns[name] == 0
                 a, b, c = (columns[name][is_valid] for name in scan.coordinates)
-                channels = (
-                    np.array([columns[name][is_valid] for name in scan.channels])
-                    .reshape(len(scan.channels), len(a))
-                    .T
-                )
+                kept = [columns[name][is_valid] for name in scan.channels]
+                channels = np.array(kept).reshape(len(kept), len(a)).T
                 with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
                     if scan.coordinates == SPHERICAL:
                         a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
