@@ -8,6 +8,7 @@ import io
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import BinaryIO, NamedTuple
@@ -26,7 +27,7 @@ from .reader import (
     PointSource,
     PointsWithScalar,
     RawCloud,
-    bare_points,
+    bare_reader,
     intensity_reader,
     label_reader,
     quote_line,
@@ -295,11 +296,10 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """
     header = read_header(path)
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
-    if options.labels:
-        read_chunks = label_reader(path, lambda: _read_scalar(header, layout, "class"), options.labels)
+    if options.labels or options.ignore_colors:
+        read = partial(_read_scalar, header, layout, "class")
+        read_chunks = label_reader(path, read, options.labels) if options.labels else bare_reader(read)
         return PointSource(path, read_chunks, header.num_points)
-    if options.ignore_colors:
-        return PointSource(path, lambda: _read_bare(header, layout), header.num_points)
     brightest, num_samples = _largest(header, layout, "rgb") if header.has_colors else (0, 0)
     if brightest == 0:
         return _gray_source(header, layout, options, num_samples)
@@ -313,20 +313,14 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     )
 
 
-def _read_bare(header: LasHeader, layout: LasLayout) -> Iterator[RawCloud]:
-    return bare_points(_points(header, records)[0] for records in _chunks(header, layout))
-
-
-def _gray_source(
-    header: LasHeader, layout: LasLayout, options: CloudSettings, num_samples: int
-) -> PointSource:
+def _gray_source(header: LasHeader, layout: LasLayout, options: CloudSettings, count: int) -> PointSource:
     if not options.intensity_as_gray:
-        why = f"red green blue are 0 in all {num_samples} points checked"
+        why = f"red green blue are 0 in all {count} points checked"
         if not header.has_colors:
             why = f"point format {header.point_format} has intensity only"
-        largest, num_samples = _largest(header, layout, "intensity")
+        largest, count = _largest(header, layout, "intensity")
         if largest == 0:
-            why += f"; its intensity is 0 in all {num_samples} points checked"
+            why += f"; its intensity is 0 in all {count} points checked"
             raise InputError(f"{header.path}: has neither colours nor intensity: {why}, {WANTED}")
         raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
     read_chunks = intensity_reader(header.path, lambda: _read_scalar(header, layout, "intensity"))

@@ -22,7 +22,7 @@ from .reader import (
     CloudFormat,
     PointSource,
     RawCloud,
-    bare_points,
+    bare_reader,
     check_option,
     intensity_reader,
     quote_line,
@@ -72,7 +72,7 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     read = partial(_read, path, COLORED if has_colors else WITH_INTENSITY, scans)
     read_chunks = (lambda: starmap(RawCloud, read())) if has_colors else intensity_reader(path, read)
     if options.ignore_colors:
-        read_chunks = lambda: bare_points(points for points, _ in read())  # noqa: E731
+        read_chunks = bare_reader(read)
     num_points = sum(scan.num_points for scan in scans)
     return PointSource(path, read_chunks, num_points, tuple(warnings), tuple(_station_axes(scans)))
 

@@ -192,6 +192,11 @@ def bare_points(chunks: Iterable[NDArray[np.float64]]) -> Iterator[RawCloud]:
     return (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points in chunks)
 
 
+def bare_reader(read_scalar: ScalarReader) -> ChunkReader:
+    """Return `read_chunks` of a PointSource for points of which only the shape counts."""
+    return lambda: bare_points(points for points, _ in read_scalar())
+
+
 def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
     return ((points_of(columns), columns[3].astype(np.float64)) for columns in read_columns())
 
