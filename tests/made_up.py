@@ -12,7 +12,7 @@ from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import last_descent, selection
 from piccolo.localization.comparison import Comparison
-from piccolo.localization.query import Cache, Features, Query
+from piccolo.localization.query import Cache, Features, Query, Seen
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
 
@@ -29,7 +29,7 @@ QUERY = Query(
     workers=Workers(1),
     method=METHOD,
     features=(NO_FEATURES, NO_FEATURES),
-    views=(),
+    seen=Once(lambda: Seen([], join_keypoints([]))),
     cache=Cache(VIEWS),
     num_parts=2,
 )

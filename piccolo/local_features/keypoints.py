@@ -81,7 +81,7 @@ def _on_sphere(
 ) -> Keypoints:
     """Convert a view's keypoints to rays, and their SIFT descriptors (N, 128) to RootSIFT."""
     height, width = view.rows.shape
-    per_px = 1.0 / view.focal
+    per_px = view.pixel
     points = np.array([(*k.pt, k.size, k.angle) for k in found])
     angle = np.radians(points[:, 3])
     left, up = (per_px * (0.5 * size - 0.5 - points[:, k]) for k, size in enumerate((width, height)))

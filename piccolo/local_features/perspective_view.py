@@ -26,12 +26,17 @@ class PerspectiveView(NamedTuple):
     """A perspective view (h, w) of a sphere's picture."""
 
     R_sphere_from_view: Array  # (3, 3), +x the view's middle, +y left, +z up
-    focal: float  # [px]
+    pixel: float  # width of a pixel, at a distance of 1
     columns: NDArray[np.float32]  # (h, w) of each pixel in the sphere's picture with its margin
     rows: NDArray[np.float32]
     is_own: NDArray[np.uint8]  # (h, w) 255 where no other view's middle is nearer, and a little beyond
     middles: Array  # (N, 3) of the views of the set
     place: int  # of this one among them
+
+    @property
+    def focal(self) -> float:
+        """Focal length [px]."""
+        return 1.0 / self.pixel
 
     def cut(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Cut the view (h, w) out of a sphere's picture (H, W)."""
@@ -65,8 +70,8 @@ def cover_sphere(width: int) -> list[PerspectiveView]:
         (c, ce), (s, se) = np.cos(angles), np.sin(angles)
         turns.append(np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]]))
     middles = np.stack(turns)[:, :, 0]
-    focal = 0.5 * side / reach
-    return [make_view(R, focal, (side, side), width, middles, k) for k, R in enumerate(turns)]
+    pixel = 2.0 * reach / side
+    return [make_view(R, pixel, (side, side), width, middles, k) for k, R in enumerate(turns)]
 
 
 def view_around(is_valid: NDArray[np.bool_], focal: float, width: int) -> PerspectiveView | None:
@@ -88,24 +93,26 @@ def view_around(is_valid: NDArray[np.bool_], focal: float, width: int) -> Perspe
         return None
     half_width, half_height = (np.abs(local[:, k] / local[:, 0]).max() + AROUND for k in (1, 2))
     shape = tuple(math.ceil(2.0 * focal * half / MULTIPLE) * MULTIPLE for half in (half_height, half_width))
-    return make_view(R_sphere_from_view, focal, (shape[0], shape[1]), width, middle[None], 0)
+    return make_view(R_sphere_from_view, 1.0 / focal, (shape[0], shape[1]), width, middle[None], 0)
 
 
 def make_view(
-    R_sphere_from_view: Array, focal: float, shape: tuple[int, int], width: int, middles: Array, place: int
+    R_sphere_from_view: Array, pixel: float, shape: tuple[int, int], width: int, middles: Array, place: int
 ) -> PerspectiveView:
-    """Make a view of `shape` (h, w) and a focal length [px] of a sphere's picture of `width`."""
-    height, across = shape
-    left, up = np.meshgrid(
-        (0.5 * across - 0.5 - np.arange(across)) / focal, (0.5 * height - 0.5 - np.arange(height)) / focal
-    )
+    """Make a view of `shape` (h, w) of a sphere's picture of `width`; `pixel` as of PerspectiveView."""
+    left, up = np.meshgrid(*(centers_of_pixels(count, pixel) for count in reversed(shape)))
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
     columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
     is_nearest = np.argmax(rays @ middles.T, axis=-1) == place
     own = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
     return PerspectiveView(
-        R_sphere_from_view, focal, columns, rows, np.asarray(own, np.uint8), middles, place
+        R_sphere_from_view, pixel, columns, rows, np.asarray(own, np.uint8), middles, place
     )
+
+
+def centers_of_pixels(count: int, pixel: float) -> Array:
+    """Return the middles (count,) of pixels, at a distance of 1, the first at the greatest."""
+    return np.asarray(0.5 * pixel * count * (1.0 - (2.0 * np.arange(count) + 1.0) / count))
 
 
 def add_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -81,7 +81,8 @@ def project_voxels(
         x, y, z = rotate(R_cam_from_map, (pixels[0, k], pixels[1, k], pixels[2, k]))
         r: Any = math.sqrt(x * x + y * y + z * z)
         u, v, px_per_rad, rho = project(x, y, z, r, focal, height, width)
-        if u < F0 or v < F0 or (focal > F0 and (u >= np.float32(width) or v >= np.float32(height))):
+        is_outside = u < F0 or v < F0 or u >= np.float32(width) or v >= np.float32(height)
+        if focal > F0 and is_outside:
             continue
         if not is_drawn[min(int(v), height - 1), min(int(u), width - 1)]:
             continue

@@ -82,6 +82,13 @@ class Photo:
         return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
 
 
+class Seen(NamedTuple):
+    """Views that show all of a photo, and the keypoints in them."""
+
+    views: list[PerspectiveView]
+    keypoints: Keypoints
+
+
 class Features(NamedTuple):
     """Keypoints of a photo, and the similar features of the map."""
 
@@ -112,7 +119,7 @@ class Query:
     workers: Workers
     method: MethodConfig
     features: tuple[Once[Features], ...]  # of a part of the photo's views each
-    views: tuple[PerspectiveView, ...]  # in which the features are found
+    seen: Once[Seen]  # what verification compares with the scan drawn at a pose
     cache: Cache
     num_parts: int  # of the features that are matched; 0 with whole views alone
 
@@ -183,19 +190,25 @@ def prepare_query(
         math.tau / min(panorama.rgb.shape[1], width),
     )
     photo.images.search()  # each search begins with it
-    parts = [] if scan_map.has_shape else find_parts(photo)
-    features = tuple(Once(partial(find_features, resized, scan_map, workers, views)) for views in parts)
-    cache = Cache(RecentViews(scan_map.octree))
-    views = tuple(view for part in parts for view in part)
-    return Query(photo, scan_map, settings, workers, method, features, views, cache, len(features))
-
-
-def find_parts(photo: Photo) -> list[list[PerspectiveView]]:
-    """Return the views in which a photo's features are found: one if it shows all, or two halves of many."""
-    width = photo.panorama.rgb.shape[1]
-    around = view_around(find_valid(photo.small), width / math.tau, width)
     every = cover_sphere(width)
-    return [[around]] if around else [[every[k] for k in half] for half in HALVES]
+    halves = () if scan_map.has_shape else HALVES
+    features = tuple(
+        Once(partial(find_features, resized, scan_map, workers, [every[k] for k in half])) for half in halves
+    )
+    cache = Cache(RecentViews(scan_map.octree))
+    seen = Once(partial(find_seen, photo, workers))
+    return Query(photo, scan_map, settings, workers, method, features, seen, cache, len(features))
+
+
+def find_seen(photo: Photo, workers: Workers) -> Seen:
+    """Find keypoints in one view around what a photo shows, or in those of many that show a part of it."""
+    panorama = photo.panorama
+    width = panorama.rgb.shape[1]
+    around = view_around(find_valid(photo.small), width / math.tau, width)
+    views = [around] if around else cover_sphere(width)
+    views = [view for view in views if view.cut_mask(panorama.is_valid).any()]
+    gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    return Seen(views, find_keypoints(gray, panorama.is_valid, views, workers))
 
 
 def find_features(

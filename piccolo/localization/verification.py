@@ -77,8 +77,8 @@ def matches_near(query: Query, pose: Pose) -> Matches:
 
 def match_drawn(query: Query, pose: Pose) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
-    own = join_keypoints([part().keypoints for part in query.features])
-    parts = [find_drawn(query, pose, view) for view in query.views]
+    views, own = query.seen()
+    parts = [find_drawn(query, pose, view) for view in views]
     drawn = join_keypoints([keypoints for keypoints, _ in parts])
     mine, theirs = match_pictures(own, drawn)
     ranges = np.concatenate([ranges for _, ranges in parts])[theirs]
