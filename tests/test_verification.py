@@ -225,5 +225,5 @@ def test_a_narrow_photo_of_unknown_gravity_is_found(seed, yaw):
     found = localize(rooms.scan_map(seed, NUM_POINTS), photo, SETTINGS, Workers(2), Stopwatch())
     distance, angle_deg = rooms.errors(found.pose, true_pose)
     assert found.status == "localized"
-    assert distance < 0.02
-    assert angle_deg < 0.5
+    assert distance < 0.05
+    assert angle_deg < 1.0
