@@ -17,6 +17,7 @@ from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
+from .geometry.colors import Labels
 from .geometry.pose import Pose, check_rotation
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
@@ -226,6 +227,16 @@ def settings_json(
     """Return the settings as a result's JSON has them."""
     reading = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(read_options).items()}
     return {**settings.to_json(), "cloud": asdict(cloud_settings), "panorama": reading}
+
+
+def read_options_of(result: Result) -> ReadOptions:
+    """Return the options with which the photo of a result was read when it was localized."""
+    how: Any = result.settings.get("panorama") or {}
+    labels = Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
+    if result.cameras:
+        return ReadOptions(labels=labels, calibration=Calibration("the result", result.cameras))
+    names = "fov_deg", "projection", "cube_order"
+    return ReadOptions(labels=labels, **{name: how.get(name) for name in names})
 
 
 def make_failed_result(

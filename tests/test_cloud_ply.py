@@ -165,7 +165,7 @@ def _cloud(num_points, dtype):
 def test_a_cloud_comes_back(tmp_path, dtype):
     points, colors, labels = _cloud(1000, dtype)
     path = tmp_path / "a b.ply"
-    write_ply(path, vertex_rows(points, colors, labels.astype(np.int32)))
+    write_ply(path, vertex_rows(points, colors, label=labels.astype(np.int32)))
     vertex = PlyData.read(path)["vertex"]
     assert [p.name for p in vertex.properties] == ["x", "y", "z", "red", "green", "blue", "label"]
     for k, name in enumerate("xyz"):

@@ -216,7 +216,7 @@ def write_scene(
             raise UsageError(f"--points: found {num_points}, wanted at least {MIN_POINTS} per room")
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors, labels = scan_world(world, num_points, workers)
-    rows = vertex_rows(points, colors, labels.astype(np.int32) if arguments.labels else None)
+    rows = vertex_rows(points, colors, label=labels.astype(np.int32) if arguments.labels else None)
     write_ply(folder / scenes.CLOUD_NAME, rows)
     if office is not None and arguments.walk:
         queries = write_walks(arguments, office, folder, workers)

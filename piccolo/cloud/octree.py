@@ -69,6 +69,31 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
             parents[part, k] = np.add.reduceat(column, places, dtype=np.float64) / counts
 
 
+def recolor(octree: Octree, colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Octree:
+    """Return the octree with leaves of other colours (leaves, 3), in [0, 1], and weights (leaves,).
+
+    A leaf of weight 0 gets its colour from those around it, the nearer level first.
+    """
+    start = octree.level_start
+    nodes = octree.nodes.copy()
+    nodes[start[-2] :, 3:] = colors
+    loads = np.zeros(len(nodes), np.float32)
+    loads[start[-2] :] = weights
+    levels = [slice(*start[k : k + 2]) for k in range(len(start) - 1)]
+    firsts = [octree.first_child[own] - own.stop for own in levels[:-1]]
+    for own, children, first in zip(levels[-2::-1], levels[:0:-1], firsts[::-1], strict=True):
+        loads[own] = np.add.reduceat(loads[children], first)
+        for k in range(3, 6):
+            sums = np.add.reduceat(nodes[children, k] * loads[children], first, dtype=np.float64)
+            nodes[own, k] = sums / np.maximum(loads[own], 1e-9)
+    for own, children, first in zip(levels[:-1], levels[1:], firsts, strict=True):
+        parents = np.repeat(nodes[own, 3:], np.diff(first, append=children.stop - children.start), axis=0)
+        nodes[children, 3:] = np.where(loads[children, None] > 0.0, nodes[children, 3:], parents)
+    for own, children, first in zip(levels[-2::-1], levels[:0:-1], firsts[::-1], strict=True):
+        average(nodes[children], first, nodes[own])
+    return octree._replace(nodes=nodes)
+
+
 @inline_kernel
 def uniform_level(least_distance: NDArray[np.float32], level: int, low: Scalar, high: Scalar) -> int:
     """Return the one level at which all below a node is drawn; 0 if there is none.

@@ -31,12 +31,11 @@ MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 
 
 def vertex_rows(
-    points: NDArray[np.floating[Any]], colors: NDArray[np.uint8], labels: NDArray[np.int32] | None = None
+    points: NDArray[np.floating[Any]], colors: NDArray[np.uint8], **more: NDArray[Any] | None
 ) -> Rows:
-    """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB and labels (N,)."""
+    """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB, and more (N,)."""
     columns = dict(zip(("x", "y", "z", *COLOR_NAMES), [*points.T, *colors.T], strict=True))
-    if labels is not None:
-        columns["label"] = labels
+    columns.update((name, column) for name, column in more.items() if column is not None)
     rows = np.empty(len(points), dtype=[(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column

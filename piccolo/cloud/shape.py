@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..geometry.colors import colors_of_edges
 from ..geometry.pose import Array
 from ..jobs.threads import Workers
-from .octree import Octree, average
+from .octree import Octree, recolor
 
 SIZE = 0.04  # [m] voxels whose surfaces are found
 NORMAL_RADIUS = 0.12  # [m] around a voxel, in which its normal is found
@@ -30,16 +30,10 @@ VERTICAL_BORDER = 0.9, 0.98
 def paint_shape(octree: Octree, workers: Workers) -> Octree:
     """Return the octree, in the map's frame, with edges of the surfaces in place of colours."""
     start = octree.level_start
-    nodes = octree.nodes.copy()
     begin, end = int(start[-3]), int(start[-2])
-    positions = nodes[begin:end, :3].astype(np.float64)
-    nodes[begin:end, 3:] = find_edges(positions, workers) / np.float32(255.0)
+    colors = find_edges(octree.nodes[begin:end, :3].astype(np.float64), workers) / np.float32(255.0)
     counts = np.diff(octree.first_child[begin : end + 1])
-    nodes[end:, 3:] = np.repeat(nodes[begin:end, 3:], counts, axis=0)
-    for level in reversed(range(len(start) - 3)):
-        first = octree.first_child[start[level] : start[level + 1]] - start[level + 1]
-        average(nodes[start[level + 1] : start[level + 2]], first, nodes[start[level] : start[level + 1]])
-    return octree._replace(nodes=nodes)
+    return recolor(octree, np.repeat(colors, counts, axis=0), np.ones(len(octree.nodes) - end, np.float32))
 
 
 def find_edges(points: Array, workers: Workers) -> NDArray[np.uint8]:

@@ -20,7 +20,7 @@ from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
-from ..opened_scan import File
+from ..opened_scan import File, read_options_of
 from ..opening import Units
 from ..panorama.photo import read_photo_facts
 from ..result import FAILED, UNREADABLE, Result, check_scan
@@ -30,7 +30,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
 from .entries import Entry, collect_entries, document_of_entry, shorten_names, unique_names
-from .pictures import extract_frames, make_pictures, read_options_of
+from .pictures import extract_frames, make_pictures
 from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 

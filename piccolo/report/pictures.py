@@ -17,17 +17,16 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Calibration
 from ..camera.model import pinhole
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
 from ..confidence.occlusion import occlusion_mask
 from ..errors import InputError
 from ..files.temporary import temporary_folder
-from ..geometry.colors import Labels
 from ..geometry.pose import Array, Pose, yaw_rotation
 from ..jobs.threads import Workers
-from ..panorama import Panorama, ReadOptions, read_panorama
+from ..opened_scan import read_options_of
+from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink
 from ..panorama.video import frames_at
 from ..result import Result
@@ -49,16 +48,6 @@ MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
-
-
-def read_options_of(result: Result) -> ReadOptions:
-    """Return the options with which the photo of a result was read when it was localized."""
-    how: Any = result.settings.get("panorama") or {}
-    labels = Labels(tuple(how["labels"]["ignored"])) if how.get("labels") else None
-    if result.cameras:
-        return ReadOptions(labels=labels, calibration=Calibration("the result", result.cameras))
-    names = "fov_deg", "projection", "cube_order"
-    return ReadOptions(labels=labels, **{name: how.get(name) for name in names})
 
 
 def make_pictures(

@@ -218,6 +218,20 @@ def prepare_map(
         return add_features(scan_map, workers) if has_features else scan_map
 
 
+def change_colors(scan_map: ScanMap, octree: Octree, workers: Workers) -> ScanMap:
+    """Return the map with an octree of the same points in other colours."""
+    wide = render_wide(octree, scan_map.centers[scan_map.sparse], SEARCH_VIEW, workers)
+    changed = replace(
+        scan_map,
+        octree=octree,
+        wide_features=wide.features,
+        wide_seen=wide.seen,
+        views=CandidateViews(octree, scan_map.centers, SEARCH_VIEW),
+        has_shape=False,
+    )
+    return defer_features(changed)
+
+
 def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[str, ...]:
     """Warn if the floors face clearly away from the map's z, naming the nearest axis."""
     axis, sense, reason, _ = find_up(octree)

@@ -62,7 +62,7 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
     warnings: list[str] = []
     has_labels = spec.cloud[0].label is not None
     no_labels = np.empty(0, np.int32) if has_labels else None
-    dtype = vertex_rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), no_labels).dtype
+    dtype = vertex_rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), label=no_labels).dtype
     with writing_ply(path, dtype) as writer:
         for part in spec.cloud:
             source = open_source(part.path)
@@ -74,7 +74,7 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
                     points, colors = validator.filter(raw)
                     moved = points if spec.transform is None else spec.transform.of_points(points)
                     labels = None if part.label is None else np.full(len(points), part.label, np.int32)
-                    writer.add(vertex_rows(moved, colors, labels))
+                    writer.add(vertex_rows(moved, colors, label=labels))
             except OSError as error:
                 raise unreadable(part.path, error) from error
         validator.check()

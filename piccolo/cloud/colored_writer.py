@@ -1,0 +1,95 @@
+"""Copies of clouds in other colours, chunk by chunk: PLY, LAS and LAZ, or E57."""
+
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..files.atomic import replacing
+from ..geometry.pose import Array
+from ..optional import import_optional
+from .ply_writer import needs_double, vertex_rows, writing_ply
+from .stream import CloudStream
+
+SUFFIXES = (".ply", ".las", ".laz", ".e57")
+LAS_STEP = 1e-4  # [m] of coordinates in LAS
+Colors = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # RGB (N, 3), and how many photos (N,) gave each
+Add = Callable[[Array, NDArray[np.uint8], NDArray[np.uint8]], None]  # points (N, 3) in the files' unit
+
+
+def write_colored(
+    cloud: CloudStream, color: Callable[[Array], Colors], box_world: Array, out: Path, crs: str = ""
+) -> tuple[int, int]:
+    """Write a cloud within a box (2, 3) [m] in the colours of `color(points_world)`, by the suffix of `out`.
+
+    Points (N, 3) [m] are coloured, and written in the files' unit and order with the number of photos that
+    gave the colour: PLY's `photos`, LAS's user data. Return the numbers of points, and of coloured ones.
+    """
+    num_points = num_colored = 0
+    writing = {".ply": writing_ply_rows, ".e57": writing_e57}.get(out.suffix.lower(), writing_las)
+    with writing(out, box_world / cloud.scale, cloud.scale, crs) as add:
+        for points_world, _ in cloud.chunks([]):
+            colors, num_photos = color(points_world)
+            add(points_world / cloud.scale, colors, num_photos)
+            num_points += len(points_world)
+            num_colored += int(np.count_nonzero(num_photos))
+    return num_points, num_colored
+
+
+@contextmanager
+def writing_ply_rows(out: Path, box: Array, scale: float, _crs: str) -> Iterator[Add]:
+    """Yield a function that adds points to a PLY file."""
+    dtype = np.float64 if needs_double(box * scale, np.eye(4), scale) else np.float32
+
+    def rows(points: Array, colors: NDArray[np.uint8], num_photos: NDArray[np.uint8]) -> NDArray[np.void]:
+        return vertex_rows(points.astype(dtype), colors, photos=num_photos)
+
+    empty = rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.uint8))
+    with writing_ply(out, empty.dtype) as writer:
+        yield lambda *columns: writer.add(rows(*columns))
+
+
+@contextmanager
+def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
+    """Yield a function that adds points to a LAS or LAZ file, in its coordinate system if one is known."""
+    laspy = import_optional(out, "laspy")
+    header = laspy.LasHeader(point_format=7, version="1.4")
+    header.scales = np.full(3, LAS_STEP / scale)
+    header.offsets = np.floor(box.mean(axis=0))
+    if crs:
+        pyproj = import_optional("a coordinate system in LAS", "pyproj", "tools")
+        header.add_crs(pyproj.CRS.from_user_input(crs))
+    is_packed = out.suffix.lower() == ".laz"
+    with replacing(out) as file:
+        writer = laspy.open(file, mode="w", header=header, do_compress=is_packed, closefd=False)
+
+        def add(points: Array, colors: NDArray[np.uint8], num_photos: NDArray[np.uint8]) -> None:
+            record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
+            record.x, record.y, record.z = points.T
+            record.red, record.green, record.blue = colors.T.astype(np.uint16) * 257
+            record.user_data = num_photos
+            writer.write_points(record)
+
+        yield add
+        writer.close()
+
+
+@contextmanager
+def writing_e57(out: Path, _box: Array, _scale: float, _crs: str) -> Iterator[Add]:
+    """Yield a function that adds points to an E57 file, whose library wants all of them at once."""
+    pye57 = import_optional(out, "pye57")
+    parts: list[tuple[Any, ...]] = []
+    yield lambda points, colors, _num_photos: parts.append((*points.T, *colors.T))
+    names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"
+    columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
+    with TemporaryDirectory(prefix="piccolo-") as folder, replacing(out) as file:
+        path = Path(folder) / "scan.e57"
+        with pye57.E57(str(path), mode="w") as writer:
+            writer.write_scan_raw(dict(zip(names, columns, strict=True)), name="coloured")
+        with path.open("rb") as written:
+            shutil.copyfileobj(written, file)

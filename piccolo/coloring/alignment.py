@@ -1,0 +1,282 @@
+"""Align localized photos with each other on the surfaces of a scan: where they look together, they agree.
+
+Minimised is the sum over points, and over the pairs of photos that see them, of a robust loss of the
+difference of their colours, with each pose's distance from where it was found before. All poses move at once,
+as those of neighbours hang together. After Zhou and Koltun, "Color Map Optimization for 3D Reconstruction
+with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree
+from ..geometry.pose import Array, Pose, log_so3, step
+from ..geometry.sphere import pixel_jacobian
+from ..jobs.threads import Workers
+from ..kernels.jit import F0, Scalar, kernel
+from ..optimize.channel_loss import geman_mcclure
+from ..panorama import Panorama
+from ..panorama.model import resize
+from ..panorama.texels import (
+    Texels,
+    blend_with_gradient,
+    in_camera,
+    is_valid,
+    locate_texel,
+    pack_texels,
+    pose_float32,
+)
+from .exposure import balance
+from .sight import look, weigh_points
+
+WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
+POINTS_PER_PHOTO = 5000
+LEAST_POINTS = 40_000
+MOST_SEEN = 6  # photos that count for a point: those that see it best
+LOSS_SCALE = 20.0  # [8-bit levels] of the length of a colour difference
+NOISE = 10.0  # [8-bit levels] of one
+NUM_ALIKE = 30.0  # points whose differences err alike: with fewer, weak constraints outweigh where poses were
+NUM_STEPS = 15  # a round, at most
+FIRST_DAMPING = 1e-3
+FALL = 0.2
+RISE = 8.0
+SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
+Array32 = NDArray[np.float32]
+
+
+class Anchor(NamedTuple):
+    """Where a photo was found, and how surely."""
+
+    pose: Pose  # in the map
+    information: Array  # (6, 6) of a step [rad, m] in the camera's frame
+
+
+class Sightings(NamedTuple):
+    """Which photos see which points; of point n those from first[n] to first[n + 1], in order of photos."""
+
+    first: NDArray[np.int64]  # (N + 1,)
+    point: NDArray[np.int64]  # (S,)
+    photo: NDArray[np.int64]  # (S,)
+
+
+class Aligned(NamedTuple):
+    """Photos that agree."""
+
+    poses: list[Pose]  # in the map
+    gains: Array32  # (photos, 3) by which colours are multiplied, so that exposures agree
+
+
+class Readings(NamedTuple):
+    """What photos show at points, for each sighting."""
+
+    values: Array32  # (S, 3) colours times gains [8-bit levels], NaN where the photo is masked
+    rows: Array32  # (S, 3, 6) their derivatives by a step of the pose
+
+
+def align(
+    octree: Octree, panoramas: Sequence[Panorama], poses: list[Pose], anchors: list[Anchor], workers: Workers
+) -> Aligned:
+    """Move the poses of photos in a map until the photos agree on its surfaces, near their anchors."""
+    leaves = octree.level(octree.leaf_size)
+    num_points = max(LEAST_POINTS, POINTS_PER_PHOTO * len(poses))
+    points = np.ascontiguousarray(leaves[:: -(-len(leaves) // num_points), :3])
+    gains = np.ones((len(poses), 3), np.float32)
+    for width in WIDTHS:
+        sized = [resize(panorama, width) for panorama in panoramas]
+        texels = [pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
+        sightings = find_sightings(octree, points, poses, workers)
+        values = read_all(points, sightings, texels, np.ones_like(gains), poses, workers).values
+        gains = balance(sightings.point, sightings.photo, values, len(poses))
+        poses = descend(points, sightings, texels, gains, poses, anchors, workers)
+    return Aligned(poses, gains)
+
+
+def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], workers: Workers) -> Sightings:
+    """Find which photos see points (N, 3), those alone that several see."""
+
+    def weigh(pose: Pose) -> Array32:
+        sight = look(octree, pose)
+        found = np.empty(len(points), np.float32)
+        weigh_points(points, *sight, pose.R_cam_from_world, pose.center_world, found)
+        return found
+
+    weights = np.stack(workers.map(weigh, poses, "see"), axis=1)
+    if len(poses) > MOST_SEEN:
+        least = np.partition(weights, -MOST_SEEN, axis=1)[:, -MOST_SEEN, None]
+        weights[weights < least] = 0.0
+    is_seen = weights > 0.0
+    is_seen &= is_seen.sum(axis=1, keepdims=True) > 1
+    point, photo = np.nonzero(is_seen)
+    return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo)
+
+
+def read_all(
+    points: Array32,
+    sightings: Sightings,
+    texels: Sequence[Texels],
+    gains: Array32,
+    poses: Sequence[Pose],
+    workers: Workers,
+) -> Readings:
+    """Read what the photos show at all points that they see."""
+    count = len(sightings.point)
+    readings = Readings(np.empty((count, 3), np.float32), np.empty((count, 3, 6), np.float32))
+
+    def read(k: int) -> None:
+        own = np.flatnonzero(sightings.photo == k)
+        pose = poses[k]
+        image = texels[k]
+        read_photo(
+            points, own, sightings.point, image.rgbx, image.width, gains[k],
+            pose.R_cam_from_world, pose.center_world, *readings,
+        )  # fmt: skip
+
+    workers.map(read, range(len(poses)), "read")
+    return readings
+
+
+def descend(
+    points: Array32,
+    sightings: Sightings,
+    texels: Sequence[Texels],
+    gains: Array32,
+    poses: list[Pose],
+    anchors: Sequence[Anchor],
+    workers: Workers,
+) -> list[Pose]:
+    """Return the poses at which photos agree best: Levenberg-Marquardt on all of them."""
+
+    def equations(at: Sequence[Pose]) -> tuple[float, Array, Array]:
+        readings = read_all(points, sightings, texels, gains, at, workers)
+        matrix = np.zeros((6 * len(at), 6 * len(at)))
+        gradient = np.zeros(6 * len(at))
+        loss = add_pairs(sightings.first, sightings.photo, *readings, LOSS_SCALE, matrix, gradient)
+        variance = NUM_ALIKE * NOISE**2
+        loss, matrix, gradient = loss / variance, matrix / variance, gradient / variance
+        for k, (pose, anchor) in enumerate(zip(at, anchors, strict=True)):
+            own = slice(6 * k, 6 * k + 6)
+            away = measure_step(anchor.pose, pose)
+            loss += 0.5 * away @ anchor.information @ away
+            matrix[own, own] += anchor.information
+            gradient[own] += anchor.information @ away
+        return loss, matrix, gradient
+
+    loss, matrix, gradient = equations(poses)
+    damping = FIRST_DAMPING
+    for _ in range(NUM_STEPS):
+        delta = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+        moved = [step(pose, delta[6 * k : 6 * k + 6]) for k, pose in enumerate(poses)]
+        found = equations(moved)
+        if found[0] < loss:
+            poses = moved
+            loss, matrix, gradient = found
+            damping *= FALL
+        else:
+            damping *= RISE
+        if np.abs(delta).max() < SETTLED:
+            break
+    return poses
+
+
+def measure_step(pose: Pose, other: Pose) -> Array:
+    """Return the step (6,) [rad, m], in the camera's frame, from a pose to another near it."""
+    turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
+    return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
+
+
+@kernel
+def read_photo(
+    points: Array32,
+    own: NDArray[np.int64],
+    point: NDArray[np.int64],
+    texels: NDArray[np.int32],
+    width: int,
+    gains: Array32,
+    R_cam_from_map: Array,
+    center_map: Array,
+    values: Array32,
+    rows: Array32,
+) -> None:
+    """Write the values (S, 3) and rows (S, 3, 6) of one photo's own sightings."""
+    pose = pose_float32(R_cam_from_map, center_map)
+    for s in own:
+        n = point[s]
+        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        rho2 = x * x + y * y
+        k, fu, fv = locate_texel(x, y, z, np.sqrt(rho2), width)
+        below = k + width + 2
+        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[below], texels[below + 1]
+        ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, rho2, np.float32(width))
+        is_shown = is_valid(t00, t10, t01, t11) > F0
+        for c in range(3):
+            value, by_u, by_v = blend_with_gradient(t00, t10, t01, t11, fu, fv, 8 * c)
+            values[s, c] = value * gains[c] if is_shown else np.float32(np.nan)
+            gx = gains[c] * (by_u * ux + by_v * vx)
+            gy = gains[c] * (by_u * uy + by_v * vy)
+            gz = gains[c] * (by_v * vz)
+            rows[s, c, 0] = y * gz - z * gy
+            rows[s, c, 1] = z * gx - x * gz
+            rows[s, c, 2] = x * gy - y * gx
+            rows[s, c, 3] = -gx
+            rows[s, c, 4] = -gy
+            rows[s, c, 5] = -gz
+
+
+@kernel
+def add_pairs(
+    first: NDArray[np.int64],
+    photo: NDArray[np.int64],
+    values: Array32,
+    rows: Array32,
+    scale: float,
+    matrix: Array,
+    gradient: Array,
+) -> float:
+    """Add the normal equations (6 K, 6 K), (6 K,) of the pairs of sightings of each point; return the loss.
+
+    The pairs of a point seen by n photos count 1 / n, so that all together count as n - 1 colours.
+    """
+    total = 0.0
+    per_scale2 = np.float32(1.0 / (scale * scale))
+    for n in range(len(first) - 1):
+        begin, end = first[n], first[n + 1]
+        for a in range(begin, end):
+            for b in range(begin, a):
+                square = F0
+                for c in range(3):
+                    square += (values[a, c] - values[b, c]) ** 2
+                if not square >= F0:  # NaN: masked
+                    continue
+                loss, weight = geman_mcclure(square, per_scale2)
+                weight /= end - begin
+                total += loss / (end - begin)
+                i, j = 6 * photo[a], 6 * photo[b]
+                for c in range(3):
+                    add_pair(rows[a, c], rows[b, c], values[a, c] - values[b, c], weight, i, j, matrix, gradient)
+    return total
+
+
+@kernel
+def add_pair(
+    row: Array32,
+    other: Array32,
+    error: Scalar,
+    weight: Scalar,
+    i: int,
+    j: int,
+    matrix: Array,
+    gradient: Array,
+) -> None:
+    """Add the equations of one difference, by its derivatives (6,) by the steps at i and, negative, at j."""
+    for p in range(6):
+        gradient[i + p] += weight * error * row[p]
+        gradient[j + p] -= weight * error * other[p]
+        for q in range(6):
+            cross = weight * row[p] * other[q]
+            matrix[i + p, i + q] += weight * row[p] * row[q]
+            matrix[j + p, j + q] += weight * other[p] * other[q]
+            matrix[i + p, j + q] -= cross
+            matrix[j + q, i + p] -= cross

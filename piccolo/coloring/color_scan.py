@@ -1,0 +1,122 @@
+"""A scan in the colours of photos that were localized in it, by its shape or by colours it has already."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud import open_cloud
+from ..cloud.colored_writer import SUFFIXES, write_colored
+from ..cloud.octree import recolor
+from ..confidence.confidence import LOCALIZED
+from ..errors import InputError
+from ..geometry.pose import Array, Pose
+from ..jobs.threads import Workers
+from ..opened_scan import OpenedScan, read_options_of
+from ..panorama import Panorama, read_panorama
+from ..panorama.model import shrink
+from ..result import Result
+from ..scan_map.open_map import find_prepared_map
+from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
+from .alignment import Anchor, align
+from .painting import WIDTH, Brush, Paint, make_brushes, paint_points
+
+LEAST_PHOTOS = 2
+UNKNOWN_STD = np.radians(0.5), 0.03  # [rad], [m] of a pose without a covariance
+PAINT_STD = 0.008  # [m] of positions in a scan whose colours are all of photos that found each other
+PAINTED = "photos are localized by the colours that they gave to the scan"
+
+
+class Colored(NamedTuple):
+    """What was coloured."""
+
+    num_photos: int
+    num_points: int
+    num_colored: int  # points that a photo sees
+
+
+def color_map(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> ScanMap:
+    """Return a map in the colours of the photos that were localized in it."""
+    octree = scan_map.octree
+    leaves = np.ascontiguousarray(octree.level(octree.leaf_size)[:, :3])
+    paint = paint_points(leaves, make_aligned_brushes(scan_map, results, workers), workers)
+    colors = paint.colors / np.float32(255.0)
+    painted = recolor(octree, colors, (paint.num_photos > 0).astype(np.float32))
+    notes = [note for note in scan_map.warnings if note not in (SHAPE_ALONE, PAINTED)]
+    return replace(
+        change_colors(scan_map, painted, workers),
+        surface_variance=scan_map.surface_variance + PAINT_STD**2 * np.eye(3),
+        warnings=(*notes, PAINTED),
+    )
+
+
+def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -> Colored:
+    """Write the points of a scan's files in the colours of photos that were localized in it.
+
+    Points that no photo sees are black. Raises InputError if the scan is not of files, if fewer than two
+    photos are localized, and for an unknown suffix.
+    """
+    scan_map = scan.prepared
+    paths = [Path(name) for name in ([scan.name] if isinstance(scan.name, str) else scan.name)]
+    if not isinstance(scan_map, ScanMap) or find_prepared_map(paths):
+        raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
+    check_suffix(out)
+    workers = scan.workers
+    brushes = make_aligned_brushes(scan_map, results, workers)
+
+    def color(points_world: Array) -> Paint:
+        points_map = (points_world - scan_map.origin_world) @ scan_map.R_map_from_world.T
+        return paint_points(points_map.astype(np.float32), brushes, Workers(workers.num_threads))
+
+    cloud = open_cloud(paths, scan.cloud_settings, workers.show)
+    counts = write_colored(cloud, color, box_world(scan_map), out, scan_map.crs)
+    return Colored(len(brushes), *counts)
+
+
+def check_suffix(out: Path) -> None:
+    """Refuse a name that does not say in which format a scan is to be written."""
+    if out.suffix.lower() not in SUFFIXES:
+        raise InputError(f"{out}: wanted a name that ends with {', '.join(SUFFIXES)}")
+
+
+def box_world(scan_map: ScanMap) -> Array:
+    """Return a box (2, 3) [m] in the world around all points of a map."""
+    leaves = scan_map.octree.level(scan_map.octree.leaf_size)[:, :3]
+    corners = np.array(np.meshgrid(*np.stack([leaves.min(axis=0), leaves.max(axis=0)], axis=1))).reshape(3, 8)
+    world = corners.T @ scan_map.R_map_from_world + scan_map.origin_world
+    return np.stack([world.min(axis=0), world.max(axis=0)])
+
+
+def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> list[Brush]:
+    """Align the photos that are localized, and return them as what gives colours."""
+    found = [(r, r.pose) for r in results if r.status == LOCALIZED and r.pose is not None]
+    if len(found) < LEAST_PHOTOS:
+        text = f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours"
+        raise InputError(text)
+    panoramas = workers.map(read_colors, [result for result, _ in found], "read")
+    poses = [scan_map.from_world(pose) for _, pose in found]
+    anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
+    aligned = align(scan_map.octree, panoramas, poses, anchors, workers)
+    return make_brushes(scan_map.octree, panoramas, aligned.poses, aligned.gains, workers)
+
+
+def read_colors(result: Result) -> Panorama:
+    """Read the photo of a result as it was read when it was localized, with its masks."""
+    how: Any = result.settings.get("panorama") or {}
+    mask = {"mask": how.get("mask") and Path(how["mask"]), "mask_nadir_deg": how.get("mask_nadir_deg") or 0.0}
+    return shrink(read_panorama(Path(result.pano), replace(read_options_of(result), **mask)), WIDTH)
+
+
+def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:
+    """Return where a result says that the photo was, and how surely."""
+    turn, move = UNKNOWN_STD
+    covariance = np.diag([turn**2] * 3 + [move**2] * 3)
+    if result.covariance is not None:
+        J = np.eye(6)
+        J[3:, 3:] = pose_world.R_cam_from_world
+        covariance = J @ result.covariance.matrix @ J.T
+    return Anchor(pose_map, np.linalg.inv(covariance))

@@ -1,0 +1,144 @@
+"""Colours of points from the photos that see them: weighted medians, so that no single photo decides."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..cloud.octree import Octree
+from ..geometry.pose import Array, Pose
+from ..jobs.threads import Workers
+from ..kernels.jit import F0, HALF, kernel
+from ..panorama import Panorama
+from ..panorama.model import shrink
+from ..panorama.texels import (
+    Texels,
+    bilinear_weights,
+    blend,
+    in_camera,
+    is_valid,
+    locate_texel,
+    pack_texels,
+    pose_float32,
+)
+from .sight import Sight, look, weigh_points
+
+WIDTH = 4096  # [px] of a photo, at most
+SAMPLES = 1 << 21  # of photos at points, that a task holds
+MOST_PHOTOS = 255  # that are counted for a point
+FULL = np.float32(255.0)
+Array32 = NDArray[np.float32]
+
+
+class Brush(NamedTuple):
+    """A photo that gives colours."""
+
+    texels: Texels
+    pose: Pose  # in the map
+    gains: Array32  # (3,) by which its colours are multiplied
+    sight: Sight
+
+
+class Paint(NamedTuple):
+    """Colours of points."""
+
+    colors: NDArray[np.uint8]  # (N, 3) RGB, 0 where no photo looks
+    num_photos: NDArray[np.uint8]  # (N,) that see the point
+
+
+def make_brushes(
+    octree: Octree, panoramas: Sequence[Panorama], poses: Sequence[Pose], gains: Array32, workers: Workers
+) -> list[Brush]:
+    """Return the photos at their poses in a map, with gains (photos, 3)."""
+
+    def make(k: int) -> Brush:
+        shown = shrink(panoramas[k], WIDTH)
+        return Brush(pack_texels(shown.rgb, shown.is_valid), poses[k], gains[k], look(octree, poses[k]))
+
+    return workers.map(make, range(len(poses)), "see")
+
+
+def paint_points(points: Array32, brushes: Sequence[Brush], workers: Workers) -> Paint:
+    """Return the colours of points (N, 3) of the map."""
+    paint = Paint(np.empty((len(points), 3), np.uint8), np.empty(len(points), np.uint8))
+    at_once = max(1, SAMPLES // len(brushes))
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + at_once)
+        some = points[part]
+        weights = np.empty((len(brushes), len(some)), np.float32)
+        colors = np.empty((len(brushes), len(some), 3), np.float32)
+        for k, (texels, pose, gains, sight) in enumerate(brushes):
+            R, t = pose.R_cam_from_world, pose.center_world
+            weigh_points(some, *sight, R, t, weights[k])
+            read_colors(some, texels.rgbx, texels.width, gains, R, t, weights[k], colors[k])
+        find_medians(colors, weights, paint.colors[part], paint.num_photos[part])
+
+    workers.map(run, range(0, len(points), at_once), "paint")
+    return paint
+
+
+@kernel
+def read_colors(
+    points: Array32,
+    texels: NDArray[np.int32],
+    width: int,
+    gains: Array32,
+    R_cam_from_map: Array,
+    center_map: Array,
+    weights: Array32,
+    colors: Array32,
+) -> None:
+    """Write what a photo shows at points (N, 3) of weights (N,) above 0; where it is masked, these become 0."""
+    pose = pose_float32(R_cam_from_map, center_map)
+    for n in range(len(points)):
+        if weights[n] <= F0:
+            continue
+        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        k, fu, fv = locate_texel(x, y, z, np.sqrt(x * x + y * y), width)
+        below = k + width + 2
+        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[below], texels[below + 1]
+        weights[n] *= is_valid(t00, t10, t01, t11)
+        blended = bilinear_weights(fu, fv)
+        for c in range(3):
+            colors[n, c] = min(blend(t00, t10, t01, t11, blended, 8 * c) * gains[c], FULL)
+
+
+@kernel
+def find_medians(
+    colors: Array32, weights: Array32, medians: NDArray[np.uint8], counts: NDArray[np.uint8]
+) -> None:
+    """Write the weighted medians (N, 3) of colours (K, N, 3), and how many (N,) of weights (K, N) are above 0.
+
+    Half of the weight is of colours that are not above the median.
+    """
+    num = len(weights)
+    values = np.empty(num, np.float32)
+    loads = np.empty(num, np.float32)
+    for n in range(weights.shape[1]):
+        count = 0
+        for k in range(num):
+            count += weights[k, n] > F0
+        counts[n] = min(count, MOST_PHOTOS)
+        for c in range(3):
+            total = F0
+            filled = 0
+            for k in range(num):
+                if weights[k, n] <= F0:
+                    continue
+                at = filled
+                while at > 0 and values[at - 1] > colors[k, n, c]:
+                    values[at] = values[at - 1]
+                    loads[at] = loads[at - 1]
+                    at -= 1
+                values[at] = colors[k, n, c]
+                loads[at] = weights[k, n]
+                total += weights[k, n]
+                filled += 1
+            at = 0
+            below = loads[0] if filled else F0
+            while below < HALF * total:
+                at += 1
+                below += loads[at]
+            medians[n, c] = np.uint8(values[at] + HALF) if filled else np.uint8(0)
