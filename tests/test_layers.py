@@ -22,6 +22,7 @@ LAYERS = [
     "batch",
     "opening",
     "scan",
+    "coloring",
     "opened_scan",
     "scan_walk",
     "result",

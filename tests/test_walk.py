@@ -250,19 +250,17 @@ def test_a_video_is_a_walk(building, tmp_path):
     folder, queries = building
     video = folder / "walk.mp4"
     out = tmp_path / "video.jsonl"
-    assert _command(folder, "--video", str(video), "--every", "1s", "--out", str(out)) == 0
+    assert _command(folder, "--video", str(video), "1s", "--out", str(out)) == 0
     results = read_results([out])
     _assert_right(results, queries[: 2 * len(results) : 2])
     assert [r.pano for r in results] == [f"{video}#t={k}.000" for k in range(len(results))]
     assert len(results) == (len(queries) + 1) // 2
     plan = tmp_path / "plan.svg"
-    assert (
-        _command(folder, "--video", str(video), "--every", "1s", "--out", str(out), "--plan", str(plan)) == 0
-    )
+    assert _command(folder, "--video", str(video), "1s", "--out", str(out), "--plan", str(plan)) == 0
     text = plan.read_text()  # of the results that are there
     assert text.count('id="walk.mp4#t=') == len(results)
     assert _command(folder, "--video", str(video), "--plan", str(tmp_path / "none" / "a.png")) == 3
-    assert _command(folder, "--video", str(video), "--every", "0.5m", "--out", str(out), "--overwrite") == 0
+    assert _command(folder, "--video", str(video), "0.5m", "--out", str(out), "--overwrite") == 0
     centers = [r.pose.center_world for r in read_results([out])]
     assert 2 <= len(centers) < len(queries)
     assert all(np.linalg.norm(b - a) >= 0.5 for a, b in pairwise(centers))
@@ -279,8 +277,8 @@ REFUSED = {
     "stdin": (["--walk", "--pano", "-"], 2, "--walk: found names on stdin, wanted files or folders"),
     "speed alone": (["--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: only with --walk or --video"),
     "jobs": (["--walk", "--pano", "a.jpg", "--jobs", "2"], 2, "--jobs: not with a walk"),
-    "every": (["--walk", "--pano", "a.jpg", "--every", "1s"], 2, "--every: only with --video"),
-    "step": (["--video", "a.mp4", "--every", "fast"], 2, "--every: found 'fast', wanted seconds or metres"),
+    "words": (["--video", "a.mp4", "1s", "2s"], 2, "--video: found 3 words, wanted a file and a step"),
+    "step": (["--video", "a.mp4", "fast"], 2, "--video: found the step 'fast', wanted seconds or metres"),
     "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
     "no step": (["--walk", "--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: found 0.0, wanted"),
     "plan alone": (["--pano", "a.jpg", "--plan", "a.png"], 2, "--plan: only with --walk or --video"),

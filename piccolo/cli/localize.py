@@ -34,6 +34,7 @@ from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from .bundle import check_bundle_options, run_bundle
+from .coloring import check_coloring_options, run_coloring
 from .command import command
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
 from .executing import (
@@ -77,11 +78,13 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
     given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
-    outputs = {"--out": arguments.out or STDOUT, "--plan": arguments.plan, **pictures}
+    outputs = {"--out": a.out or STDOUT, "--plan": a.plan, "--color-scan": a.color_scan, **pictures}
     check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
     check_output(arguments.out or STDOUT)
     if arguments.plan:
         check_plan(arguments.plan)
+    if arguments.color_scan:
+        check_output(arguments.color_scan)
     for option, path in pictures.items():
         if path is None or path.is_dir():
             continue
@@ -98,6 +101,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
         check_arguments(arguments)
         check_walk_options(arguments)
         check_bundle_options(arguments)
+        check_coloring_options(arguments)
         check_execution(arguments)
         limit_memory(arguments.max_memory)
         localizer = localizer_from(arguments, tuple(arguments.cloud))
@@ -282,11 +286,13 @@ def main(arguments: argparse.Namespace) -> int:
     run = prepare_run(arguments)
     if arguments.walk or arguments.video:
         return run_frames(run)
-    if arguments.relative:
+    if arguments.relative or arguments.color_scan:
         localizer = run.localizer
         opening = partial(open_scan, run, localizer, arguments.threads or num_cores())
-        photos = list(run.panoramas)
-        return run_bundle(arguments, photos, localizer, opening, partial(print_result, arguments))
+        run_together = run_bundle if arguments.relative else run_coloring
+        return run_together(
+            arguments, list(run.panoramas), localizer, opening, partial(print_result, arguments)
+        )
     rig = run.localizer.read_options.rig
     with open_output(arguments.out or STDOUT) as (file, write):
         records = take_up_results(run, file)

@@ -33,7 +33,8 @@ examples:
   python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 4
   python localize.py --cloud scan.ply --pano photos --relative transforms.json --out poses.jsonl
   python localize.py --cloud scan.ply --walk --pano frames --out walk.jsonl
-  python localize.py --cloud scan.ply --video walk.mp4 --every 0.5s --out walk.jsonl
+  python localize.py --cloud scan.ply --video walk.mp4 0.5s --out walk.jsonl
+  python localize.py --cloud bare.e57 --ignore-colors --pano photos --color-scan colored.ply --out poses.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
 
 output: one JSON object per photo and line, in the order given (docs/RESULT.md); messages and progress go
@@ -71,6 +72,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--overlay PNG", text + folder)
     text = "mask of the photo's size: white contradicts the scan, grey was not scanned, black elsewhere; "
     option(group, "--occlusion-mask PNG", text + folder)
+    text = "colour the scan by the photos (.ply, .las, .laz, .e57), and localize them again by these colours"
+    option(group, "--color-scan FILE", text)
     option(group, "--cache FOLDER", CACHE_TEXT)
     add_method_options(parser)
     add_prior_options(parser)
@@ -180,11 +183,11 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
-    option(group, "--video FILE", "video of a walk, instead of --pano")
     text = (
-        f"take the sharpest frame of every step of a video, 0.5s or 1m for example (default {DEFAULT_EVERY})"
+        "video of a walk, instead of --pano, and the step from one frame to the next, of which the sharpest "
     )
-    option(group, "--every STEP", text)
+    text += f"is taken: 0.5s or 1m for example (default {DEFAULT_EVERY})"
+    option(group, "--video FILE", text, nargs="+", metavar=("FILE", "STEP"))
     text = (
         f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file with "
     )

@@ -39,8 +39,8 @@ from .options import DEFAULT_EVERY
 from .outputs import check_suffix
 from .progress import progress_bar, show_progress
 
-EVERY = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
-ONLY_WITH = ("every", "times", "max_speed", "plan")
+STEP = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
+ONLY_WITH = ("times", "max_speed", "plan")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 KEY_BEGINS = b'{"'
 
@@ -62,8 +62,9 @@ class WalkInputs(NamedTuple):
 
 
 def check_walk_options(arguments: argparse.Namespace) -> None:
-    """Refuse what does not go together."""
+    """Refuse what does not go together; take the step of a video apart from its path."""
     is_video = arguments.video is not None
+    arguments.video, arguments.step = take_step(arguments.video or [None])
     if not (arguments.walk or is_video):
         if not arguments.pano:
             raise UsageError("the following arguments are required: --pano")
@@ -74,7 +75,6 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
     wrong = {
         "--walk, --video: wanted --walk with --pano, or --video alone": is_video == bool(arguments.pano),
         "--walk: found names on stdin, wanted files or folders": is_from_stdin(arguments.pano),
-        "--every: only with --video": not is_video and arguments.every is not None,
         "--times: not with --video, which contains its times": is_video and arguments.times is not None,
     }
     for name in NOT_WITH:
@@ -93,11 +93,19 @@ def motion_of(max_speed: float | None, has_times: bool) -> Motion:
     return Motion(max_speed or MAX_STEP, NO_ACCELERATION, False, max_speed is None)
 
 
-def every_of(text: str, max_speed: float) -> tuple[float, float]:
-    """Return the seconds from frame to frame, and the metres below which frames are dropped, of --every."""
-    found = EVERY.fullmatch(text)
+def take_step(words: Sequence[Path | None]) -> tuple[Path | None, str]:
+    """Return the path and the step of --video, a path of None without."""
+    path, *step = words
+    if len(step) > 1:
+        raise UsageError(f"--video: found {len(words)} words, wanted a file and a step, such as 0.5s")
+    return path, str(step[0]) if step else DEFAULT_EVERY
+
+
+def measure_step(text: str, max_speed: float) -> tuple[float, float]:
+    """Return the seconds from frame to frame, and the metres below which frames are dropped, of a step."""
+    found = STEP.fullmatch(text)
     if not found or not 0.0 < float(found[1]) < math.inf:
-        raise UsageError(f"--every: found {text!r}, wanted seconds or metres, such as 0.5s or 1m")
+        raise UsageError(f"--video: found the step {text!r}, wanted seconds or metres, such as 0.5s or 1m")
     value = float(found[1])
     return (value, 0.0) if found[2] == "s" else (value / max_speed, value)
 
@@ -112,7 +120,7 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
         yield WalkInputs(frames, motion_of(arguments.max_speed, times is not None), 0.0)
         return
     motion = motion_of(arguments.max_speed, True)
-    seconds, metres = every_of(arguments.every or DEFAULT_EVERY, motion.max_speed)
+    seconds, metres = measure_step(arguments.step, motion.max_speed)
     with temporary_folder() as folder:
         found = frames_of(arguments.video, seconds, folder)
         bar = {"desc": "read the video", "unit": " frames", "leave": False}

@@ -17,6 +17,7 @@ from .ply_writer import needs_double, vertex_rows, writing_ply
 from .stream import CloudStream
 
 SUFFIXES = (".ply", ".las", ".laz", ".e57")
+UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a scan in the axes of its file
 LAS_STEP = 1e-4  # [m] of coordinates in LAS
 Colors = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # RGB (N, 3), and how many photos (N,) gave each
 Add = Callable[[Array, NDArray[np.uint8], NDArray[np.uint8]], None]  # points (N, 3) in the files' unit
@@ -80,16 +81,18 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
 
 
 @contextmanager
-def writing_e57(out: Path, _box: Array, _scale: float, _crs: str) -> Iterator[Add]:
+def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add]:
     """Yield a function that adds points to an E57 file, whose library wants all of them at once."""
     pye57 = import_optional(out, "pye57")
+    middle = np.floor(box.mean(axis=0))  # coordinates are written in float32
     parts: list[tuple[Any, ...]] = []
-    yield lambda points, colors, _num_photos: parts.append((*points.T, *colors.T))
+    yield lambda points, colors, _num_photos: parts.append((*(points - middle).T, *colors.T))
     names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"
     columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
     with TemporaryDirectory(prefix="piccolo-") as folder, replacing(out) as file:
         path = Path(folder) / "scan.e57"
         with pye57.E57(str(path), mode="w") as writer:
-            writer.write_scan_raw(dict(zip(names, columns, strict=True)), name="coloured")
+            data = dict(zip(names, columns, strict=True))
+            writer.write_scan_raw(data, name="coloured", rotation=UNTURNED, translation=middle)
         with path.open("rb") as written:
             shutil.copyfileobj(written, file)

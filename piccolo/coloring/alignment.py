@@ -48,7 +48,7 @@ Array32 = NDArray[np.float32]
 
 
 class Anchor(NamedTuple):
-    """Where a photo was found, and how surely."""
+    """The pose at which a photo was found, and how sure that is."""
 
     pose: Pose  # in the map
     information: Array  # (6, 6) of a step [rad, m] in the camera's frame
@@ -70,7 +70,7 @@ class Aligned(NamedTuple):
 
 
 class Readings(NamedTuple):
-    """What photos show at points, for each sighting."""
+    """The colours that photos show at points, for each sighting."""
 
     values: Array32  # (S, 3) colours times gains [8-bit levels], NaN where the photo is masked
     rows: Array32  # (S, 3, 6) their derivatives by a step of the pose
@@ -155,11 +155,13 @@ def descend(
         gradient = np.zeros(6 * len(at))
         loss = add_pairs(sightings.first, sightings.photo, *readings, LOSS_SCALE, matrix, gradient)
         variance = NUM_ALIKE * NOISE**2
-        loss, matrix, gradient = loss / variance, matrix / variance, gradient / variance
+        loss /= variance
+        matrix /= variance
+        gradient /= variance
         for k, (pose, anchor) in enumerate(zip(at, anchors, strict=True)):
             own = slice(6 * k, 6 * k + 6)
             away = measure_step(anchor.pose, pose)
-            loss += 0.5 * away @ anchor.information @ away
+            loss += 0.5 * float(away @ anchor.information @ away)
             matrix[own, own] += anchor.information
             gradient[own] += anchor.information @ away
         return loss, matrix, gradient
@@ -167,7 +169,9 @@ def descend(
     loss, matrix, gradient = equations(poses)
     damping = FIRST_DAMPING
     for _ in range(NUM_STEPS):
-        delta = -np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), gradient)
+        delta = np.asarray(
+            np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -gradient), np.float64
+        )
         moved = [step(pose, delta[6 * k : 6 * k + 6]) for k, pose in enumerate(poses)]
         found = equations(moved)
         if found[0] < loss:
@@ -255,7 +259,9 @@ def add_pairs(
                 total += loss / (end - begin)
                 i, j = 6 * photo[a], 6 * photo[b]
                 for c in range(3):
-                    add_pair(rows[a, c], rows[b, c], values[a, c] - values[b, c], weight, i, j, matrix, gradient)
+                    add_pair(
+                        rows[a, c], rows[b, c], values[a, c] - values[b, c], weight, i, j, matrix, gradient
+                    )
     return total
 
 

@@ -2,12 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..cloud import open_cloud
 from ..cloud.colored_writer import SUFFIXES, write_colored
@@ -32,7 +30,7 @@ PAINTED = "photos are localized by the colours that they gave to the scan"
 
 
 class Colored(NamedTuple):
-    """What was coloured."""
+    """The numbers of photos and points of a scan that was coloured."""
 
     num_photos: int
     num_points: int
@@ -44,7 +42,7 @@ def color_map(scan_map: ScanMap, results: Sequence[Result], workers: Workers) ->
     octree = scan_map.octree
     leaves = np.ascontiguousarray(octree.level(octree.leaf_size)[:, :3])
     paint = paint_points(leaves, make_aligned_brushes(scan_map, results, workers), workers)
-    colors = paint.colors / np.float32(255.0)
+    colors = np.asarray(paint.colors / np.float32(255.0), np.float32)
     painted = recolor(octree, colors, (paint.num_photos > 0).astype(np.float32))
     notes = [note for note in scan_map.warnings if note not in (SHAPE_ALONE, PAINTED)]
     return replace(
@@ -107,8 +105,10 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
 def read_colors(result: Result) -> Panorama:
     """Read the photo of a result as it was read when it was localized, with its masks."""
     how: Any = result.settings.get("panorama") or {}
-    mask = {"mask": how.get("mask") and Path(how["mask"]), "mask_nadir_deg": how.get("mask_nadir_deg") or 0.0}
-    return shrink(read_panorama(Path(result.pano), replace(read_options_of(result), **mask)), WIDTH)
+    mask = Path(how["mask"]) if how.get("mask") else None
+    nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
+    options = replace(read_options_of(result), mask=mask, mask_nadir_deg=nadir_deg)
+    return shrink(read_panorama(Path(result.pano), options), WIDTH)
 
 
 def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:

@@ -17,7 +17,7 @@ def balance(
     `values` (S, 3) are what `photo` (S,) shows at `point` (S,), sorted by points. The logarithms of gains are
     found by robust least squares on those of ratios, their mean is 0.
     """
-    is_plain = ((values > DARKEST) & (values < BRIGHTEST)).all(axis=1)  # not NaN either
+    is_plain = np.asarray(np.all((values > DARKEST) & (values < BRIGHTEST), axis=1))  # not NaN either
     logs = np.log(np.where(is_plain[:, None], values, 1.0).astype(np.float64))
     pairs = [np.empty((0, 2), np.int64)]
     for apart in range(1, num_photos):
@@ -48,8 +48,6 @@ def solve(
     cross = np.bincount(i * count + j, weights, count * count).reshape(count, count)
     cross = cross + cross.T
     matrix = np.diag(cross.sum(axis=1) + 1.0) - cross  # one observation that a photo is like others
-    right = [
-        np.bincount(i, load, count) - np.bincount(j, load, count) for load in loads.T
-    ]
+    right = [np.bincount(i, load, count) - np.bincount(j, load, count) for load in loads.T]
     found = np.linalg.solve(matrix, np.stack(right, axis=1))
     return np.asarray(found - found.mean(axis=0))

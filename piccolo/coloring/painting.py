@@ -90,7 +90,7 @@ def read_colors(
     weights: Array32,
     colors: Array32,
 ) -> None:
-    """Write what a photo shows at points (N, 3) of weights (N,) above 0; where it is masked, these become 0."""
+    """Write what a photo shows at points (N, 3) whose weights (N,) are above 0; masked, they become 0."""
     pose = pose_float32(R_cam_from_map, center_map)
     for n in range(len(points)):
         if weights[n] <= F0:
@@ -109,7 +109,7 @@ def read_colors(
 def find_medians(
     colors: Array32, weights: Array32, medians: NDArray[np.uint8], counts: NDArray[np.uint8]
 ) -> None:
-    """Write the weighted medians (N, 3) of colours (K, N, 3), and how many (N,) of weights (K, N) are above 0.
+    """Write weighted medians (N, 3) of colours (K, N, 3), and how many (N,) of weights (K, N) are above 0.
 
     Half of the weight is of colours that are not above the median.
     """

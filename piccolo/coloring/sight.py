@@ -1,4 +1,4 @@
-"""What a photo sees of a scan: how far the surfaces are around it, and how well it sees them."""
+"""The surfaces of a scan that a photo sees: how far away they are, and how well it sees them."""
 
 from typing import NamedTuple
 

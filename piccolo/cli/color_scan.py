@@ -1,0 +1,53 @@
+"""Colour a scan by photos that were localized in it."""
+
+import argparse
+import json
+
+from ..coloring.color_scan import check_suffix, write_colored_scan
+from ..jobs.threads import Workers, num_cores
+from ..localization.settings import CoarseToFineSettings
+from ..opening import open_files
+from ..result import read_results
+from .command import command, option, print_warnings
+from .errors import checking_options
+from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
+from .outputs import check_outputs, print_report
+from .progress import progress_bar, warn_once
+
+EPILOG = """\
+examples:
+  python tools/color_scan.py --cloud bare.e57 --ignore-colors --results poses.jsonl --out colored.e57
+  python tools/color_scan.py --cloud old.laz --results poses.jsonl --out colored.laz
+
+The photos are aligned with each other first, on the surfaces of the scan, and their exposures are balanced.
+A point gets the weighted median of the photos that see it: by the cosine of the angle to its surface,
+divided by the squared distance. Points that no photo sees are black. PLY has the number of photos of each
+point as the property `photos`, LAS and LAZ as user data. Prints one JSON object to stdout.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
+    add_cloud_options(parser, "files of the scan in which the photos were localized")
+    option(parser, "--out FILE", "the scan in colours: .ply, .las, .laz or .e57", required=True)
+    option(parser, "--cache FOLDER", CACHE_TEXT)
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
+    """Read, align, paint, write; returns the exit code."""
+    with checking_options():
+        settings = cloud_settings_from(arguments)
+        check_suffix(arguments.out)
+    check_outputs({"--out": arguments.out}, [*arguments.cloud, *arguments.results])
+    results = read_results(arguments.results)
+    workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    cache = cache_from(arguments)
+    scan = open_files(arguments.cloud, settings, CoarseToFineSettings(), cache, workers)
+    print_warnings(arguments, scan.warnings)
+    colored = write_colored_scan(scan, results, arguments.out)
+    line = {"out": str(arguments.out), "photos": colored.num_photos, "points": colored.num_points}
+    line["colored_points"] = colored.num_colored
+    print_report(arguments, {}, json.dumps(line))
+    return 0

@@ -1,0 +1,72 @@
+"""localize.py --color-scan: photos colour a scan, and are localized again by the colours of the others."""
+
+import argparse
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..batch.inputs import is_from_stdin
+from ..batch.localizer import Localizer
+from ..batch.results_file import WAYS
+from ..coloring.color_scan import check_suffix, color_map, write_colored_scan
+from ..files.atomic import is_stream
+from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import OpenedScan
+from ..result import Result
+from ..scan_map.scan_map import ScanMap
+from .errors import UsageError, print_note
+from .executing import choose_exit_code
+from .progress import progress_bar
+from .walking import write_all
+
+NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
+NOT_WITH = ("walk", "video", "relative", "jobs", "dask", "overlay", "occlusion_mask", "labels")
+
+
+def check_coloring_options(arguments: argparse.Namespace) -> None:
+    """Refuse options that do not go with --color-scan."""
+    if not arguments.color_scan:
+        return
+    for name in NOT_WITH:
+        if getattr(arguments, name) not in (None, False):
+            raise UsageError(f"--{name.replace('_', '-')}: not with --color-scan")
+    if is_from_stdin(arguments.pano):
+        raise UsageError("--color-scan: found names on stdin, wanted files or folders")
+    check_suffix(arguments.color_scan)
+    out = arguments.out
+    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
+        raise UsageError(f"--out: {out} has results already; {WAYS}")
+
+
+def run_coloring(
+    arguments: argparse.Namespace,
+    photos: Sequence[Path],
+    localizer: Localizer,
+    open_scan: Callable[[], OpenedScan],
+    print_result: Callable[[Result, Sequence[str]], None],
+) -> int:
+    """Localize the photos, write the scan in their colours, then the results; return the exit code."""
+    if not isinstance(localizer.settings, CoarseToFineSettings):
+        raise UsageError("--color-scan: not an option of the preset paper")
+    show = progress_bar(arguments.quiet)
+    scan = open_scan()
+
+    def localize_all() -> list[Result]:
+        shown = show(iter(photos), len(photos), "photos")
+        return [localizer.answer(scan, localizer.task(photo)).result for photo in shown]
+
+    results = localize_all()
+    for _ in range(NUM_ROUNDS):
+        assert isinstance(scan.prepared, ScanMap)
+        scan = replace(scan, prepared=color_map(scan.prepared, results, scan.workers))
+        results = localize_all()
+    colored = write_colored_scan(scan, results, arguments.color_scan)
+    write_all(arguments.out, results)
+    for result in results:
+        print_result(result, result.warnings[len(scan.warnings) :])
+    share = 100.0 * colored.num_colored / max(colored.num_points, 1)
+    counts = Counter(result.status for result in results)
+    words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
+    print_note(arguments, f"{len(results)} photos: {words}; {share:.0f} % of the points coloured")
+    return choose_exit_code(counts)
