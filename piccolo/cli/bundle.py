@@ -22,9 +22,22 @@ NOT_WITH = ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "prior
 
 def check_bundle_options(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go with --relative."""
-    for name in NOT_WITH if arguments.relative else ():
+    if arguments.relative:
+        check_alone(arguments, "--relative", NOT_WITH)
+
+
+def check_alone(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
+    """Refuse the others of an option that does not go with them."""
+    for name in others:
         if getattr(arguments, name) not in (None, False):
-            raise UsageError(f"--{name.replace('_', '-')}: not with --relative")
+            raise UsageError(f"--{name.replace('_', '-')}: not with {option}")
+
+
+def check_new_results(arguments: argparse.Namespace) -> None:
+    """Refuse a file of --out that has results, without --overwrite: all are written at once."""
+    out = arguments.out
+    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
+        raise UsageError(f"--out: {out} has results already; {WAYS}")
 
 
 def run_bundle(
@@ -37,15 +50,13 @@ def run_bundle(
     """Localize the photos together, write their results at once, return the exit code."""
     if not isinstance(localizer.settings, CoarseToFineSettings):
         raise UsageError("--relative: not an option of the preset paper")
-    out = arguments.out
-    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
-        raise UsageError(f"--out: {out} has results already; {WAYS}")
+    check_new_results(arguments)
     poses = read_relative_poses(arguments.relative, photos)
     watch = Stopwatch()
     with watch.stage("all"):
         scan = open_scan()
         results = scan.localize_bundle(photos, poses, localizer.read_options, localizer.settings)
-    write_all(out, results)
+    write_all(arguments.out, results)
     for result in results:
         print_result(result, result.warnings[len(scan.warnings) :])
     counts = Counter(result.status for result in results)

@@ -8,13 +8,12 @@ from pathlib import Path
 
 from ..batch.inputs import is_from_stdin
 from ..batch.localizer import Localizer
-from ..batch.results_file import WAYS
 from ..coloring.color_scan import check_suffix, color_map, write_colored_scan
-from ..files.atomic import is_stream
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
 from ..scan_map.scan_map import ScanMap
+from .bundle import check_alone, check_new_results
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
 from .progress import progress_bar
@@ -28,15 +27,11 @@ def check_coloring_options(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go with --color-scan."""
     if not arguments.color_scan:
         return
-    for name in NOT_WITH:
-        if getattr(arguments, name) not in (None, False):
-            raise UsageError(f"--{name.replace('_', '-')}: not with --color-scan")
+    check_alone(arguments, "--color-scan", NOT_WITH)
     if is_from_stdin(arguments.pano):
         raise UsageError("--color-scan: found names on stdin, wanted files or folders")
     check_suffix(arguments.color_scan)
-    out = arguments.out
-    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
-        raise UsageError(f"--out: {out} has results already; {WAYS}")
+    check_new_results(arguments)
 
 
 def run_coloring(
