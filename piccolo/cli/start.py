@@ -17,8 +17,8 @@ from ..jobs.arenas import share_arenas
 
 # Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
 COMMANDS = (
-    "localize", "align_gravity", "prepare_map", "render_pose", "export_poses", "report", "e57_images",
-    "make_room", "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
+    "localize", "align_gravity", "prepare_map", "render_pose", "color_scan", "export_poses", "report",
+    "e57_images", "make_room", "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
 )  # fmt: skip
 SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
 # a parameter of the API in a message, the unit in its name, and those whose flag has another name
