@@ -195,7 +195,10 @@ def advise(result: Result) -> list[str]:
 
 
 def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequence[str]) -> None:
-    """Print what was found, the warnings, and what to do about a doubtful result, unless --quiet."""
+    """Print an error; or, unless --quiet, what was found, the warnings, and what to do if it is doubtful."""
+    if result.error is not None:
+        print_error(arguments, result.error, EXIT_BAD_INPUT)
+        return
     if arguments.quiet:
         return
     lines = [f"  warning: {for_terminal(printable(warning))}" for warning in warnings]
@@ -212,10 +215,7 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     for path, png in pictures:
         if path and png is not None:
             write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
-    if result.error is not None:
-        print_error(arguments, result.error, EXIT_BAD_INPUT)
-    else:
-        print_result(arguments, result, answer.warnings)
+    print_result(arguments, result, answer.warnings)
     write(result.to_json())
     run.counts[result.status] += 1
 

@@ -4,13 +4,13 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..files.atomic import replacing
+from ..files.temporary import temporary_folder
 from ..geometry.pose import Array
 from ..optional import import_optional
 from .ply_writer import needs_double, vertex_rows, writing_ply
@@ -89,8 +89,8 @@ def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add
     yield lambda points, colors, _num_photos: parts.append((*(points - middle).T, *colors.T))
     names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"
     columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
-    with TemporaryDirectory(prefix="piccolo-") as folder, replacing(out) as file:
-        path = Path(folder) / "scan.e57"
+    with temporary_folder() as folder, replacing(out) as file:
+        path = folder / "scan.e57"
         with pye57.E57(str(path), mode="w") as writer:
             data = dict(zip(names, columns, strict=True))
             writer.write_scan_raw(data, name="coloured", rotation=UNTURNED, translation=middle)

@@ -18,6 +18,7 @@ from ..geometry.sphere import pixel_jacobian
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, kernel
 from ..optimize.channel_loss import geman_mcclure
+from ..optimize.levenberg_marquardt import FALL, FIRST_DAMPING, RISE
 from ..panorama import Panorama
 from ..panorama.model import resize
 from ..panorama.texels import (
@@ -40,9 +41,6 @@ LOSS_SCALE = 20.0  # [8-bit levels] of the length of a colour difference
 NOISE = 10.0  # [8-bit levels] of one
 NUM_ALIKE = 30.0  # points whose differences err alike: with fewer, weak constraints outweigh where poses were
 NUM_STEPS = 15  # a round, at most
-FIRST_DAMPING = 1e-3
-FALL = 0.2
-RISE = 8.0
 SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
 Array32 = NDArray[np.float32]
 

@@ -45,9 +45,10 @@ def color_map(scan_map: ScanMap, results: Sequence[Result], workers: Workers) ->
     colors = np.asarray(paint.colors / np.float32(255.0), np.float32)
     painted = recolor(octree, colors, (paint.num_photos > 0).astype(np.float32))
     notes = [note for note in scan_map.warnings if note not in (SHAPE_ALONE, PAINTED)]
+    is_painted = PAINTED in scan_map.warnings  # its variance has that of photos already
     return replace(
         change_colors(scan_map, painted, workers),
-        surface_variance=scan_map.surface_variance + PAINT_STD**2 * np.eye(3),
+        surface_variance=scan_map.surface_variance + (not is_painted) * PAINT_STD**2 * np.eye(3),
         warnings=(*notes, PAINTED),
     )
 
@@ -95,15 +96,15 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
     if len(found) < LEAST_PHOTOS:
         text = f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours"
         raise InputError(text)
-    panoramas = workers.map(read_colors, [result for result, _ in found], "read")
+    panoramas = workers.map(read_unmasked, [result for result, _ in found], "read")
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
     aligned = align(scan_map.octree, panoramas, poses, anchors, workers)
     return make_brushes(scan_map.octree, panoramas, aligned.poses, aligned.gains, workers)
 
 
-def read_colors(result: Result) -> Panorama:
-    """Read the photo of a result as it was read when it was localized, with its masks."""
+def read_unmasked(result: Result) -> Panorama:
+    """Read the photo of a result as it was read when it was localized, without what was masked."""
     how: Any = result.settings.get("panorama") or {}
     mask = Path(how["mask"]) if how.get("mask") else None
     nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
