@@ -174,6 +174,25 @@ def test_the_commands_colour_a_scan(tmp_path, capsys):
     assert "has results already" in capsys.readouterr().err
     for wrong in (["--jobs", "2"], ["--color-scan", str(tmp_path / "a.xyz")]):
         assert command_line.main([*given, "--overwrite", *wrong]) in (2, 3)
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"no picture")
+    one = [
+        *cloud,
+        "--pano",
+        photos[0],
+        str(broken),
+        "--gravity",
+        "known",
+        "--out",
+        str(tmp_path / "one.jsonl"),
+    ]
+    assert command_line.main([*one, "--color-scan", str(tmp_path / "none.ply")]) == 3
+    err = capsys.readouterr().err
+    assert "broken.jpg: " in err
+    assert "none.ply is not written: wanted 2 localized photos or more" in err
+    assert not (tmp_path / "none.ply").exists()
+    found = [json.loads(line)["status"] for line in (tmp_path / "one.jsonl").read_text().splitlines()]
+    assert found == ["localized", "unreadable"]
     lines.write_text(lines.read_text().splitlines()[0] + "\n")
     assert tool.main([*cloud, "--results", str(lines), "--out", str(again)]) == 3
     assert "found 1 localized photos, wanted 2" in capsys.readouterr().err

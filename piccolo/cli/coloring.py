@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ..batch.inputs import is_from_stdin
 from ..batch.localizer import Localizer
-from ..coloring.color_scan import check_suffix, color_map, write_colored_scan
+from ..coloring.color_scan import LEAST_PHOTOS, check_suffix, color_map, write_colored_scan
+from ..confidence.confidence import LOCALIZED
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
@@ -41,7 +42,10 @@ def run_coloring(
     open_scan: Callable[[], OpenedScan],
     print_result: Callable[[Result, Sequence[str]], None],
 ) -> int:
-    """Localize the photos, write the scan in their colours, then the results; return the exit code."""
+    """Localize the photos, write the scan in their colours, then the results; return the exit code.
+
+    If too few are localized to colour the scan, the results alone are written.
+    """
     if not isinstance(localizer.settings, CoarseToFineSettings):
         raise UsageError("--color-scan: not an option of the preset paper")
     show = progress_bar(arguments.quiet)
@@ -52,16 +56,19 @@ def run_coloring(
         return [localizer.answer(scan, localizer.task(photo)).result for photo in shown]
 
     results = localize_all()
-    for _ in range(NUM_ROUNDS):
-        assert isinstance(scan.prepared, ScanMap)
-        scan = replace(scan, prepared=color_map(scan.prepared, results, scan.workers))
-        results = localize_all()
-    colored = write_colored_scan(scan, results, arguments.color_scan)
+    counts = Counter(result.status for result in results)
+    note = f"{arguments.color_scan} is not written: wanted {LEAST_PHOTOS} localized photos or more"
+    if counts[LOCALIZED] >= LEAST_PHOTOS:
+        for _ in range(NUM_ROUNDS):
+            assert isinstance(scan.prepared, ScanMap)
+            scan = replace(scan, prepared=color_map(scan.prepared, results, scan.workers))
+            results = localize_all()
+        colored = write_colored_scan(scan, results, arguments.color_scan)
+        counts = Counter(result.status for result in results)
+        note = f"{100.0 * colored.num_colored / max(colored.num_points, 1):.0f} % of the points coloured"
     write_all(arguments.out, results)
     for result in results:
         print_result(result, result.warnings[len(scan.warnings) :])
-    share = 100.0 * colored.num_colored / max(colored.num_points, 1)
-    counts = Counter(result.status for result in results)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
-    print_note(arguments, f"{len(results)} photos: {words}; {share:.0f} % of the points coloured")
+    print_note(arguments, f"{len(results)} photos: {words}; {note}")
     return choose_exit_code(counts)
