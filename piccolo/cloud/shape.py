@@ -5,7 +5,7 @@ is where a surface ends: the points around lie to one side. Both are painted as 
 channels of a colour: how strong the edge is, and how much stronger vertical ones are than the others.
 """
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,11 +15,6 @@ from ..geometry.pose import Array
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
 
-SIZE = 0.04  # [m] voxels whose surfaces are found
-NORMAL_RADIUS = 0.12  # [m] around a voxel, in which its normal is found
-NUM_NORMAL = 24  # voxels in it, at most
-EDGE_RADIUS = 0.15  # [m] in which normals are compared
-NUM_EDGE = 48
 AT_ONCE = 20_000  # voxels of a task
 FULL_CREASE = 0.6  # root of the second eigenvalue; 0.7 for two planes at a right angle
 BORDER = 0.08, 0.28  # distance of the surroundings' middle, divided by the radius: nothing, and a full border
@@ -27,26 +22,53 @@ VERTICAL = 0.8, 0.95  # cosine of an edge's angle to the vertical: not vertical 
 VERTICAL_BORDER = 0.9, 0.98
 
 
+class Surroundings(NamedTuple):
+    """What is looked at around a voxel."""
+
+    normal_radius: float  # [m] in which its normal is found
+    num_normal: int  # voxels in it, at most
+    edge_radius: float  # [m] in which normals are compared
+    num_edge: int
+
+
+WIDE = Surroundings(0.12, 24, 0.15, 48)  # of voxels of 4 cm
+NARROW = Surroundings(0.06, 12, 0.06, 16)  # of the leaves, of 2 cm
+
+
 def paint_shape(octree: Octree, workers: Workers) -> Octree:
-    """Return the octree, in the map's frame, with edges of the surfaces in place of colours."""
+    """Return the octree, in the map's frame, with edges of the surfaces in place of colours.
+
+    Those of the leaves are narrow, for the last descent; those of all other levels wide.
+    """
     start = octree.level_start
     begin, end = int(start[-3]), int(start[-2])
-    colors = find_edges(octree.nodes[begin:end, :3].astype(np.float64), workers) / np.float32(255.0)
+    colors = color_edges(octree.nodes[begin:end], WIDE, workers)
     counts = np.diff(octree.first_child[begin : end + 1])
-    return recolor(octree, np.repeat(colors, counts, axis=0), np.ones(len(octree.nodes) - end, np.float32))
+    painted = recolor(octree, np.repeat(colors, counts, axis=0), np.ones(len(octree.nodes) - end, np.float32))
+    painted.nodes[end:, 3:] = color_edges(octree.nodes[end:], NARROW, workers)
+    return painted
 
 
-def find_edges(points: Array, workers: Workers) -> NDArray[np.uint8]:
-    """Return the colours (N, 3) of the edges of surfaces at points (N, 3) [m], about SIZE apart, z up."""
+def color_edges(nodes: NDArray[np.float32], around: Surroundings, workers: Workers) -> NDArray[np.float32]:
+    """Return the colours (N, 3), in [0, 1], of the edges at nodes (N, 6) in grey, z up."""
+    strength, vertical = find_edges(nodes[:, :3].astype(np.float64), around, workers).T
+    return colors_of_edges(strength, vertical, nodes[:, 3]) / np.float32(255.0)
+
+
+def find_edges(points: Array, around: Surroundings, workers: Workers) -> Array:
+    """Return the edges (N, 2) of surfaces at points (N, 3) [m], z up, each in [0, 1].
+
+    They are how strong an edge is, and how strong a vertical one.
+    """
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     tree = cKDTree(points)
     parts = [slice(lo, lo + AT_ONCE) for lo in range(0, len(points), AT_ONCE)]
     normals = np.concatenate(
-        workers.map(lambda part: find_normals(points, tree, part), parts, "find surfaces") or [points]
+        workers.map(lambda part: find_normals(points, tree, around, part), parts, "find surfaces") or [points]
     )
-    found = workers.map(lambda part: edges_of(points, tree, normals, part), parts, "find edges")
-    return np.concatenate(found or [np.empty((0, 3), np.uint8)])
+    found = workers.map(lambda part: edges_of(points, tree, normals, around, part), parts, "find edges")
+    return np.concatenate(found or [np.empty((0, 2))])
 
 
 def neighbors(tree: Any, points: Array, count: int, radius: float) -> tuple[NDArray[np.intp], Array]:
@@ -56,34 +78,33 @@ def neighbors(tree: Any, points: Array, count: int, radius: float) -> tuple[NDAr
     return np.where(is_there, indices, 0), is_there.astype(np.float64)
 
 
-def find_normals(points: Array, tree: Any, part: slice) -> Array:
+def find_normals(points: Array, tree: Any, around: Surroundings, part: slice) -> Array:
     """Return the unit normals (N, 3), of either sign, at a part of the points."""
-    indices, weights = neighbors(tree, points[part], NUM_NORMAL, NORMAL_RADIUS)
-    around = points[indices] - points[part][:, None]
+    indices, weights = neighbors(tree, points[part], around.num_normal, around.normal_radius)
+    offsets = points[indices] - points[part][:, None]
     total = weights.sum(axis=1)
-    middle = np.einsum("nk,nki->ni", weights, around) / total[:, None]
-    second = np.einsum("nk,nki,nkj->nij", weights, around, around) / total[:, None, None]
+    middle = np.einsum("nk,nki->ni", weights, offsets) / total[:, None]
+    second = np.einsum("nk,nki,nkj->nij", weights, offsets, offsets) / total[:, None, None]
     return np.linalg.eigh(second - middle[:, :, None] * middle[:, None])[1][:, :, 0]
 
 
-def edges_of(points: Array, tree: Any, normals: Array, part: slice) -> NDArray[np.uint8]:
-    """Return the colours (N, 3) of the edges at a part of the points with normals (N, 3)."""
-    indices, weights = neighbors(tree, points[part], NUM_EDGE, EDGE_RADIUS)
+def edges_of(points: Array, tree: Any, normals: Array, around: Surroundings, part: slice) -> Array:
+    """Return the edges (N, 2) at a part of the points with normals (N, 3)."""
+    indices, weights = neighbors(tree, points[part], around.num_edge, around.edge_radius)
     total = weights.sum(axis=1)
-    around = normals[indices]
-    values, axes = np.linalg.eigh(
-        np.einsum("nk,nki,nkj->nij", weights, around, around) / total[:, None, None]
-    )
+    near = normals[indices]
+    second = np.einsum("nk,nki,nkj->nij", weights, near, near) / total[:, None, None]
+    values, axes = np.linalg.eigh(second)
     crease = np.clip(np.sqrt(np.maximum(values[:, 1], 0.0)) / FULL_CREASE, 0.0, 1.0)
     along = np.abs(axes[:, 2, 0])  # the normals of a crease lie across it
     normal = normals[part]
     middle = np.einsum("nk,nki->ni", weights, points[indices] - points[part][:, None]) / total[:, None]
     middle -= normal * np.einsum("ni,ni->n", middle, normal)[:, None]
     distance = np.linalg.norm(middle, axis=1)
-    border = rise(distance / EDGE_RADIUS, BORDER)
+    border = rise(distance / around.edge_radius, BORDER)
     along_border = np.abs(np.cross(middle, normal)[:, 2]) / np.maximum(distance, 1e-9)
     vertical = np.maximum(crease * rise(along, VERTICAL), border * rise(along_border, VERTICAL_BORDER))
-    return colors_of_edges(np.maximum(crease, border), vertical)
+    return np.stack([np.maximum(crease, border), vertical], axis=1)
 
 
 def rise(values: Array, limits: tuple[float, float]) -> Array:

@@ -62,12 +62,17 @@ def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
     return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]
 
 
-def colors_of_edges(strength: NDArray[np.floating], vertical: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Return the colours (..., 3) that stand for edges (...) in [0, 1], and for the vertical ones of them.
+def colors_of_edges(
+    strength: NDArray[np.floating], vertical: NDArray[np.floating], gray: NDArray[np.floating] | float
+) -> NDArray[np.uint8]:
+    """Return the colours (..., 3) that stand for edges (...) in [0, 1], the vertical ones of them, and a grey.
 
-    Luminance is the strength; (R - B) / 2 is the strength of vertical edges minus that of others.
+    (2 G - R - B) / 4 is the strength, (R - B) / 2 that of vertical edges minus that of others, luminance the
+    grey.
     """
-    luminance = 0.2 + 0.5 * strength
-    difference = 0.3 * (2.0 * vertical - strength)
-    rgb = np.stack([luminance + difference, luminance, luminance - difference], axis=-1)
+    luminance = 0.25 + 0.5 * gray
+    green = 0.2 * (strength - 0.5)
+    difference = 0.15 * (2.0 * vertical - strength)
+    parts = luminance - green + difference, luminance + 2.0 * green, luminance - green - difference
+    rgb = np.stack(np.broadcast_arrays(*parts), axis=-1)
     return np.clip(np.rint(255.0 * rgb), 0.0, 255.0).astype(np.uint8)

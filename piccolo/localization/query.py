@@ -18,7 +18,7 @@ from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches, match
 from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere, view_around
 from ..panorama import Panorama
-from ..panorama.edges import draw_edges
+from ..panorama.edges import draw_edges, soften
 from ..panorama.gpano import attitude_of_gravity, rotation_to_level
 from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize, shrink
@@ -26,9 +26,8 @@ from ..panorama.texels import Texels, find_valid, pack_texels
 from ..scan_map.scan_map import ScanMap
 from ..views.points_around import RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
-from .settings import METHOD, CoarseToFineSettings, ImageScales, MethodConfig
+from .settings import METHOD, SHAPE_SCALES, CoarseToFineSettings, ImageScale, ImageScales, MethodConfig
 
-COMPARED_WIDTH = 256  # [px]
 MAX_WIDTH = 4096  # [px] of the photo for the loss: more costs seconds and gains nothing
 WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
 MOST_SHARE = 0.98  # of the sphere: a photo that shows more counts as showing all cells
@@ -50,9 +49,14 @@ def make_images(panorama: Panorama, scales: ImageScales) -> Images:
     """Make the images of a panorama, each resized from the one before."""
     images = {}
     for name, scale in scales._asdict().items():
-        panorama = resize(panorama, scale.width)
+        panorama = reduce(panorama, scale)
         images[name] = Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg))
     return Images(**images)
+
+
+def reduce(panorama: Panorama, scale: ImageScale) -> Panorama:
+    """Return a panorama at the size of one of its images, made of one that is wider or of the same size."""
+    return resize(soften(panorama, scale.blur_px) if scale.blur_px else panorama, scale.width)
 
 
 @dataclass(frozen=True)
@@ -62,7 +66,7 @@ class Photo:
     given: Panorama
     panorama: Panorama  # at the width of its features
     images: Images
-    small: Texels  # colours at the size at which poses are compared
+    small: Texels  # colours at the size of fine images, at which poses are compared
     colors: Once[Texels]  # at the size at which the loss is taken
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     has_tilt: bool  # R_cam_from_level is known, from metadata or a gravity vector
@@ -140,8 +144,9 @@ class Query:
         height, width = panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(panorama, is_valid=panorama.is_valid & (enlarged == 0))
-        small = make_texels(resize(rest, COMPARED_WIDTH))
-        photo = replace(self.photo, panorama=rest, images=make_images(rest, self.method.scales), small=small)
+        scales = self.method.scales
+        small = make_texels(reduce(rest, scales.fine))
+        photo = replace(self.photo, panorama=rest, images=make_images(rest, scales), small=small)
         return replace(self, photo=photo, cache=Cache(self.cache.views))
 
     def view_at(self, pose: Pose, config: ViewConfig) -> Cells:
@@ -175,15 +180,15 @@ def prepare_query(
     R_level_from_cam = rotation_to_level(gpano) if gpano else None
     R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
     if scan_map.has_shape:
-        panorama = draw_edges(panorama, R_cam_from_level)
-        method = method._replace(uses_features=False)
+        panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
+        method = method._replace(uses_features=False, scales=SHAPE_SCALES)
     width = method.scales.full.width
     resized = resize(panorama, width)
     photo = Photo(
         panorama,
         resized,
         make_images(resized, method.scales),
-        make_texels(resize(resized, COMPARED_WIDTH)),
+        make_texels(reduce(resized, method.scales.fine)),
         Once(partial(make_texels, panorama)),
         R_cam_from_level,
         R_level_from_cam is not None,

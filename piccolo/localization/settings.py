@@ -58,6 +58,7 @@ class ImageScale(NamedTuple):
     width: int  # [px] a multiple of local_normalization's STATS_WIDTH
     cell_deg: float  # colours are averaged over cells this wide
     sigma_deg: float  # of the Gaussian in which contrast is judged
+    blur_px: float = 0.0  # standard deviation, in the next wider image, with which that is blurred before
 
 
 class ImageScales(NamedTuple):
@@ -67,6 +68,10 @@ class ImageScales(NamedTuple):
     fine: ImageScale = ImageScale(256, 0.0, 10.0)
     middle: ImageScale = ImageScale(128, 0.0, 14.0)
     search: ImageScale = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)
+
+
+# narrow edges are for the last descent: all others need them as wide as those of coarse voxels
+SHAPE_SCALES = ImageScales(fine=ImageScales().fine._replace(blur_px=1.7))
 
 
 class MethodConfig(NamedTuple):

@@ -1,5 +1,8 @@
 """Edges of a photo, as `cloud.shape` paints those of a scan without colours."""
 
+from dataclasses import replace
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
@@ -14,13 +17,16 @@ DARK = 12.0  # [levels] added before the logarithm
 SMOOTHING = 0.8  # [px] before the gradient is taken
 FULL_GRADIENT = 0.25  # of the logarithm, a pixel; the strength is the root of the fraction
 VERTICAL = 0.9, 0.98  # cosine of a gradient's angle to the horizontal: no vertical edge at all, and fully
-SPREAD = 2.0  # [px] the painted edges of a scan are wide
+SPREAD = 1.0  # [px] the painted edges of a scan are wide
 LEAST_COS = 0.2  # of the elevation: nearer to the poles a pixel counts as this wide
 MARGIN = 32  # [px] beyond the seam
 
 
-def draw_edges(panorama: Panorama, R_cam_from_level: Array) -> Panorama:
-    """Return a panorama of the edges of another, of WIDTH, taken with a camera of a known tilt (3, 3)."""
+def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> Panorama:
+    """Return a panorama of the edges of another, of WIDTH, taken with a camera of a known tilt (3, 3).
+
+    With the other's grey too, or without.
+    """
     source = resize(panorama, WIDTH)
     across, down = gradients(source)
     strength = np.hypot(across, down)
@@ -28,10 +34,15 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array) -> Panorama:
     cosine = horizontal / np.maximum(strength, 1e-9)
     strength = np.clip(np.sqrt(strength / FULL_GRADIENT), 0.0, 1.0)
     vertical = strength * np.clip((cosine - VERTICAL[0]) / (VERTICAL[1] - VERTICAL[0]), 0.0, 1.0)
-    shown = find_inner(source).astype(np.float32)
-    weight = np.maximum(spread(shown), 1e-6)
-    drawn = colors_of_edges(spread(strength * shown) / weight, spread(vertical * shown) / weight)
-    return Panorama(drawn, source.is_valid)
+    gray = source.rgb.astype(np.float32).mean(axis=2) / np.float32(255.0) if has_gray else 0.5
+    drawn = blur(np.stack([strength, vertical], axis=-1), find_inner(source), SPREAD)
+    return Panorama(colors_of_edges(drawn[..., 0], drawn[..., 1], gray), source.is_valid)
+
+
+def soften(panorama: Panorama, sigma: float) -> Panorama:
+    """Return the panorama blurred by a Gaussian of `sigma` [px], without what does not count."""
+    blurred = blur(panorama.rgb, panorama.is_valid, sigma)
+    return replace(panorama, rgb=np.rint(blurred).astype(np.uint8))
 
 
 def gradients(panorama: Panorama) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -72,13 +83,16 @@ def tangents(width: int, R_cam_from_level: Array) -> NDArray[np.float64]:
     return np.stack([(horizontal * right).sum(axis=-1), (horizontal * below).sum(axis=-1)], axis=-1)
 
 
-def spread(image: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Blur an equirectangular image (H, W) by SPREAD."""
-    blurred = cv2.GaussianBlur(wrap(image.astype(np.float32)), (0, 0), SPREAD)
-    return np.asarray(blurred[MARGIN:-MARGIN, MARGIN:-MARGIN], np.float32)
+def blur(image: NDArray[Any], counts: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
+    """Blur the pixels of an equirectangular image (H, W, C) that count (H, W) by a Gaussian [px]."""
+    weights = counts[..., None].astype(np.float32)
+    layers = np.concatenate([image.astype(np.float32) * weights, weights], axis=2)
+    blurred = cv2.GaussianBlur(wrap(layers), (0, 0), sigma)[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    return np.asarray(blurred[..., :-1] / np.maximum(blurred[..., -1:], 1e-6), np.float32)
 
 
 def wrap(image: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return an equirectangular image (H, W) with a margin on all sides, across the seam."""
-    wide = np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap")
-    return np.pad(wide, ((MARGIN, MARGIN), (0, 0)), mode="edge")
+    """Return an equirectangular image (H, W, ...) with a margin on all sides, across the seam."""
+    others = [(0, 0)] * (image.ndim - 2)
+    wide = np.pad(image, ((0, 0), (MARGIN, MARGIN), *others), mode="wrap")
+    return np.pad(wide, ((MARGIN, MARGIN), (0, 0), *others), mode="edge")

@@ -27,6 +27,7 @@ from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
 
 SHAPE_ALONE = "photos are localized by the shape of the scan alone, without colours"
+LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
 
 
@@ -85,6 +86,12 @@ class ScanMap:
         """Leaves of the octree as coloured points, in the map's frame."""
         leaves = self.octree.level(self.octree.leaf_size)
         return pack_points(leaves[:, :3], np.round(leaves[:, 3:] * 255.0).astype(np.uint8))
+
+    @cached_property
+    def has_intensity(self) -> bool:
+        """True for a map of shape whose points differ in intensity too."""
+        luminance = self.octree.level(COARSE_SPACING)[:, 3:].mean(axis=1)
+        return self.has_shape and float(luminance.std()) > LEAST_DEVIATION
 
     @cached_property
     def storeys(self) -> Storeys:
