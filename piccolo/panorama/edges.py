@@ -1,7 +1,8 @@
 """Edges of a photo, as `cloud.shape` paints those of a scan without colours."""
 
 from dataclasses import replace
-from typing import Any
+from functools import lru_cache
+from typing import TypeVar, cast
 
 import cv2
 import numpy as np
@@ -21,6 +22,8 @@ SPREAD = 1.0  # [px] the painted edges of a scan are wide
 LEAST_COS = 0.2  # of the elevation: nearer to the poles a pixel counts as this wide
 MARGIN = 32  # [px] beyond the seam
 
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
+
 
 def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> Panorama:
     """Return a panorama of the edges of another, of WIDTH, taken with a camera of a known tilt (3, 3).
@@ -35,14 +38,16 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> P
     strength = np.clip(np.sqrt(strength / FULL_GRADIENT), 0.0, 1.0)
     vertical = strength * np.clip((cosine - VERTICAL[0]) / (VERTICAL[1] - VERTICAL[0]), 0.0, 1.0)
     gray = source.rgb.astype(np.float32).mean(axis=2) / np.float32(255.0) if has_gray else 0.5
-    drawn = blur(np.stack([strength, vertical], axis=-1), find_inner(source), SPREAD)
-    return Panorama(colors_of_edges(drawn[..., 0], drawn[..., 1], gray), source.is_valid)
+    shown = find_inner(source).astype(np.float32)
+    weight = np.maximum(blur(shown, SPREAD), 1e-6)
+    strength = blur(strength * shown, SPREAD) / weight
+    vertical = blur(vertical * shown, SPREAD) / weight
+    return Panorama(colors_of_edges(strength, vertical, gray), source.is_valid)
 
 
 def soften(panorama: Panorama, sigma: float) -> Panorama:
-    """Return the panorama blurred by a Gaussian of `sigma` [px], without what does not count."""
-    blurred = blur(panorama.rgb, panorama.is_valid, sigma)
-    return replace(panorama, rgb=np.rint(blurred).astype(np.uint8))
+    """Return the panorama blurred by a Gaussian of `sigma` [px]."""
+    return replace(panorama, rgb=blur(panorama.rgb, sigma))
 
 
 def gradients(panorama: Panorama) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -66,6 +71,7 @@ def find_inner(panorama: Panorama) -> NDArray[np.bool_]:
     return np.asarray(cv2.erode(panorama.is_valid.view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
+@lru_cache(maxsize=1)
 def tangent_axes(width: int) -> tuple[Array, Array]:
     """Return the unit directions (H, W, 3), across to the right and down, at each pixel."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
@@ -83,16 +89,12 @@ def tangents(width: int, R_cam_from_level: Array) -> NDArray[np.float64]:
     return np.stack([(horizontal * right).sum(axis=-1), (horizontal * below).sum(axis=-1)], axis=-1)
 
 
-def blur(image: NDArray[Any], counts: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
-    """Blur the pixels of an equirectangular image (H, W, C) that count (H, W) by a Gaussian [px]."""
-    weights = counts[..., None].astype(np.float32)
-    layers = np.concatenate([image.astype(np.float32) * weights, weights], axis=2)
-    blurred = cv2.GaussianBlur(wrap(layers), (0, 0), sigma)[MARGIN:-MARGIN, MARGIN:-MARGIN]
-    return np.asarray(blurred[..., :-1] / np.maximum(blurred[..., -1:], 1e-6), np.float32)
+def blur(image: NDArray[Pixel], sigma: float) -> NDArray[Pixel]:
+    """Blur an equirectangular image (H, W, ...) by a Gaussian of `sigma` [px]."""
+    return cast(NDArray[Pixel], cv2.GaussianBlur(wrap(image), (0, 0), sigma)[MARGIN:-MARGIN, MARGIN:-MARGIN])
 
 
-def wrap(image: NDArray[np.float32]) -> NDArray[np.float32]:
+def wrap(image: NDArray[Pixel]) -> NDArray[Pixel]:
     """Return an equirectangular image (H, W, ...) with a margin on all sides, across the seam."""
-    others = [(0, 0)] * (image.ndim - 2)
-    wide = np.pad(image, ((0, 0), (MARGIN, MARGIN), *others), mode="wrap")
-    return np.pad(wide, ((MARGIN, MARGIN), (0, 0), *others), mode="edge")
+    wide = np.concatenate([image[:, -MARGIN:], image, image[:, :MARGIN]], axis=1)
+    return cast(NDArray[Pixel], cv2.copyMakeBorder(wide, MARGIN, MARGIN, 0, 0, cv2.BORDER_REPLICATE))
