@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 
 from .arguments import check_arguments
 from .cloud import open_cloud
-from .cloud.readers.reader import GRAY
-from .cloud.settings import METRES, CloudSettings, UpAxis
+from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
@@ -38,7 +37,6 @@ def open_scan(  # noqa: PLR0913  options by name
     *,
     units: Units = "m",
     up: UpAxis = "auto",
-    intensity_as_gray: bool = False,
     ignore_colors: bool = False,
     labels: bool = False,
     ignore_labels: Sequence[int] = (),
@@ -61,10 +59,8 @@ def open_scan(  # noqa: PLR0913  options by name
         Unit of the coordinates in files, "m" by default. Arrays and all poses are in metres.
     up
         Axis of the scan that points up. By default "auto": z, in glTF files y.
-    intensity_as_gray
-        Use intensities as grey levels where a file has no colours. False by default.
     ignore_colors
-        Use the shape of the scan alone, whether it has colours or not. False by default.
+        Use the shape of the scan, and intensities, even if it has colours. False by default.
     labels
         Use semantic labels in place of colours, in scan and panoramas. False by default.
     ignore_labels
@@ -89,8 +85,8 @@ def open_scan(  # noqa: PLR0913  options by name
     Raises
     ------
     InputError
-        A file is missing or damaged, has no colours, or is of an unknown format; or an option is invalid.
-        A prepared map takes no `units`, `up`, `intensity_as_gray` and `ignore_colors`.
+        A file is missing or damaged, or is of an unknown format; or an option is invalid.
+        A prepared map takes no `units`, `up` and `ignore_colors`.
 
     Examples
     --------
@@ -105,10 +101,14 @@ def open_scan(  # noqa: PLR0913  options by name
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     cloud_settings = CloudSettings(
-        METRES[units], up, intensity_as_gray, ignore_colors, _make_labels(labels, ignore_labels), crs
+        METRES[units],
+        up,
+        WITHOUT_COLORS if ignore_colors else IN_METRES.channels,
+        _make_labels(labels, ignore_labels),
+        crs,
     )
     if isinstance(source, np.ndarray):
-        cloud = stream_of_arrays(source, np.full(source.shape, GRAY, np.uint8) if ignore_colors else colors)
+        cloud = stream_of_arrays(source, None if ignore_colors else colors)
         return Scan(scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch()))
     if colors is not None:
         raise InputError("colors: found files, wanted an array of points")
@@ -166,10 +166,9 @@ def scan_of(
             watch,
             prior=prior,
             has_features=False,
-            has_shape=cloud_settings.ignore_colors,
         )
-    elif cloud_settings.ignore_colors:
-        raise InputError("`ignore_colors`: not an option of the preset paper")
+    elif not cloud.has_colors:
+        raise InputError(f"{cloud.label}: found no colours to be used, wanted some for the preset paper")
     else:
         with watch.stage("read"):
             points = cloud.read()

@@ -13,6 +13,7 @@ from piccolo.cli import e57_images
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import e57, e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
 
@@ -145,7 +146,7 @@ def test_colors_without_or_outside_of_their_range_and_files_without_points_are_r
     assert_refused(r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100", read, path)
     written = ScanToWrite(cartesian() | colored(RAW.colors / 255.0))
     with pytest.raises(InputError, match="colours without a range: neither colorLimits nor a declared"):
-        open_source(write(tmp_path / "a.e57", [written]))
+        open_source(write(tmp_path / "a.e57", [written]), IN_COLORS)
     empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
     assert_refused(r"scan 1 of 1 \('a scan'\) has 0 points", open_source, write(tmp_path / "a.e57", [empty]))
     assert_refused("no scans, wanted scans with", open_source, write(tmp_path / "b.e57"))
@@ -162,7 +163,7 @@ def test_scans_without_colors_are_left_out_beside_others(tmp_path):
     )
     np.testing.assert_allclose(read(path)[0], RAW.points_world @ R_WORLD.T + CENTER, atol=1e-12)
     with pytest.raises(InputError, match=r"scan 1 of 1 \('gray'\) has no colours, wanted scans"):
-        open_source(write(tmp_path / "b.e57", [plain]))
+        open_source(write(tmp_path / "b.e57", [plain]), IN_COLORS)
 
 
 def test_points_that_are_not_finite_are_handed_on_and_foreign_fields_change_nothing(tmp_path, monkeypatch):

@@ -10,20 +10,18 @@ from scans import write_scalars
 from test_cloud_morton import seeded_cloud, whole
 from test_cloud_pcd import content_of
 
-from piccolo.cloud import open_cloud
+from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import RawCloud, as_gray, intensity_reader
+from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, intensity_reader
 from piccolo.cloud.readers.text import open_text
-from piccolo.cloud.settings import CloudSettings
-from piccolo.errors import InputError
+from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.geometry.pose import exp_so3
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
-GRAY = CloudSettings(intensity_as_gray=True)
 
 
 def _measured(seed, kind):
@@ -41,14 +39,18 @@ def _in_gray(intensity, points=POINTS, chunk=701):
         for lo in range(0, len(points), chunk):
             yield points[lo : lo + chunk], intensity[lo : lo + chunk]
 
-    return np.concatenate([raw.colors for raw in intensity_reader("a", read)()])
+    return np.concatenate([raw.colors for raw in intensity_reader(read)()])
 
 
 def assert_gray(open_file, path, intensity, points_world=POINTS, atol=1e-9):
-    read = whole(open_file, path, GRAY)
+    read = whole(open_file, path, IN_METRES, "intensity")
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, points_world, atol=atol)
-    assert_refused(r"has intensity and no colours.*`intensity_as_gray`", open_file, path)
+    source = open_source(path)
+    assert source.channel == "intensity"
+    assert source.warnings[-1].startswith(str(path))
+    with pytest.raises(MissingChannelError):
+        open_source(path, IN_COLORS)
 
 
 @pytest.mark.parametrize("kind", ["bytes", "16 bits", "decibels", "mirrors"])
@@ -77,11 +79,10 @@ def test_what_has_no_position_or_no_intensity_does_not_count():
     np.testing.assert_array_equal(_in_gray(intensity, points)[:2000], expected)
 
 
-def test_one_intensity_for_all_is_refused_and_what_is_not_finite_is_black():
+def test_one_intensity_for_all_is_none_and_what_is_not_finite_is_black():
     gray = as_gray(np.array([np.nan, -np.inf, np.inf, 0.5]), 0.0, 1.0)
     assert gray[:, 0].tolist() == [0, 0, 255, 128]
-    with pytest.raises(InputError, match="a: the intensity is 7 nearly everywhere, wanted colours"):
-        _in_gray(np.full(3000, 7.0))
+    assert (_in_gray(np.full(3000, 7.0)) == 128).all()
 
 
 def _ply(path, name, kind="f4", text=False):
@@ -113,8 +114,10 @@ def test_text(tmp_path, name):
 def test_colours_come_first_and_the_map_is_gray(tmp_path):
     lines = ["x y z intensity r g b", *(f"{x} {y} {z} 5 10 20 30" for x, y, z in POINTS.tolist())]
     (tmp_path / "a.txt").write_text("\n".join(lines))
-    assert (whole(open_text, tmp_path / "a.txt", GRAY).colors == [10, 20, 30]).all()
-    nodes = open_cloud([_ply(tmp_path / "b.ply", "intensity")], GRAY).voxels(np.eye(3)).nodes
+    assert (whole(open_source, tmp_path / "a.txt", IN_METRES).colors == [10, 20, 30]).all()
+    in_gray = whole(open_source, tmp_path / "a.txt", CloudSettings(channels=WITHOUT_COLORS))
+    assert (in_gray.colors == 128).all()
+    nodes = open_cloud([_ply(tmp_path / "b.ply", "intensity")]).voxels(np.eye(3)).nodes
     assert (nodes[:, 3] == nodes[:, 5]).all()
     assert np.ptp(nodes[:, 4]) == 1.0
 
@@ -153,26 +156,27 @@ def test_e57_scans_have_one_gray_for_all(tmp_path):
     path = write_e57(tmp_path / "a.e57", halves)
     assert_gray(open_e57, path, intensity, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0])
     bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
-    assert_refused("has no colours, wanted scans with", open_e57, bare, GRAY)
+    assert_refused("has no colours, wanted scans with", open_e57, bare)
+    assert_refused("has no intensity, wanted scans with", open_e57, bare, IN_METRES, "intensity")
 
 
 def test_e57_scans_without_intensity_are_named(tmp_path):
     intensity = _measured(9, "decibels")
     scans = [_e57_scan(POINTS[:1000]), _e57_scan(POINTS[1000:], intensity=intensity[1000:])]
     path = write_e57(tmp_path / "a.e57", scans)
-    assert_refused(r"scan 2 of 2 .* has intensity and no colours", open_e57, path)
-    source = open_e57(path, GRAY)
-    assert len(source.warnings) == 1
+    source = open_source(path)
+    assert len(source.warnings) == 2
     assert "scan 1 of 2 ('a scan') has no intensity; left out" in source.warnings[0]
     assert sum(len(chunk.colors) for chunk in source.read_chunks()) == 2000
 
 
-def test_ptx_scan_with_colors_after_one_without_is_refused(tmp_path):
+def test_ptx_scan_with_colors_after_one_without_is_read_by_its_intensity(tmp_path):
     header = ["1", "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
     path = tmp_path / "a.ptx"
     path.write_text("\n".join([*header, "1 2 3 0.5", *header, "1 2 3 0.5 10 20 30"]) + "\n")
-    with pytest.raises(InputError, match="line 22: 7 instead of 4 columns"):
-        whole(open_ptx, path, GRAY)
+    read = whole(open_source, path, IN_METRES)
+    np.testing.assert_array_equal(read.points_world, [[1.0, 2.0, 3.0]] * 2)
+    assert (read.colors == 128).all()
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])

@@ -11,6 +11,7 @@ from test_cloud_morton import read, seeded_cloud
 from piccolo.cloud import open_source
 from piccolo.cloud.readers import las
 from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(2, num_points=1200)
@@ -115,18 +116,18 @@ def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed
 
 
 @pytest.mark.parametrize("point_format", [1, 3, 6, 7])
-def test_an_intensity_of_0_is_not_recommended(tmp_path, point_format):
+def test_an_intensity_of_0_is_not_used(tmp_path, point_format):
     black = np.zeros((1200, 3), np.uint16)
     for intensity in (np.zeros(1200, np.uint16), INTENSITY):
         plain = las_bytes(RAW, point_format, colors=black, intensity=intensity)
         for content in (plain, laz_bytes(plain, 500)):
             with pytest.raises(InputError) as error:
-                open_source(write(tmp_path, content))
-            is_there = bool(intensity.any())
+                open_source(write(tmp_path, content), IN_COLORS)
             why = "point format" if point_format in (1, 6) else "red green blue are 0 in all 1200 points"
             assert why in str(error.value)
-            assert ("`intensity_as_gray`" in str(error.value)) == is_there
-            assert ("its intensity is 0 in all 1200 points checked, wanted" in str(error.value)) != is_there
+            source = open_source(write(tmp_path, content))
+            assert source.channel == ("intensity" if intensity.any() else "shape")
+            assert why in source.warnings[0]
 
 
 def patched(content, position, form, value):

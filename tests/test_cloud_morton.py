@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from piccolo.cloud import Cloud, open_source, stream_points
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.voxels import morton_codes, morton_order
 
 A = Path("a")
@@ -29,10 +29,10 @@ def clean(path, raw, scale):
     return replace(stream_points(path, raw), scale=scale).read()
 
 
-def whole(open_file, path, options=IN_METRES):
+def whole(open_file, path, options=IN_COLORS, *channel):
     """All points that a reader finds in a file."""
     none = RawCloud(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    chunks = list(open_file(path, options).read_chunks()) or [none]
+    chunks = list(open_file(path, options, *channel).read_chunks()) or [none]
     return RawCloud(*(np.concatenate(arrays) for arrays in zip(*chunks, strict=True)))
 
 

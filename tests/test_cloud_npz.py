@@ -10,6 +10,7 @@ from test_cloud_morton import read, seeded_cloud
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import npz
 from piccolo.cloud.readers import reader as raw
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -94,7 +95,7 @@ def test_nan_points_need_no_color(tmp_path):
 )
 def test_other_arrays_are_refused(tmp_path, array, message):
     path = save(tmp_path / "a.npy", array)
-    assert_refused(message, read_cloud, path)
+    assert_refused(message, read_cloud, path, IN_COLORS)
 
 
 @pytest.mark.parametrize(
@@ -111,7 +112,7 @@ def test_other_arrays_are_refused(tmp_path, array, message):
 def test_other_archives_are_refused(tmp_path, arrays, message):
     path = tmp_path / "a.npz"
     np.savez(path, **arrays)
-    assert_refused(message, read_cloud, path)
+    assert_refused(message, read_cloud, path, IN_COLORS)
 
 
 def test_nothing_is_unpickled(tmp_path):

@@ -11,6 +11,7 @@ from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.readers import text
 from piccolo.cloud.readers.pcd import MAX_RATIO, decompress_lzf
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -149,7 +150,7 @@ def test_nan_points_of_a_grid_need_no_color(tmp_path, encoding, kind):
 def test_broken_headers_are_refused(tmp_path, fields, lines, message):
     path = tmp_path / "a.pcd"
     path.write_bytes(content_of(fields or [*XYZ, ("rgb", "u4", 1, PACKED)], "binary", **lines))
-    assert_refused(message, open_source, path)
+    assert_refused(message, open_source, path, IN_COLORS)
 
 
 @pytest.mark.parametrize(

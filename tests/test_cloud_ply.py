@@ -11,7 +11,7 @@ from test_cloud_morton import seeded_cloud, whole
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.ply_writer import needs_double, vertex_rows, write_ply, writing_ply
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -119,13 +119,13 @@ def test_promises_of_more_vertices_are_refused_before_memory_is_taken(tmp_path, 
 def test_broken_files_are_refused(tmp_path, old, new, message):
     path = tmp_path / "a.ply"
     path.write_bytes(content_of(tmp_path, text=True).replace(old, new, 1))
-    assert_refused(message, read_cloud, path)
+    assert_refused(message, read_cloud, path, IN_COLORS)
 
 
 def test_gaussian_splats_and_lists_before_the_vertices_are_refused(tmp_path):
     names = ("f_dc_0", "f_dc_1", "f_dc_2")
     with pytest.raises(InputError, match="Gaussian splats without red green blue, the vertices have x y z"):
-        read_cloud(write(tmp_path / "a.ply", vertices(color="f4", names=names)))
+        read_cloud(write(tmp_path / "a.ply", vertices(color="f4", names=names)), IN_COLORS)
     with pytest.raises(InputError, match="'strip' has the list property 'vertex_indices', wanted vertices"):
         read_cloud(write(tmp_path / "a.ply", TRIANGLES, vertices()))
 
@@ -137,7 +137,7 @@ def test_paths_that_are_no_cloud_and_unreadable_files_are_refused(tmp_path, monk
         ("none.ply", "no such file"),
         (".", "not a file but a folder"),
         ("empty.ply", "the file is empty"),
-        ("scan.doc", "unknown format '.doc', wanted a coloured point cloud: PLY, .*text"),
+        ("scan.doc", "unknown format '.doc', wanted a point cloud: PLY, .*text"),
     ]:
         assert_refused(message, read_cloud, tmp_path / name)
 

@@ -11,7 +11,6 @@ from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.readers import text
 from piccolo.cloud.readers.ptx import open_ptx
 from piccolo.cloud.readers.text import line_blocks, open_pts
-from piccolo.cloud.settings import CloudSettings
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -165,8 +164,8 @@ def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (["1200", *["1 2 3 4"] * 1200], r"has intensity and no colours, wanted lines x y z intensity"),
-        (["1 2 3"] * 1200, r"line 1 has 3 columns, no colours"),
+        (["1200", *["1 2 3 4"] * 1200], r"line 2 has 4 columns, no colors: .*, wanted lines x y z intensity"),
+        (["1 2 3"] * 1200, r"line 1 has 3 columns, no colors"),
         (["400", *pts()[:400], "800", *pts("")[400:]], r"line 403: 6 instead of 7 columns"),
         ([*pts()[:900], "12.5", *pts()[900:]], r"line 901: 1 instead of 7 columns"),
         (["400", *pts()[:400], "5", "", "1 2 3 4 5 6 777"], r"line 404 has the colour 5 6 777"),
@@ -200,7 +199,7 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, name, gra
         fields = [line.split() for line in lines]
         lines = [" ".join([*f[:3], str(k)] if len(f) == 7 else f) for k, f in enumerate(fields)]
     path = write(tmp_path / name, lines)
-    chunks = open_source(path, CloudSettings(intensity_as_gray=gray)).read_chunks()
+    chunks = open_source(path).read_chunks()
     next(chunks)
     content = path.read_bytes()
     with path.open("r+b") as file:

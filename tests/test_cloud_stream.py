@@ -13,7 +13,7 @@ from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud import CloudStream
 from piccolo.cloud.readers.reader import PointSource, RawCloud
-from piccolo.cloud.settings import METRES, CloudSettings
+from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.voxels import Voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
@@ -192,7 +192,7 @@ def test_order_of_files_changes_no_bit_of_a_map(tmp_path):
     b = _write_text(tmp_path / "b.txt", part(raw, slice(half, None)))
     settings = CloudSettings()
     others = [dataclasses.replace(settings, up="z"), dataclasses.replace(settings, scale=2.0)]
-    others.append(dataclasses.replace(settings, intensity_as_gray=True))
+    others.append(dataclasses.replace(settings, channels=WITHOUT_COLORS))
     keys = {content_key(digest, s) for s in (settings, *others) for digest in ("00", "01")}
     assert len(keys) == 8
     maps = [

@@ -9,6 +9,7 @@ from test_cloud_ply import vertices
 from test_cloud_ply import write as write_ply
 
 from piccolo.cloud import read_cloud
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.readers import reader, text
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.text import is_number, open_text
@@ -116,7 +117,7 @@ def test_broken_lines_are_named(tmp_path, broken, message):
 def test_other_content_is_refused(tmp_path, content, message):
     path = tmp_path / "a.txt"
     path.write_bytes(content)
-    assert_refused(message, read_cloud, path)
+    assert_refused(message, read_cloud, path, IN_COLORS)
 
 
 @pytest.fixture

@@ -19,7 +19,7 @@ from piccolo.cli.command import command, new_parser, parse
 from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.options import add_arguments, cloud_settings_from
 from piccolo.cli.start import COMMANDS
-from piccolo.cloud.settings import IN_METRES, CloudSettings
+from piccolo.cloud.settings import IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.result import Result
 
@@ -54,7 +54,7 @@ def test_options_of_a_cloud(capsys):
         ("", IN_METRES),
         ("--units mm", CloudSettings(scale=0.001)),
         ("--units 0.5 --up x", CloudSettings(scale=0.5, up="x")),
-        ("--up -z --intensity-as-gray", CloudSettings(up="-z", intensity_as_gray=True)),
+        ("--up -z --ignore-colors", CloudSettings(up="-z", channels=WITHOUT_COLORS)),
         ("--up=-y", CloudSettings(up="-y")),
     ):
         assert cloud_settings_from(_parse(*options.split())) == expected

@@ -16,7 +16,7 @@ from test_cloud_pcd import content_of
 
 from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.settings import WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
 from piccolo.panorama import ReadOptions as PanoramaOptions
@@ -114,8 +114,8 @@ def test_clouds_without_labels_are_refused(tmp_path):
     PlyData([mesh["vertex"], PlyElement.describe(faces, "face")]).write(str(tmp_path / "mesh.ply"))
     with pytest.raises(InputError, match=r"mesh.ply: found a mesh, wanted points with labels"):
         open_source(tmp_path / "mesh.ply", READ)
-    with pytest.raises(InputError, match="`labels`, `intensity_as_gray`: found both"):
-        CloudSettings(intensity_as_gray=True, labels=Labels())
+    with pytest.raises(InputError, match="`ignore_colors`, `labels`: found both"):
+        CloudSettings(channels=WITHOUT_COLORS, labels=Labels())
 
 
 def _png(path, pixels):

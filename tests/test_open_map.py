@@ -28,7 +28,7 @@ def _open(cloud, folder, monkeypatch, num_made=1):
     """The map by `open_map`, and the warnings; `prepare_map` is called so many times."""
     made, heard = [], []
 
-    def prepare(*_, prior, has_features, has_shape):
+    def prepare(*_, prior, has_features):
         made.append(1)
         return scan_map(1)
 

@@ -10,7 +10,7 @@ from ..batch.frame_times import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
 from ..camera.files import open_calibration, read_rig
 from ..cloud.crs import check_crs
-from ..cloud.settings import METRES, CloudSettings, UpAxis
+from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
@@ -94,8 +94,7 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--units UNIT", text, type=_metres_of, default=None)
     text = "axis of the cloud that points up; auto: z, or y in glTF (default auto; with preset default only)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
-    option(group, "--ignore-colors", "localize by the shape of the scan alone, with or without colours")
-    option(group, "--intensity-as-gray", "use the intensities of clouds without colours as gray values")
+    option(group, "--ignore-colors", "localize by the shape and intensity of the scan even if it has colours")
     text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
     option(group, "--labels N ...", f"{text}; points and pixels with labels N are left out", nargs="*")
 
@@ -243,8 +242,7 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     return CloudSettings(
         scale,
         arguments.up,
-        arguments.intensity_as_gray,
-        arguments.ignore_colors,
+        WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels,
         _labels_from(arguments),
         crs,
     )

@@ -13,29 +13,38 @@ from .readers.npz import NPY, NPZ
 from .readers.pcd import PCD
 from .readers.ply import PLY
 from .readers.ptx import PTX
-from .readers.reader import HEAD_SIZE, CloudFormat, PointSource
+from .readers.reader import HEAD_SIZE, CloudFormat, MissingChannelError, PointSource
 from .readers.text import PTS, TEXT
 from .settings import IN_METRES, CloudSettings
 from .stream import Cloud, CloudStream
 
 FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, MESH, TEXT)
-WANTED = f"wanted a coloured point cloud: {', '.join(f.name for f in FORMATS)}"
+WANTED = f"wanted a point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
 def open_cloud(
     paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Progress = no_progress
 ) -> CloudStream:
-    """Return the coloured cloud in one or several files, before its points are read.
+    """Return the cloud in one or several files, before its points are read, in the first channel of all.
 
-    Raises InputError if a file is missing, has a damaged header, no colours, or an unknown format. Reading
-    the points raises it where the data are damaged or fail the checks of `PointValidator`.
+    Raises InputError if a file is missing, has a damaged header, none of the channels, or an unknown format,
+    or if some files have colours and some have none. Reading the points raises it where the data are damaged
+    or fail the checks of `PointValidator`.
     """
     sources = [open_source(path, settings) for path in sorted(paths)]
+    if len({source.channel for source in sources}) > 1:
+        colored = next((source.path for source in sources if source.channel == "colors"), None)
+        if colored:
+            bare = next(source.path for source in sources if source.channel != "colors")
+            found = f"{bare}: found no colours, though {colored} has them"
+            raise InputError(f"{found}, wanted them in all files, or `ignore_colors`")
+        only_shape = replace(settings, channels=("shape",))
+        sources = [open_source(path, only_shape) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
 
 
 def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
-    """Return the coloured cloud in a file, checked, in metres, in Morton order.
+    """Return the cloud in a file, checked, in metres, in Morton order.
 
     The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
     metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
@@ -45,26 +54,42 @@ def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
 
 
 def open_source(path: Path, settings: CloudSettings = IN_METRES) -> PointSource:
-    """Return the points of a file in any supported format."""
+    """Return the points of a file in any supported format, in the first of the channels that it has."""
     try:
         format_ = _format_of(path)
         if settings.labels and not format_.has_labels:
             known = ", ".join(f.name for f in FORMATS if f.has_labels)
             raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
         try:
-            return format_.open_source(path, settings)
+            return _open_channel(format_, path, settings)
+        except MissingChannelError:
+            raise
         except InputError as error:
             raise InputError(f"{error}{_hint(format_, path, settings)}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
 
 
+def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> PointSource:
+    """Return the points in the first channel that the file has, with a warning if it has no colours."""
+    missing: list[MissingChannelError] = []
+    for channel in ("colors",) if settings.labels else settings.channels:
+        try:
+            source = format_.open_source(path, settings, channel)
+        except MissingChannelError as error:
+            missing.append(error)
+            continue
+        notes = (str(missing[0]),) if missing and settings.channels[0] == "colors" else ()
+        return source._replace(channel=channel, warnings=(*source.warnings, *notes))
+    raise missing[0]
+
+
 def _hint(format_: CloudFormat, path: Path, settings: CloudSettings) -> str:
     """Return what to add to the refusal of a file that would be read without its colours."""
-    if settings.ignore_colors or settings.labels:
+    if settings.labels or settings.channels != IN_METRES.channels:
         return ""
     try:
-        format_.open_source(path, replace(settings, intensity_as_gray=False, ignore_colors=True))
+        format_.open_source(path, settings, "shape")
     except InputError:
         return ""
     return "; `ignore_colors` localizes by the shape alone"

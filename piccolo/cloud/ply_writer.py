@@ -31,10 +31,11 @@ MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 
 
 def vertex_rows(
-    points: NDArray[np.floating[Any]], colors: NDArray[np.uint8], **more: NDArray[Any] | None
+    points: NDArray[np.floating[Any]], colors: NDArray[np.uint8] | None, **more: NDArray[Any] | None
 ) -> Rows:
-    """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB, and more (N,)."""
-    columns = dict(zip(("x", "y", "z", *COLOR_NAMES), [*points.T, *colors.T], strict=True))
+    """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB if any, more (N,)."""
+    columns = dict(zip(AXES, points.T, strict=True))
+    columns.update({} if colors is None else dict(zip(COLOR_NAMES, colors.T, strict=True)))
     columns.update((name, column) for name, column in more.items() if column is not None)
     rows = np.empty(len(points), dtype=[(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
@@ -106,8 +107,8 @@ def write_transformed(
     """Write a cloud, read once before, as binary PLY under a transform (4, 4) in the files' unit.
 
     One PLY file keeps its other properties and elements and its points with NaN, its normals are rotated; any
-    other cloud is written with x y z and red green blue. `finish` runs when all is written, just before `out`
-    appears. Return a line for each element that was left out.
+    other cloud is written with x y z and red green blue, or intensity, or neither. `finish` runs when all is
+    written, just before `out` appears. Return a line for each element that was left out.
     """
     path = cloud.sources[0].path
     with path.open("rb") as file:
@@ -115,11 +116,17 @@ def write_transformed(
     if is_ply and len(cloud.sources) == 1:
         return _write_copy(cloud, read_header(path), T_target_from_source, out, finish)
     dtype = np.float64 if needs_double(cloud.box, T_target_from_source, cloud.scale) else np.float32
-    fields = vertex_rows(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
+    channel = cloud.sources[0].channel
+
+    def rows_of(points: NDArray[np.floating[Any]], colors: NDArray[np.uint8]) -> Rows:
+        intensity = colors[:, 0] if channel == "intensity" else None
+        return vertex_rows(points, colors if cloud.has_colors else None, intensity=intensity)
+
+    fields = rows_of(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
     with writing_ply(out, fields) as writer:
         for points, colors in cloud.chunks([]):
             target = transform_points(points / cloud.scale, T_target_from_source)
-            writer.add(vertex_rows(target.astype(dtype), colors))
+            writer.add(rows_of(target.astype(dtype), colors))
         finish()
     return ()
 

@@ -11,29 +11,28 @@ from ..geometry.colors import Labels
 from ..geometry.pose import Array, rotation_to_z
 from ..optional import import_optional
 
+# of points: what photos are compared with
+Channel = Literal["colors", "intensity", "shape"]
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
 
+WITHOUT_COLORS: tuple[Channel, ...] = ("intensity", "shape")
 METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # per unit of length
 
 
 @dataclass(frozen=True)
 class CloudSettings:
-    """Unit, axes, colours and coordinate system of a cloud's files."""
+    """Unit, axes, channels and coordinate system of a cloud's files."""
 
     scale: float = 1.0  # metres per unit of the files
     up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
-    intensity_as_gray: bool = False  # where a file has no colours
-    ignore_colors: bool = False  # edges of the surfaces take their place
+    channels: tuple[Channel, ...] = get_args(Channel)  # the first one that the files have is taken
     labels: Labels | None = None  # the points' labels are taken for their colours
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 
     def __post_init__(self) -> None:
-        """Raise InputError for invalid values, and for labels, intensity or neither at once."""
-        if self.intensity_as_gray and self.labels:
-            raise InputError("`labels`, `intensity_as_gray`: found both, wanted one of them")
-        if self.ignore_colors and (self.labels or self.intensity_as_gray):
-            other = "labels" if self.labels else "intensity_as_gray"
-            raise InputError(f"`ignore_colors`, `{other}`: found both, wanted one of them")
+        """Raise InputError for invalid values, and for labels of a scan whose colours are ignored."""
+        if self.labels and "colors" not in self.channels:
+            raise InputError("`ignore_colors`, `labels`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):
             raise InputError(f"`up`: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
@@ -53,6 +52,7 @@ def check_crs(crs: str) -> Any:
 
 
 IN_METRES = CloudSettings()
+IN_COLORS = CloudSettings(channels=("colors",))  # of files that must have colours
 
 
 def R_z_from_axis(up: UpAxis, of_file: UpAxis) -> Array:

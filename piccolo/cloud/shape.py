@@ -52,7 +52,7 @@ def paint_shape(octree: Octree, workers: Workers) -> Octree:
 def color_edges(nodes: NDArray[np.float32], around: Surroundings, workers: Workers) -> NDArray[np.float32]:
     """Return the colours (N, 3), in [0, 1], of the edges at nodes (N, 6) in grey, z up."""
     strength, vertical = find_edges(nodes[:, :3].astype(np.float64), around, workers).T
-    return colors_of_edges(strength, vertical, nodes[:, 3]) / np.float32(255.0)
+    return np.asarray(colors_of_edges(strength, vertical, nodes[:, 3]) / np.float32(255.0), np.float32)
 
 
 def find_edges(points: Array, around: Surroundings, workers: Workers) -> Array:

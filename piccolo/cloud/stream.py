@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +14,8 @@ from ..files.cache import sha256_of_arrays
 from ..geometry.pose import Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .readers.reader import CHUNK, PointSource, RawCloud, color_chunks, find_full_brightness
-from .settings import UpAxis
+from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness
+from .settings import Channel, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
@@ -102,6 +102,7 @@ class Cloud:
     num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
     up: UpAxis = "z"  # the axis that points up according to the files
+    has_colors: bool = True  # else greys, by the intensity or all alike
 
     def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
         """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
@@ -147,6 +148,11 @@ class CloudStream:
         """The axis that points up according to the files; z if they disagree."""
         axes = {source.up for source in self.sources}
         return axes.pop() if len(axes) == 1 else "z"
+
+    @property
+    def has_colors(self) -> bool:
+        """False if the colours are greys, by the intensity of the points or all alike."""
+        return all(source.channel == "colors" for source in self.sources)
 
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres; append each file's validator once it is read."""
@@ -197,14 +203,17 @@ class CloudStream:
         colors = colors[order]
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
         num_dropped = sum(validator.num_dropped for validator in validators)
-        return Cloud(points, colors, origin_world, num_dropped, warnings, self.up)
+        return Cloud(points, colors, origin_world, num_dropped, warnings, self.up, self.has_colors)
 
 
 def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
-    """Return a cloud in memory: points (N, 3), colours (N, 3) in uint8, uint16, or floats in [0, 1]."""
-    if points.ndim != 2 or points.shape[1:] != (3,) or colors is None or colors.shape != points.shape:
+    """Return a cloud in memory: points (N, 3), and colours (N, 3): uint8, uint16, floats in [0, 1], None."""
+    if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
-        raise InputError(f"points, colors: found shapes {shapes}, wanted two arrays of shape (N, 3)")
-    brightest = find_full_brightness(ARRAYS, [f"{colors.dtype.kind}{colors.dtype.itemsize}"])
-    chunks = color_chunks([(points, colors)], brightest, lambda row: f"{ARRAYS}, row {row}")
-    return replace(stream_points(ARRAYS, next(iter(chunks))), sha256=sha256_of_arrays(points, colors))
+        raise InputError(f"points, colors: found shapes {shapes}, wanted arrays of shape (N, 3)")
+    given = np.full(points.shape, GRAY, np.uint8) if colors is None else colors
+    brightest = find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
+    chunk = next(iter(color_chunks([(points, given)], brightest, lambda row: f"{ARRAYS}, row {row}")))
+    channel: Channel = "shape" if colors is None else "colors"
+    source = PointSource(ARRAYS, lambda: iter([chunk]), len(given), channel=channel)
+    return CloudStream([source], sha256=sha256_of_arrays(points, given))

@@ -65,7 +65,7 @@ def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
 def colors_of_edges(
     strength: NDArray[np.floating], vertical: NDArray[np.floating], gray: NDArray[np.floating] | float
 ) -> NDArray[np.uint8]:
-    """Return the colours (..., 3) that stand for edges (...) in [0, 1], the vertical ones of them, and a grey.
+    """Return the colours (..., 3) that stand for edges (...) in [0, 1], the vertical ones, and a grey.
 
     (2 G - R - B) / 4 is the strength, (R - B) / 2 that of vertical edges minus that of others, luminance the
     grey.

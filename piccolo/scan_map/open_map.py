@@ -10,7 +10,7 @@ import numpy as np
 
 from ..cloud import open_cloud
 from ..cloud.crs import read_crs
-from ..cloud.settings import IN_METRES, CloudSettings, R_z_from_axis
+from ..cloud.settings import IN_COLORS, IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
 from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
@@ -75,7 +75,6 @@ def open_map(
             watch,
             prior=prior,
             has_features=has_features,
-            has_shape=cloud_settings.ignore_colors,
         )
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=read_crs(paths))
@@ -115,12 +114,12 @@ def extend_map(
         raise InputError("`up`: not with `add`; a scan is added in the axes of the map")
     with watch.stage("read"):
         old = load_map(map_path)
-        cloud = open_cloud(paths, cloud_settings, workers.show)
+        if old.has_shape:
+            raise InputError(f"{map_path}: `add`: found a map without colours, wanted one with them")
+        cloud = open_cloud(paths, replace(cloud_settings, channels=IN_COLORS.channels), workers.show)
         digest = sha256_of_files(paths)
         crs = read_crs(paths)
     check_labels(map_path, old, cloud_settings)
-    if old.has_shape or cloud_settings.ignore_colors:
-        raise InputError(f"{map_path}: `add`: not with the shape alone")
     if crs and old.crs and crs != old.crs:
         workers.warn(f"{paths[0]}: names another coordinate system than the map; the map's is used")
     old = add_features(old, workers)

@@ -26,7 +26,7 @@ from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candi
 from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
 
-SHAPE_ALONE = "photos are localized by the shape of the scan alone, without colours"
+SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
 LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
 
@@ -37,6 +37,10 @@ class Voxelized(Protocol):
     @property
     def up(self) -> UpAxis:
         """Upward axis, as the file declares it."""
+
+    @property
+    def has_colors(self) -> bool:
+        """False if its colours are greys, by the intensity of the points or all alike."""
 
     def voxels(self, R_map_from_world: Array) -> Voxels:
         """Average the points in each voxel, in axes rotated by a matrix (3, 3)."""
@@ -174,11 +178,10 @@ def prepare_map(
     view: ViewConfig = SEARCH_VIEW,
     prior: Prior = NOTHING_KNOWN,
     has_features: bool = True,
-    has_shape: bool = False,
 ) -> ScanMap:
     """Prepare a map of a cloud, with local features, or without until a photo needs them.
 
-    With `has_shape` it holds the edges of the surfaces in place of colours, and no local features.
+    Of a cloud without colours it holds the edges of the surfaces in their place, and no local features.
 
     The named axis is up, with `auto` the file's; or a rotation (3, 3) makes z up. Of a scan too large as a
     whole only the surroundings of the prior's place are prepared; TooManyPositionsError if the prior has no
@@ -193,6 +196,7 @@ def prepare_map(
         warnings = voxels.warnings
         if isinstance(up, str) and up == "auto":
             warnings += check_up(octree, R_map_from_world, cloud.up)
+    has_shape = not cloud.has_colors
     if has_shape:
         warnings += (SHAPE_ALONE,)
     for warning in warnings:  # now: a wrong unit makes what follows long

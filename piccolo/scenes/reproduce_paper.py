@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..cloud import read_cloud
 from ..cloud.ply_writer import vertex_rows, write_ply
+from ..cloud.settings import IN_COLORS
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..geometry.pose import Array, Pose
@@ -41,7 +42,7 @@ def identity(scene: Scene, folder: Path) -> Scene:
 
 def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | None = None) -> Scene:
     """Return a number or a fraction of the points, drawn at random; InputError where there are fewer."""
-    cloud = read_cloud(scene.cloud)
+    cloud = read_cloud(scene.cloud, IN_COLORS)
     count = num_points or max(1, round(fraction * len(cloud.points)))
     if count > len(cloud.points):
         raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
@@ -52,7 +53,7 @@ def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | No
 
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """Return the cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
-    cloud = read_cloud(scene.cloud)
+    cloud = read_cloud(scene.cloud, IN_COLORS)
     turn = RigidTransform(random_rotation(_rng(scene)), np.zeros(3))
     points = turn.of_points(cloud.points.astype(np.float64) + cloud.origin_world)
     queries = tuple(replace(query, pose=turn.of_pose(query.pose)) for query in scene.queries)

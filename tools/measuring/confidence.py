@@ -5,7 +5,6 @@ import json
 import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 
 from piccolo.cli.command import option
 from piccolo.cli.errors import print_note
-from piccolo.cloud import read_cloud, stream_points
-from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud import read_cloud
+from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose, is_correct
 from piccolo.geometry.rotations import Gravity
@@ -312,8 +311,8 @@ def run(arguments: argparse.Namespace) -> int:
     rows: list[Case] = []
     with arguments.out.open("w") as file:
         for scene, (points, colors), trials in all_trials(arguments, workers):
-            cloud = stream_points(Path("trial"), RawCloud(points.astype(np.float64), colors))
-            scan_map = prepare_map(cloud, workers, has_features=False, has_shape=arguments.ignore_colors)
+            cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
+            scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
                 settings = CoarseToFineSettings(gravity=trial.gravity)
                 photo = read_photo(trial.rgb, ReadOptions(focal_px=trial.focal_px), trial.is_masked)

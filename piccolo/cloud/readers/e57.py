@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from .e57_file import (
     MAGIC,
     NAMESPACE,
@@ -29,7 +29,16 @@ from .e57_file import (
     refusing,
     text_of,
 )
-from .reader import CHUNK, OPTION, CloudFormat, PointSource, RawCloud, bare_points, intensity_reader
+from .reader import (
+    CHUNK,
+    ChunkReader,
+    CloudFormat,
+    MissingChannelError,
+    PointSource,
+    RawCloud,
+    bare_points,
+    intensity_reader,
+)
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -39,7 +48,12 @@ INTENSITY = "intensity"
 INVALID_COLOR = "isColorInvalid"
 INVALID_INTENSITY = "isIntensityInvalid"
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
-WANTED = "wanted scans with colorRed colorGreen colorBlue"
+CHANNELS: dict[Channel, tuple[str, ...]] = {"colors": COLORS, "intensity": (INTENSITY,), "shape": ()}
+WANTED: dict[Channel, str] = {
+    "colors": "wanted scans with colorRed colorGreen colorBlue",
+    "intensity": "wanted scans with intensity",
+    "shape": "wanted scans with points",
+}
 KINDS = {
     "spherical": "sphericalRepresentation",
     "pinhole": "pinholeRepresentation",
@@ -68,44 +82,26 @@ class _UnusableError(Exception):
     """A scan is intact, but can't be used."""
 
 
-def open_e57(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """Return the coloured points of all scans of an E57 file.
+def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+    """Return the points of all scans of an E57 file that have colours, or another channel.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
     range is the scan's colorLimits, or else that of the field's declaration; it is never guessed. If only
-    some scans have colours, the others are left out, with a warning.
+    some scans have the channel, the others are left out, with a warning.
     """
-    if options.ignore_colors:
-        return _bare_source(path)
     with open_file(path) as file:
-        scans, left_out = _scans(file, COLORS)
-        measured, not_measured = ([], []) if scans else _scans(file, (INTENSITY,))
-    if not scans and not (measured and options.intensity_as_gray):
-        found = left_out[0] if left_out else "no scans"
-        more = f"; {measured[0].label} has intensity and no colours, {OPTION}" if measured else ""
-        raise InputError(f"{path}: {found}, {WANTED}{more}")
-    warnings = tuple(f"{path}: {what}; left out" for what in (left_out if scans else not_measured))
-    num_points = sum(scan.num_points for scan in scans or measured)
-    read_chunks = intensity_reader(path, lambda: ((p, v[:, 0]) for _, p, v in _read(path, measured)))
-    if scans:
-        read_chunks = partial(_read_colored, path, scans)
-    return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans or measured))
-
-
-def _bare_source(path: Path) -> PointSource:
-    """Return the points of all scans, of which only the shape counts."""
-    with open_file(path) as file:
-        scans, left_out = _scans(file, ())
+        scans, left_out = _scans(file, CHANNELS[channel])
     if not scans:
-        raise InputError(f"{path}: {left_out[0] if left_out else 'no scans'}, wanted scans with points")
+        error = InputError if channel == "shape" else MissingChannelError
+        raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
+    read_chunks: ChunkReader = partial(_read_colored, path, scans)
+    if channel == "shape":
+        read_chunks = lambda: bare_points(points for _, points, _ in _read(path, scans))  # noqa: E731
+    elif channel == "intensity":
+        read_chunks = intensity_reader(lambda: ((p, values[:, 0]) for _, p, values in _read(path, scans)))
     warnings = tuple(f"{path}: {what}; left out" for what in left_out)
     num_points = sum(scan.num_points for scan in scans)
-    read_chunks = partial(_read_bare, path, scans)
     return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans))
-
-
-def _read_bare(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
-    return bare_points(points for _, points, _ in _read(path, scans))
 
 
 def _station_axes(scans: list[E57Scan]) -> tuple[NDArray[np.float64], ...]:
@@ -145,8 +141,6 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise _UnusableError("has neither cartesian nor spherical coordinates")
     if not fields.keys() >= set(channels):
         raise _UnusableError("has no colours" if channels == COLORS else "has no intensity")
-    if channels == (INTENSITY,) and fields.keys() >= set(COLORS):
-        raise _UnusableError("has colours, but without a range")
     of_channels = {COLORS: (INVALID_COLOR,), (INTENSITY,): (INVALID_INTENSITY,)}
     invalid = (INVALID[coordinates], *of_channels.get(channels, ()))
     num_bits = sum(_num_bits(file.path, field) for field in prototype.iter())

@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...optional import import_optional
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from .reader import (
     CHUNK,
     CUT,
-    OPTION,
     CloudFormat,
+    MissingChannelError,
     PointSource,
     PointsWithScalar,
     RawCloud,
@@ -287,7 +287,7 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
         raise InputError(f"{path}: the compressed points are broken ({why})") from error
 
 
-def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a LAS or LAZ file; withheld ones are left out.
 
     Colours are 16-bit, as the format says. They are read as 8-bit if none of a million points, spread evenly
@@ -296,13 +296,18 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """
     header = read_header(path)
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
-    if options.labels or options.ignore_colors:
+    if options.labels or channel == "shape":
         read = partial(_read_scalar, header, layout, "class")
         read_chunks = label_reader(path, read, options.labels) if options.labels else bare_reader(read)
         return PointSource(path, read_chunks, header.num_points)
+    if channel == "intensity":
+        return _gray_source(header, layout)
     brightest, num_samples = _largest(header, layout, "rgb") if header.has_colors else (0, 0)
     if brightest == 0:
-        return _gray_source(header, layout, options, num_samples)
+        why = f"red green blue are 0 in all {num_samples} points checked"
+        if not header.has_colors:
+            why = f"point format {header.point_format} has none"
+        raise MissingChannelError(f"{path}: has no colours: {why}, {WANTED}")
     is_8_bit = brightest <= 255
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields"
     return PointSource(
@@ -313,17 +318,13 @@ def open_las(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     )
 
 
-def _gray_source(header: LasHeader, layout: LasLayout, options: CloudSettings, count: int) -> PointSource:
-    if not options.intensity_as_gray:
-        why = f"red green blue are 0 in all {count} points checked"
-        if not header.has_colors:
-            why = f"point format {header.point_format} has intensity only"
-        largest, count = _largest(header, layout, "intensity")
-        if largest == 0:
-            why += f"; its intensity is 0 in all {count} points checked"
-            raise InputError(f"{header.path}: has neither colours nor intensity: {why}, {WANTED}")
-        raise InputError(f"{header.path}: has intensity and no colours: {why}, {WANTED}; {OPTION}")
-    read_chunks = intensity_reader(header.path, lambda: _read_scalar(header, layout, "intensity"))
+def _gray_source(header: LasHeader, layout: LasLayout) -> PointSource:
+    """Return the points in grey, by their intensity."""
+    largest, num_samples = _largest(header, layout, "intensity")
+    if largest == 0:
+        why = f"it is 0 in all {num_samples} points checked"
+        raise MissingChannelError(f"{header.path}: has no intensity: {why}")
+    read_chunks = intensity_reader(partial(_read_scalar, header, layout, "intensity"))
     return PointSource(header.path, read_chunks, header.num_points)
 
 

@@ -19,10 +19,10 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import Array
-from ..settings import IN_METRES, CloudSettings, UpAxis
+from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import BRIGHTEST, CHUNK, CloudFormat, PointSource, RawCloud
+from .reader import BRIGHTEST, CHUNK, CloudFormat, MissingChannelError, PointSource, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -157,7 +157,7 @@ def _bytes(colors: Array) -> NDArray[np.uint8]:
     return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return points on the triangles of an OBJ, GLB or glTF file, 10,000 per square metre.
 
     The options' scale is the file's unit in metres. A file that would give more than 30 million points is
@@ -168,18 +168,20 @@ def open_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     """
     content = path.read_bytes()
     is_gltf = content.startswith(GLB_MAGIC) or path.suffix.lower() in (".glb", ".gltf")
-    return _source((load_gltf if is_gltf else load_obj)(path, content), options)
+    return _source((load_gltf if is_gltf else load_obj)(path, content), options, channel)
 
 
-def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return points on the faces of a PLY file, like `open_mesh`; textured if a comment names a texture."""
-    return _source(load_ply(path), options)
+    return _source(load_ply(path), options, channel)
 
 
-def _source(loaded: Loaded, options: CloudSettings) -> PointSource:
+def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSource:
     path = loaded.path
+    if channel == "intensity":
+        raise MissingChannelError(f"{path}: has no intensity")
     scale = options.scale
-    instances, notes = _instances(loaded, options.ignore_colors)
+    instances, notes = _instances(loaded, channel == "shape")
     num_triangles = sum(len(instance.surface.triangles) for instance in instances)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
@@ -230,7 +232,7 @@ def _instances(loaded: Loaded, is_bare: bool) -> tuple[list[SurfaceInstance], li
     if not instances and not num_bare:
         raise InputError(f"{path}: no triangles, {WANTED}")
     if not instances or (not is_bare and _is_one_color([instance.surface for instance in instances])):
-        raise InputError(f"{path}: no colours, {WANTED}")
+        raise MissingChannelError(f"{path}: no colours, {WANTED}")
     # surfaces of one texture next to each other: it is decoded once
     first = {id(instance.surface.texture): i for i, instance in reversed(list(enumerate(instances)))}
     instances.sort(key=lambda instance: first[id(instance.surface.texture)])

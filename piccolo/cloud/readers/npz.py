@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from .reader import (
     BRIGHTEST,
     CloudFormat,
+    MissingChannelError,
     PointSource,
     bare_points,
     color_chunks,
@@ -71,27 +72,31 @@ class ArrayInFile(NamedTuple):
             yield rows
 
 
-def open_npy(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
-    """Return the points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255."""
+def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+    """Return the points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255, or (N, 3) of x y z."""
     array = _open_array(path, None, path.stat().st_size)
-    is_bare = options.ignore_colors and array.shape[1:] == (3,)
-    if len(array.shape) != 2 or not (is_bare or array.shape[1] == 6) or array.dtype.kind not in "fiu":
+    if len(array.shape) != 2 or array.shape[1] not in (3, 6) or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
-    if options.ignore_colors:
+    if channel == "shape":
         return _bare_source(path, array)
+    if channel == "intensity" or array.shape[1] == 3:
+        raise MissingChannelError(f"{path}: {array}, {WANTED}")
     brightest = BRIGHTEST["u1"]
     return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
 
 
-def open_npz(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
     The range of colours follows from their type: uint8 0-255, uint16 0-65535, float 0-1. An archive whose
     arrays promise more than 200 times the size of the file, or 16 GB, is refused.
     """
-    arrays = [_open_array(path, m.filename, m.file_size) for m in _members(path, options.ignore_colors)]
+    if channel == "intensity":
+        raise MissingChannelError(f"{path}: has no intensity")
+    is_bare = channel == "shape"
+    arrays = [_open_array(path, m.filename, m.file_size) for m in _members(path, is_bare)]
     points = arrays[0]
-    if options.ignore_colors and points.shape[1:] == (3,) and points.dtype.kind in "fiu":
+    if is_bare and points.shape[1:] == (3,) and points.dtype.kind in "fiu":
         return _bare_source(path, points)
     colors = arrays[-1]
     if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
@@ -148,7 +153,8 @@ def _members(path: Path, is_bare: bool) -> list[zipfile.ZipInfo]:
     names = [name for kind in kinds for name in kind if name in members]
     if [name in COLORS_NAMES for name in names] != [False, True][: len(kinds)]:
         listed = quote_line(" ".join(list(members)[:12]).encode())
-        raise InputError(f"{path}: the arrays are {listed}, {WANTED}")
+        error = MissingChannelError if [name in POINTS_NAMES for name in names] == [True] else InputError
+        raise error(f"{path}: the arrays are {listed}, {WANTED}")
     infos = [members[name] for name in names]
     for info in infos:
         if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED) or info.flag_bits & 1:

@@ -15,14 +15,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from .reader import (
     CloudFormat,
     ColumnReader,
     Columns,
+    MissingChannelError,
     PointSource,
     RawCloud,
-    check_option,
     color_names,
     column_source,
     in_chunks,
@@ -180,16 +180,16 @@ def decompress_lzf(data: bytes, size: int) -> bytearray | None:
     return out if len(out) == size and i == len(data) - 2 else None
 
 
-def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a PCD file.
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
     in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
-    fields are left out. If the options say so, `intensity` or `label` takes the place of colours. The size of
-    a binary file is compared with the header before memory is reserved.
+    fields are left out, but for `intensity` or `label` where one is asked for. The size of a binary file is
+    compared with the header before memory is reserved.
     """
     header = read_header(path)
-    fields = _select_fields(header, options)
+    fields = _select_fields(header, options, channel)
     found = path.stat().st_size - header.size
     promised = {"ascii": 0, "binary": header.row_size * header.num_points}.get(header.encoding, 8)
     if promised > found:  # of ASCII and compressed data this is known when they are read
@@ -204,27 +204,24 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     return column_source(path, read_columns, types, header.num_points, options.labels)
 
 
-def _select_fields(header: PcdHeader, options: CloudSettings) -> tuple[PcdField, ...]:
-    """Return the fields x y z and one or three of colours, or by the options the intensity or label."""
+def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:
+    """Return the fields x y z and one or three of colours, or the intensity or label, or no others."""
     found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
+    more: tuple[str, ...] = ()
+    wanted = WANTED
     if options.labels:
         more = (LABEL,) * (LABEL in found)
         wanted = "wanted x y z and label"
-    elif options.ignore_colors:
-        more = ()
-        wanted = "wanted x y z"
-    else:
-        color = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
-        more = color or (INTENSITY,) * (INTENSITY in found)
-        wanted = WANTED
-    if not (more or options.ignore_colors) or not all(
-        names.count(axis) == 1 and axis in found for axis in "xyz"
-    ):
+    elif channel == "intensity":
+        more = (INTENSITY,) * (INTENSITY in found)
+    elif channel == "colors":
+        more = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
+    has_points = all(names.count(axis) == 1 and axis in found for axis in "xyz")
+    if not has_points or not (more or channel == "shape"):
         listed = " ".join(names[:12]) or "none"
-        raise InputError(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
-    if more == (INTENSITY,):
-        check_option(header.path, options, WANTED)
+        error = MissingChannelError if has_points else InputError
+        raise error(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
     fields = tuple(found[name] for name in (*"xyz", *more))
     for field in fields:
         types, kinds = TYPES.get(field.name, ((field.type,), ""))

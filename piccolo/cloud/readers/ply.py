@@ -15,7 +15,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from .mesh import open_ply_mesh
 from .reader import (
     COLOR_NAMES,
@@ -23,8 +23,8 @@ from .reader import (
     LABEL_NAMES,
     CloudFormat,
     Columns,
+    MissingChannelError,
     PointSource,
-    check_option,
     color_names,
     column_source,
     quote_line,
@@ -59,7 +59,7 @@ class PlyHeader:
         return self.elements[self.index]
 
 
-def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
@@ -69,8 +69,8 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     if _has_faces(header):
         if options.labels:
             raise InputError(f"{path}: found a mesh, wanted points with labels")
-        return open_ply_mesh(path, options)
-    names = _property_names(header, options)
+        return open_ply_mesh(path, options, channel)
+    names = _property_names(header, options, channel)
     if not header.is_ascii:
         place_of_vertices(header)
     types = [header.vertices.ply_property(name).val_dtype for name in names[3:]]
@@ -144,24 +144,24 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
     raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
 
 
-def _property_names(header: PlyHeader, options: CloudSettings) -> tuple[str, ...]:
-    """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label."""
+def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel) -> tuple[str, ...]:
+    """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label, or none."""
     found = [prop.name for prop in header.vertices.properties]
-    if options.ignore_colors and {*"xyz"} <= {*found}:
-        return tuple("xyz")
-    colors = () if options.labels else color_names(found)
-    scalars = [name for name in found if name.lower() in INTENSITY_NAMES]
+    by_lower = {name.lower(): name for name in found}
+    more: tuple[str, ...] = ()
     if options.labels:
-        by_lower = {name.lower(): name for name in found}
-        scalars = [by_lower[name] for name in LABEL_NAMES if name in by_lower]
-    if not {*"xyz"} <= {*found} or not (colors or scalars):
+        more = tuple(by_lower[name] for name in LABEL_NAMES if name in by_lower)[:1]
+    elif channel == "intensity":
+        more = tuple(name for name in found if name.lower() in INTENSITY_NAMES)[:1]
+    elif channel == "colors":
+        more = color_names(found)
+    if not {*"xyz"} <= {*found} or not (more or channel == "shape"):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
         listed = " ".join(found[:9]) or "no properties"
         wanted = LABELS_WANTED if options.labels else WANTED
-        raise InputError(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
-    if not colors and not options.labels:
-        check_option(header.path, options, WANTED)
-    return (*"xyz", *(colors or scalars[:1]))
+        error = MissingChannelError if {*"xyz"} <= {*found} else InputError
+        raise error(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
+    return (*"xyz", *more)
 
 
 def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:

@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.pose import transform_points
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from .reader import (
+    ChunkReader,
     CloudFormat,
+    MissingChannelError,
     PointSource,
     RawCloud,
     bare_reader,
-    check_option,
     intensity_reader,
     quote_line,
 )
@@ -32,7 +33,7 @@ from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
 COLORED = LineLayout((0, 1, 2, 4, 5, 6))  # x y z r g b
-WITH_INTENSITY = LineLayout((0, 1, 2, 3), NUM_WITH_INTENSITY)
+IN_GRAY = LineLayout((0, 1, 2, 3))  # x y z intensity
 AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
 WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
 
@@ -44,7 +45,7 @@ class PtxScan(NamedTuple):
     T_world_from_scanner: NDArray[np.float64]  # (4, 4)
 
 
-def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of a PTX file, in the world.
 
     0 0 0 means that no beam came back, and is left out. A last scan with fewer lines than its header promises
@@ -53,14 +54,11 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     lines = NumberLines(path, COLORED, WANTED)
     scans: list[PtxScan] = []
     warnings: list[str] = []
-    has_colors = True
     while (header := _take_header(lines)) is not None:
         count, T_world_from_scanner = header
         last_of_header = lines.num_taken - 1
-        if not scans and len((lines.peek() or b"").split()) == NUM_WITH_INTENSITY:
-            if not options.ignore_colors:
-                check_option(path, options, WANTED)
-            has_colors = False
+        if not scans and len((lines.peek() or b"").split()) == NUM_WITH_INTENSITY and channel == "colors":
+            raise MissingChannelError(f"{path}: has intensity and no colours, {WANTED}")
         found = lines.skip(count)
         if found < count:
             found -= bool(found) and not _ends_with_a_line_end(path)
@@ -69,12 +67,14 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
         scans.append(PtxScan(found, T_world_from_scanner))
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
-    read = partial(_read, path, COLORED if has_colors else WITH_INTENSITY, scans)
-    read_chunks = (lambda: starmap(RawCloud, read())) if has_colors else intensity_reader(path, read)
-    if options.ignore_colors:
-        read_chunks = bare_reader(read)
+    read = partial(_read, path, COLORED if channel == "colors" else IN_GRAY, scans)
+    readers: dict[Channel, ChunkReader] = {
+        "colors": lambda: starmap(RawCloud, read()),
+        "intensity": intensity_reader(read),
+        "shape": bare_reader(read),
+    }
     num_points = sum(scan.num_points for scan in scans)
-    return PointSource(path, read_chunks, num_points, tuple(warnings), tuple(_station_axes(scans)))
+    return PointSource(path, readers[channel], num_points, tuple(warnings), tuple(_station_axes(scans)))
 
 
 def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:

@@ -2,9 +2,9 @@
 
 Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
 become 8 bits; their range follows from the declared type and is never guessed. Labels become colours in place
-of the file's own. Intensity becomes a gray for files that have no colours. Its unit differs from scanner to
-scanner, and a few mirrors outshine everything: the 1st percentile of a file becomes black, its 99th white.
-These are percentiles of all points, in any order, for which the file is read once more.
+of the file's own. Intensity becomes a gray. Its unit differs from scanner to scanner, and a few mirrors
+outshine everything: the 1st percentile of a file becomes black, its 99th white. These are percentiles of all
+points, in any order, for which the file is read once more.
 """
 
 import functools
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
-from ..settings import CloudSettings, UpAxis
+from ..settings import Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
@@ -40,7 +40,6 @@ COLOR_NAMES = (
 Columns = list[NDArray[Any]]
 ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
-OPTION = "`intensity_as_gray` uses it as gray values"
 BLACK, WHITE = 0.01, 0.99  # fraction of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
@@ -48,6 +47,10 @@ GRAY = 128  # of points of which only the shape counts
 # as in PLY files, in lower case; the first that is found counts. CloudCompare prefixes `scalar_`
 LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
 MOST = 2.0**32  # labels are below it, and above its negative
+
+
+class MissingChannelError(InputError):
+    """A file that is sound, but has no colours, or no intensity."""
 
 
 class RawCloud(NamedTuple):
@@ -69,6 +72,7 @@ class PointSource(NamedTuple):
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
     station_axes: tuple[NDArray[np.float64], ...] = ()  # (3,) unit, z of scanners with poses, file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
+    channel: Channel = "colors"  # what is read of the points
 
 
 class CloudFormat(NamedTuple):
@@ -77,7 +81,8 @@ class CloudFormat(NamedTuple):
     name: str
     suffixes: frozenset[str]  # lower case, with the dot
     has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    open_source: Callable[[Path, CloudSettings], PointSource]
+    # MissingChannelError if the file has no such channel
+    open_source: Callable[[Path, CloudSettings, Channel], PointSource]
     has_labels: bool = False  # the reader knows them
 
 
@@ -178,7 +183,7 @@ def column_source(
     elif labels:
         read_chunks = label_reader(path, partial(_with_scalar, read_columns), labels)
     else:
-        read_chunks = intensity_reader(path, partial(_with_scalar, read_columns))
+        read_chunks = intensity_reader(partial(_with_scalar, read_columns))
     return PointSource(path, read_chunks, num_points)
 
 
@@ -201,9 +206,9 @@ def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
     return ((points_of(columns), columns[3].astype(np.float64)) for columns in read_columns())
 
 
-def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
+def intensity_reader(read_scalar: ScalarReader) -> ChunkReader:
     """Return `read_chunks` of a PointSource for a reader of points and their intensity."""
-    limits = functools.cache(lambda: _limits(path, read_scalar()))
+    limits = functools.cache(lambda: _limits(read_scalar()))
 
     def read_chunks() -> Iterator[RawCloud]:
         low, high = limits()
@@ -213,20 +218,19 @@ def intensity_reader(path: Path, read_scalar: ScalarReader) -> ChunkReader:
     return read_chunks
 
 
-def check_option(path: Path, options: CloudSettings, wanted: str) -> None:
-    """Refuse a file with intensity and no colours, unless the options allow its intensity as a gray."""
-    if not options.intensity_as_gray:
-        raise InputError(f"{path}: has intensity and no colours, {wanted}; {OPTION}")
-
-
 def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
-    """Convert intensity (N,) to gray (N, 3): black up to `low` and for NaN, white from `high` on."""
+    """Convert intensity (N,) to gray (N, 3): black up to `low` and for NaN, white from `high` on.
+
+    If all are alike, they say no more than no intensity does.
+    """
+    if not low < high:
+        return np.full((len(intensity), 3), GRAY, np.uint8)
     share = (np.nan_to_num(intensity, nan=low) - low) / (high - low)
     gray = np.rint(255.0 * np.clip(share, 0.0, 1.0)).astype(np.uint8)
     return np.repeat(gray[:, None], 3, axis=1)
 
 
-def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
+def _limits(chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
     """Return percentiles of the intensity of points with a position, within 1 %, or exact up to 255."""
     histogram = np.zeros(NUM_BINS, np.int64)
     for points, intensity in chunks:
@@ -236,8 +240,6 @@ def _limits(path: Path, chunks: Iterator[PointsWithScalar]) -> tuple[float, floa
     if total[-1] == 0:  # no point has a position: others refuse that
         return 0.0, 1.0
     low, high = (_lower_edge(int(np.searchsorted(total, share * total[-1]))) for share in (BLACK, WHITE))
-    if not low < high:
-        raise InputError(f"{path}: the intensity is {low:g} nearly everywhere, wanted colours")
     return low, high
 
 

@@ -14,17 +14,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...errors import InputError
-from ..settings import IN_METRES, CloudSettings
+from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader as raw
 from .reader import (
     BRIGHTEST,
     CUT,
     INTENSITY_NAMES,
+    ChunkReader,
     CloudFormat,
+    MissingChannelError,
     PointSource,
     RawCloud,
     bare_points,
-    check_option,
     color_chunks,
     color_names,
     intensity_reader,
@@ -34,12 +35,17 @@ from .reader import (
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
+NUM_COLUMNS: dict[Channel, int] = {"colors": 6, "intensity": NUM_WITH_INTENSITY, "shape": 3}
 TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
-# What is read of a line, by the number of its columns; those behind the seventh are left out.
-COLUMNS = {NUM_WITH_INTENSITY: (0, 1, 2, 3), 6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2, 4, 5, 6)}
+# What is read of a PTS line, by the number of its columns; those behind the seventh are left out.
+COLUMNS: dict[Channel, dict[int, tuple[int, ...]]] = {
+    "colors": {6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2, 4, 5, 6)},
+    "intensity": dict.fromkeys((NUM_WITH_INTENSITY, 7), (0, 1, 2, 3)),
+    "shape": dict.fromkeys(range(3, 8), (0, 1, 2)),
+}
 PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 
 
@@ -206,34 +212,33 @@ def is_number(field: str) -> bool:
     return "_" not in field  # which Python takes and np.loadtxt does not
 
 
-def line_source(path: Path, layout: LineLayout, options: CloudSettings, wanted: str) -> PointSource:
-    """Return points of lines x y z r g b, colours 0-255, or of x y z intensity if the options allow it."""
+def line_source(path: Path, layout: LineLayout, channel: Channel, wanted: str) -> PointSource:
+    """Return points of lines x y z r g b, colours 0-255, or of x y z intensity, or of x y z."""
 
     def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
         return NumberLines(path, layout, wanted).read_points()
 
-    if options.ignore_colors:
-        bare = layout._replace(columns=layout.columns[:3])
-        return PointSource(path, lambda: bare_points(NumberLines(path, bare, wanted).read_rows()))
-    if len(layout.columns) > NUM_WITH_INTENSITY:
-        return PointSource(path, lambda: starmap(RawCloud, read()))
-    check_option(path, options, wanted)
-    return PointSource(path, intensity_reader(path, read))
+    readers: dict[Channel, ChunkReader] = {
+        "colors": lambda: starmap(RawCloud, read()),
+        "intensity": intensity_reader(read),
+        "shape": lambda: bare_points(NumberLines(path, layout, wanted).read_rows()),
+    }
+    return PointSource(path, readers[channel])
 
 
-def open_text(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_text(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
 
-    A header line is skipped. It determines the columns if it names x y z and r g b (or red green blue), or
-    x y z and an intensity; it is refused if it names all columns, x y z among them, but neither of these.
-    Without one the first six columns are read; four are x y z and intensity.
+    A header line is skipped. It determines the columns if it names x y z and r g b (or red green blue), or an
+    intensity; it names all columns or none. Without one the first six columns are read; four are x y z and
+    intensity.
     """
     with path.open("rb") as file:
-        layout = _layout(path, file.read(HEAD_SIZE), options.ignore_colors)
-    return line_source(path, layout, options, WANTED)
+        layout = _layout(path, file.read(HEAD_SIZE), channel)
+    return line_source(path, layout, channel, WANTED)
 
 
-def _layout(path: Path, head: bytes, is_bare: bool) -> LineLayout:
+def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
     """Return the layout of a file, from its first lines."""
     if b"\0" in head:
         raise InputError(f"{path}: holds bytes that are no text, {WANTED}")
@@ -246,7 +251,7 @@ def _layout(path: Path, head: bytes, is_bare: bool) -> LineLayout:
         fields = text.split(_delimiter(text))
         if _begins_numbers(line.strip(), fields):
             break
-        named = _find_columns(text, is_bare) or named
+        named = _find_columns(text, channel) or named
         if {*"xyz"} <= {*_names(text)}:
             header = text
         start += len(line)
@@ -254,12 +259,15 @@ def _layout(path: Path, head: bytes, is_bare: bool) -> LineLayout:
     else:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
     if not named and len(_names(header)) == len(fields):
-        raise InputError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
+        raise MissingChannelError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
     has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
-    columns = named or tuple(range(3 if is_bare else NUM_WITH_INTENSITY if has_intensity else 6))
+    if not named and channel == "intensity" and not has_intensity:
+        raise MissingChannelError(f"{path}: line {num_lines + 1} has {len(fields)} columns and no intensity")
+    columns = named or tuple(range(NUM_COLUMNS[channel]))
     if len(fields) <= max(columns):
         found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quote_line(line)}"
-        raise InputError(f"{path}: {found}, {WANTED}")
+        error = MissingChannelError if len(fields) >= NUM_COLUMNS["shape"] else InputError
+        raise error(f"{path}: {found}, {WANTED}")
     return LineLayout(columns, start=start, delimiter=_delimiter(text))
 
 
@@ -279,23 +287,24 @@ def _names(header: str) -> list[str]:
     return [name.strip(' "').lower() for name in names.split(_delimiter(names))]
 
 
-def _find_columns(header: str, is_bare: bool) -> tuple[int, ...]:
-    """Return the columns of x, y, z and r, g, b, or of x, y, z and intensity; empty if not all are named.
-
-    Of x, y, z alone where only the shape counts.
-    """
+def _find_columns(header: str, channel: Channel) -> tuple[int, ...]:
+    """Return the columns of x, y, z, and r, g, b or an intensity; empty if not all are named."""
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
-    more = color_names(once) or tuple(name for name in once if name in INTENSITY_NAMES)[:1]
-    wanted = tuple("xyz") if is_bare else (*"xyz", *more)
-    is_found = (is_bare or more) and set(wanted) <= set(once)
+    more: dict[Channel, tuple[str, ...]] = {
+        "colors": color_names(once),
+        "intensity": tuple(name for name in once if name in INTENSITY_NAMES)[:1],
+        "shape": (),
+    }
+    wanted = (*"xyz", *more[channel])
+    is_found = (more[channel] or channel == "shape") and set(wanted) <= set(once)
     return tuple(names.index(name) for name in wanted) if is_found else ()
 
 
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
 
 
-def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
+def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of a PTS file.
 
     All lines must have as many columns as the first one: six are x y z r g b, more are x y z intensity r g b
@@ -307,13 +316,12 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES) -> PointSource:
     if line is None:
         raise InputError(f"{path}: no line of numbers, {PTS_WANTED}")
     num_columns = len(line.split())
-    if options.ignore_colors and num_columns >= 3:
-        return line_source(path, LineLayout((0, 1, 2), num_columns, has_counts=True), options, PTS_WANTED)
-    if min(num_columns, 7) not in COLUMNS:
-        found = f"{num_columns} columns, no colours: {quote_line(line)}"
-        raise InputError(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
-    layout = LineLayout(COLUMNS[min(num_columns, 7)], num_columns, has_counts=True)
-    return line_source(path, layout, options, PTS_WANTED)
+    columns = COLUMNS[channel].get(min(num_columns, 7))
+    if columns is None:
+        found = f"{num_columns} columns, no {channel}: {quote_line(line)}"
+        error = MissingChannelError if min(num_columns, 7) in COLUMNS["shape"] else InputError
+        raise error(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
+    return line_source(path, LineLayout(columns, num_columns, has_counts=True), channel, PTS_WANTED)
 
 
 PTS = CloudFormat("PTS", frozenset({".pts"}), lambda head: False, open_pts)

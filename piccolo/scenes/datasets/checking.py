@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from ...cloud import open_cloud
 from ...cloud.octree import build_octree
+from ...cloud.settings import IN_COLORS
 from ...cloud.soa import pack_points
 from ...confidence.occlusion import VIEW_WIDTH, measure_agreement
 from ...geometry.pose import Array, Pose
@@ -55,7 +56,7 @@ class Check(NamedTuple):
 
 def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress = no_progress) -> Check:
     """Score some panoramas of a scene, evenly spaced over the list, against its cloud at their poses."""
-    voxels = open_cloud([scene.cloud], show=show).voxels(np.eye(3))
+    voxels = open_cloud([scene.cloud], IN_COLORS, show).voxels(np.eye(3))
     nodes = build_octree(voxels).level(0.08)  # [m] enough for views of a few degrees
     points = pack_points(nodes[:, :3], np.round(nodes[:, 3:] * 255.0).astype(np.uint8))
 

@@ -12,6 +12,7 @@ import numpy as np
 from ...cloud import open_source
 from ...cloud.ply_writer import vertex_rows, writing_ply
 from ...cloud.readers.reader import CHUNK
+from ...cloud.settings import IN_COLORS
 from ...cloud.stream import PointValidator
 from ...errors import InputError, unreadable
 from ...files.atomic import check_output_folder, replacing_folder, write_atomically
@@ -65,7 +66,7 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
     dtype = vertex_rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), label=no_labels).dtype
     with writing_ply(path, dtype) as writer:
         for part in spec.cloud:
-            source = open_source(part.path)
+            source = open_source(part.path, IN_COLORS)
             warnings += source.warnings
             validator.path = part.path
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
