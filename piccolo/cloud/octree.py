@@ -31,6 +31,12 @@ class Octree(NamedTuple):
         level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
         return self.nodes[self.level_start[level] : self.level_start[level + 1]]
 
+    def without_leaves(self) -> "Octree":
+        """Return the octree whose leaves are the parents of these, for kernels."""
+        end = self.level_start[-2]
+        first_child = np.minimum(self.first_child[: end + 1], end)
+        return Octree(self.nodes[:end], first_child, self.level_start[:-1], 2.0 * self.leaf_size)
+
 
 def build_octree(voxels: Voxels) -> Octree:
     """Return the octree whose leaves are the voxels."""

@@ -23,8 +23,8 @@ MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
-SHAPE_TURN = 0.005  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
-SHAPE_MOVE = 0.02  # [m]
+SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
+SHAPE_MOVE = 0.015  # [m]
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 

@@ -200,7 +200,9 @@ def prepare_query(
     features = tuple(
         Once(partial(find_features, resized, scan_map, workers, [every[k] for k in half])) for half in halves
     )
-    cache = Cache(RecentViews(scan_map.octree))
+    # leaves have narrow edges, which only the last descent is near enough to
+    averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
+    cache = Cache(RecentViews(scan_map.octree, averaged))
     seen = Once(partial(find_seen, photo, workers))
     return Query(photo, scan_map, settings, workers, method, features, seen, cache, len(features))
 

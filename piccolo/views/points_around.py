@@ -177,9 +177,10 @@ def points_around(octree: Octree, center_map: Center, voxel_per_range: float) ->
 class RecentViews:
     """The last few views of one scan, each rendered when it is asked for and not kept; from any thread."""
 
-    def __init__(self, octree: Octree) -> None:
+    def __init__(self, octree: Octree, averaged: Octree | None = None) -> None:
+        """Prepare for views of an octree; averages are of another one, if it is given."""
         self.averages: Callable[[Place, ViewConfig], Array32] = lru_cache(NUM_VIEWS)(
-            partial(average_view, octree)
+            partial(average_view, averaged or octree)
         )
         self.points: Callable[[Place, ViewConfig, bytes, int], Cells] = lru_cache(NUM_POINT_SETS)(
             partial(visible_points, octree)
