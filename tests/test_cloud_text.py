@@ -9,10 +9,10 @@ from test_cloud_ply import vertices
 from test_cloud_ply import write as write_ply
 
 from piccolo.cloud import read_cloud
-from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.readers import reader, text
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.text import is_number, open_text
+from piccolo.cloud.settings import IN_COLORS
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1)

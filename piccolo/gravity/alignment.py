@@ -167,6 +167,11 @@ def wall_yaw(planes: Planes, R_level_from_scan: Array) -> float | None:
     return float(turns - np.ceil(turns - 0.5)) * 0.5 * np.pi
 
 
+def find_yaw_of_walls(octree: Octree) -> float | None:
+    """Return `wall_yaw` of the octree of a cloud whose z is up."""
+    return wall_yaw(ransac_planes(estimate_normals(octree.level(SPACING)[:, :3])), np.eye(3))
+
+
 def find_sense(
     cloud: PointNormals, levels: Array, axis: Array, heights: Array, places: Array
 ) -> tuple[float, str]:

@@ -24,7 +24,7 @@ PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos o
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
-SHAPE_MOVE = 0.015  # [m]
+SHAPE_MOVE = 0.01  # [m]
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
@@ -43,6 +43,12 @@ STEPS = (
 )
 # of dark, noisy photos; they are too few to calibrate
 ROUGH_STEPS = DifferenceSteps(2, math.radians(0.3), 0.015, 1.0)
+# of edges, whose poses have larger errors
+SHAPE_STEPS = (
+    DifferenceSteps(0, math.radians(0.5), 0.03, 1.0),
+    DifferenceSteps(1, math.radians(0.5), 0.03, 1.0),
+)
+ROUGH_SHAPE_STEPS = DifferenceSteps(1, math.radians(0.8), 0.05, 1.0)
 
 
 def compute_gradient(image: Texels, points: Cells, pose: Pose) -> Array:
@@ -146,9 +152,11 @@ def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
         covariance = sandwich_covariance(hessian, block_gradients(image, points, pose))
         return covariance if covariance is None else steps.inflation * covariance
 
-    found = [c for c in query.workers.map(by, STEPS, "covariance") if c is not None]
+    has_shape = query.scan_map.has_shape
+    steps = SHAPE_STEPS if has_shape else STEPS
+    found = [c for c in query.workers.map(by, steps, "covariance") if c is not None]
     if not found:
-        return by(ROUGH_STEPS)
+        return by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 

@@ -9,20 +9,21 @@ import numpy as np
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import classify
 from ..confidence.localization import Alternative, Localization
-from ..geometry.pose import is_correct
+from ..geometry.pose import Array, is_correct
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..panorama import Panorama
+from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate, change_camera
 from .last_descent import HOPELESS_SCORE, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
-from .selection import CLEAR_MARGIN, Selection
+from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
-from .shape import CLEAR_SHAPE, find_tilts, is_tilt_known
+from .shape import Aligned, align_level, find_tilts, is_clear, is_tilt_known
 from .verdict import judge
 
 GUESSES = (
@@ -74,18 +75,20 @@ def find_pose(
         return Localization(warnings=(NO_PIXEL,))
     if not scan_map.has_shape:
         return find_once(scan_map, allowed_map, panorama, settings, workers, watch, method)
-    # most cameras are about level
-    level = find_once(
-        scan_map, allowed_map, panorama, replace(settings, gravity="known"), workers, watch, method
-    )
-    if is_tilt_known(panorama, settings) or (
-        level.selection.best.score > CLEAR_SHAPE and level.selection.margin > CLEAR_MARGIN
-    ):
-        return level
-    with watch.stage("search"):
-        tilts = find_tilts(allowed_map, panorama, settings, workers, method)
-    found = [find_once(scan_map, allowed_map, panorama, tilt, workers, watch, method) for tilt in tilts]
-    return max([level, *found], key=lambda one: one.selection.best.score)
+    axes = find_axes(panorama)
+    level = align_level(scan_map, panorama, axes, settings)
+
+    def search(one: Aligned) -> Found:
+        return find_once(scan_map, allowed_map, panorama, one.settings, workers, watch, method, one.rotations)
+
+    found = [search(level)]  # most cameras are about level
+    if not is_tilt_known(panorama, settings) and not is_clear(found[0].selection):
+        with watch.stage("search"):
+            tilts = find_tilts(allowed_map, panorama, axes, settings, workers, method)
+        found += [search(tilt) for tilt in tilts]
+    if len(level.rotations) and not any(is_clear(one.selection) for one in found):
+        found.append(search(level._replace(rotations=level.rotations[:0])))
+    return max(found, key=lambda one: one.selection.best.score)
 
 
 def find_once(
@@ -96,10 +99,11 @@ def find_once(
     workers: Workers,
     watch: Stopwatch,
     method: MethodConfig,
+    rotations: Array | None = None,
 ) -> Found:
-    """Search what the prior allows of a map, and refine."""
+    """Search what the prior allows of a map, or some rotations (N, 3, 3) there, and refine."""
     with watch.stage("search"):
-        query = prepare_query(panorama, allowed_map, settings, workers, method)
+        query = prepare_query(panorama, allowed_map, settings, workers, method, rotations)
     images = query.photo.images
     # idle cores prepare the images that later steps need
     with workers.beside(images.middle, images.fine, images.full, query.photo.colors):

@@ -126,6 +126,7 @@ class Query:
     seen: Once[Seen]  # what verification compares with the scan drawn at a pose
     cache: Cache
     num_parts: int  # of the features that are matched; 0 with whole views alone
+    rotations: Array  # (N, 3, 3) camera from map, that are searched in place of those of the settings; N >= 0
 
     @cached_property
     def keypoints(self) -> Keypoints:
@@ -173,12 +174,14 @@ def prepare_query(
     settings: CoarseToFineSettings,
     workers: Workers,
     method: MethodConfig = METHOD,
+    rotations: Array | None = None,
 ) -> Query:
-    """Prepare a panorama for the search in a map; the prior or metadata give the camera's tilt."""
-    down_cam = settings.prior.gravity_vector
-    gpano = attitude_of_gravity(down_cam) if down_cam else panorama.gpano
-    R_level_from_cam = rotation_to_level(gpano) if gpano else None
-    R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
+    """Prepare a panorama for the search in a map; the prior or metadata give the camera's tilt.
+
+    Of rotations (N, 3, 3), camera from map, with N > 0, only these are searched.
+    """
+    R_cam_from_level, has_tilt = find_tilt(panorama, settings)
+    rotations = np.empty((0, 3, 3)) if rotations is None else rotations
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
         method = method._replace(uses_features=False, scales=SHAPE_SCALES)
@@ -191,7 +194,7 @@ def prepare_query(
         make_texels(reduce(resized, method.scales.fine)),
         Once(partial(make_texels, panorama)),
         R_cam_from_level,
-        R_level_from_cam is not None,
+        has_tilt,
         math.tau / min(panorama.rgb.shape[1], width),
     )
     photo.images.search()  # each search begins with it
@@ -204,7 +207,15 @@ def prepare_query(
     averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
     cache = Cache(RecentViews(scan_map.octree, averaged))
     seen = Once(partial(find_seen, photo, workers))
-    return Query(photo, scan_map, settings, workers, method, features, seen, cache, len(features))
+    return Query(photo, scan_map, settings, workers, method, features, seen, cache, len(features), rotations)
+
+
+def find_tilt(panorama: Panorama, settings: CoarseToFineSettings) -> tuple[Array, bool]:
+    """Return R_cam_from_level (3, 3) of a camera, and True if the prior or metadata give its tilt."""
+    down_cam = settings.prior.gravity_vector
+    gpano = attitude_of_gravity(down_cam) if down_cam else panorama.gpano
+    R_level_from_cam = rotation_to_level(gpano) if gpano else None
+    return (np.eye(3), False) if R_level_from_cam is None else (R_level_from_cam.T, True)
 
 
 def find_seen(photo: Photo, workers: Workers) -> Seen:

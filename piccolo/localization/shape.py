@@ -1,18 +1,31 @@
-"""The tilt of a photo in a scan without colours: its lines against the vertical of the scan."""
+"""Photos in a scan without colours: the lines of a photo lie along the walls and the vertical of the scan."""
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
+import numpy as np
+
+from ..geometry.pose import Array, yaw_rotation
 from ..jobs.threads import Workers
 from ..panorama import Panorama
-from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import brief_query, score_starts
-from .query import prepare_query
+from .query import find_tilt, prepare_query
 from .search import search_poses
+from .selection import CLEAR_MARGIN, Selection
 from .settings import CoarseToFineSettings, MethodConfig
 
-CLEAR_SHAPE = 0.1  # least score with which a level camera is taken for the right one
+CLEAR_SHAPE = 0.1  # least score of a pose that makes further searches needless
 NUM_TILTS = 3  # that are searched in full, at most
+LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the horizon, at most
+
+
+class Aligned(NamedTuple):
+    """A tilt of the camera, and rotations to be searched with it."""
+
+    settings: CoarseToFineSettings
+    rotations: Array  # (N, 3, 3) camera from map, that put the photo's lines along the walls; N = 4 or 0
 
 
 def is_tilt_known(panorama: Panorama, settings: CoarseToFineSettings) -> bool:
@@ -21,28 +34,55 @@ def is_tilt_known(panorama: Panorama, settings: CoarseToFineSettings) -> bool:
     return settings.gravity == "known" or (has_attitude and settings.gravity != "unknown")
 
 
+def is_clear(found: Selection) -> bool:
+    """Return True if one pose alone explains a photo by its edges."""
+    return found.best.score > CLEAR_SHAPE and found.margin > CLEAR_MARGIN
+
+
+def align_lines(scan_map: ScanMap, axes: Sequence[Array], R_cam_from_level: Array) -> Array:
+    """Return the rotations (4, 3, 3), camera from map, that put level lines of a photo along the walls.
+
+    The axes (3,) are those of the photo's lines, R_cam_from_level (3, 3) is its tilt. (0, 3, 3) if the lines
+    or the scan have no such directions.
+    """
+    yaw_of_walls = scan_map.yaw_of_walls
+    level = np.array([axis @ R_cam_from_level for axis in axes]).reshape(-1, 3)
+    level = level[np.abs(level[:, 2]) < LEVEL_SINE]
+    if yaw_of_walls is None or len(level) != 4:
+        return np.empty((0, 3, 3))
+    yaws = -np.arctan2(level[:, 1], level[:, 0]) - yaw_of_walls
+    return np.stack([R_cam_from_level @ yaw_rotation(float(yaw)) for yaw in yaws])
+
+
+def align_level(
+    scan_map: ScanMap, panorama: Panorama, axes: Sequence[Array], settings: CoarseToFineSettings
+) -> Aligned:
+    """Return the known tilt of a camera, level unless the photo or the settings say another."""
+    known = replace(settings, gravity="known")
+    R_cam_from_level, _ = find_tilt(panorama, known)
+    return Aligned(known, align_lines(scan_map, axes, R_cam_from_level))
+
+
 def find_tilts(
     scan_map: ScanMap,
     panorama: Panorama,
+    axes: Sequence[Array],
     settings: CoarseToFineSettings,
     workers: Workers,
     method: MethodConfig,
-) -> list[CoarseToFineSettings]:
-    """Return settings with the axes of the photo's lines as its vertical, those that fit best.
+) -> list[Aligned]:
+    """Return the tilts with one of the axes (3,) of the photo's lines as vertical, those that fit best.
 
     In a building the vertical is one of six directions of lines. Each is searched briefly.
     """
-    tried = [
-        replace(
-            settings,
-            gravity="known",
-            prior=replace(settings.prior, gravity_vector=tuple((-axis).tolist())),
-        )
-        for axis in find_axes(panorama)
-    ]
+    tried = []
+    for axis in axes:
+        prior = replace(settings.prior, gravity_vector=tuple((-axis).tolist()))
+        tried.append(align_level(scan_map, panorama, axes, replace(settings, prior=prior)))
     scores = []
     for one in tried:
-        query = brief_query(prepare_query(panorama, scan_map, one, workers, method))
-        scores.append(score_starts(query, search_poses(query, "known")))
+        query = prepare_query(panorama, scan_map, one.settings, workers, method, one.rotations)
+        brief = brief_query(query)
+        scores.append(score_starts(brief, search_poses(brief, "known")))
     ranked = sorted(range(len(tried)), key=lambda k: -scores[k])
     return [tried[k] for k in ranked[:NUM_TILTS]]

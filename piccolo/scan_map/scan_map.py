@@ -16,7 +16,7 @@ from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Array, Pose
-from ..gravity.alignment import find_up
+from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
@@ -101,6 +101,11 @@ class ScanMap:
     def storeys(self) -> Storeys:
         """Storeys of the building, in the map's frame."""
         return find_storeys(self.octree)
+
+    @cached_property
+    def yaw_of_walls(self) -> float | None:
+        """The turn about z [rad], in (-45, 45] deg, that puts the walls along x and y; None without walls."""
+        return find_yaw_of_walls(self.octree)
 
     @cached_property
     def searched_for(self) -> NDArray[np.int64]:
