@@ -82,13 +82,15 @@ def find_pose(
         return find_once(scan_map, allowed_map, panorama, one.settings, workers, watch, method, one.rotations)
 
     found = [search(level)]  # most cameras are about level
-    if not is_tilt_known(panorama, settings) and not is_clear(found[0].selection):
+    if not is_tilt_known(panorama, settings) and not is_clear(found[0].selection, level):
         with watch.stage("search"):
             tilts = find_tilts(allowed_map, panorama, axes, settings, workers, method)
         found += [search(tilt) for tilt in tilts]
-    if len(level.rotations) and not any(is_clear(one.selection) for one in found):
-        found.append(search(level._replace(rotations=level.rotations[:0])))
-    return max(found, key=lambda one: one.selection.best.score)
+    best = max(found, key=lambda one: one.selection.best.score)
+    if len(level.rotations) == 0 or is_clear(best.selection, level):
+        return best
+    in_any_heading = search(level._replace(rotations=level.rotations[:0]))
+    return max([best, in_any_heading], key=lambda one: one.selection.best.score)
 
 
 def find_once(

@@ -34,9 +34,10 @@ def is_tilt_known(panorama: Panorama, settings: CoarseToFineSettings) -> bool:
     return settings.gravity == "known" or (has_attitude and settings.gravity != "unknown")
 
 
-def is_clear(found: Selection) -> bool:
-    """Return True if one pose alone explains a photo by its edges."""
-    return found.best.score > CLEAR_SHAPE and found.margin > CLEAR_MARGIN
+def is_clear(found: Selection, searched: Aligned) -> bool:
+    """Return True if a pose explains a photo by its edges: one alone, unless its lines lie along the walls."""
+    is_alone = found.margin > CLEAR_MARGIN or len(searched.rotations) > 0
+    return found.best.score > CLEAR_SHAPE and is_alone
 
 
 def align_lines(scan_map: ScanMap, axes: Sequence[Array], R_cam_from_level: Array) -> Array:
