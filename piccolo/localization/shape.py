@@ -35,7 +35,7 @@ def is_tilt_known(panorama: Panorama, settings: CoarseToFineSettings) -> bool:
 
 
 def is_clear(found: Selection, searched: Aligned) -> bool:
-    """Return True if a pose explains a photo by its edges: one alone, unless its lines lie along the walls."""
+    """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
     is_alone = found.margin > CLEAR_MARGIN or len(searched.rotations) > 0
     return found.best.score > CLEAR_SHAPE and is_alone
 
