@@ -154,6 +154,18 @@ def test_other_formats_become_ply(run, tmp_path):
     assert np.array_equal(vertex["red"], np.concatenate([colors[::2, 0], colors[1::2, 0]]))
 
 
+def test_a_cloud_without_colours_gets_none(run, tmp_path):
+    points, colors = scan()
+    turned = points @ exp_so3(TURN).T
+    np.save(tmp_path / "bare.npy", turned)
+    np.savetxt(tmp_path / "gray.txt", np.column_stack([turned, colors[:, 0]]))
+    for name, more in (("bare.npy", []), ("gray.txt", ["intensity"])):
+        assert run("--cloud", tmp_path / name, "--out", tmp_path / "out.ply", FREE)[0] == 0
+        vertex = PlyData.read(tmp_path / "out.ply")["vertex"]
+        assert [p.name for p in vertex.properties] == ["x", "y", "z", *more]
+        (tmp_path / "out.ply").unlink()
+
+
 def test_same_bits_every_run_and_for_every_thread_count(run, tilted, tmp_path):
     outs = [tmp_path / f"{k}.ply" for k in range(2)]
     assert run("--cloud", tilted, "--out", outs[0], "--yaw-walls", FREE)[0] == 0

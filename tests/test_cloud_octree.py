@@ -82,6 +82,17 @@ def test_collects_the_coarsest_nodes_that_are_small_from_where_one_is(voxel_per_
     np.testing.assert_allclose(directions[:, :count].T, expected, atol=1e-5)
 
 
+def test_without_leaves_their_parents_are_the_leaves():
+    whole = _octree(*_cloud())
+    thin = whole.without_leaves()
+    assert thin.leaf_size == 2.0 * whole.leaf_size
+    for k in range(1, NUM_LEVELS):
+        np.testing.assert_array_equal(thin.level(LEAF_SIZE * 2**k), whole.level(LEAF_SIZE * 2**k))
+    found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
+    count = collect(thin, np.zeros(3), 1e-6, found, directions)
+    np.testing.assert_array_equal(np.sort(found[:count]), np.arange(*thin.level_start[-2:]))
+
+
 def test_collects_no_more_than_there_is_room_for():
     octree = _octree(*_cloud())
     found, directions = np.full(110, -1, np.int32), np.zeros((3, 100), np.float32)

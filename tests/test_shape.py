@@ -21,14 +21,15 @@ from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.shape import paint_shape
 from piccolo.cloud.stream import Cloud
 from piccolo.errors import InputError
-from piccolo.geometry.pose import exp_so3
+from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
-from piccolo.panorama.edges import draw_edges
+from piccolo.panorama.edges import draw_edges, soften
 from piccolo.panorama.manhattan import find_axes
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
@@ -36,6 +37,7 @@ from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 WIDTH = 1024
 SEED = 6  # of a room whose walls are plain: strong patterns hide its edges
 NUM_POINTS = 200_000
+PATTERNED = 12  # of a room with patterns on its walls
 LEVEL = np.eye(3)
 TILTED = exp_so3(np.array([0.5, 0.3, 0.2]))
 
@@ -172,6 +174,42 @@ def test_a_photo_is_found_by_shape(gravity, R):
     assert all(standing.kind == "shape alone" for standing in found.standings)
 
 
+def test_intensity_is_a_channel_of_its_own():
+    cloud = rooms.room(PATTERNED, NUM_POINTS)[1]
+    gray = np.repeat(cloud.colors.mean(axis=1).astype(np.uint8)[:, None], 3, axis=1)
+    found = {}
+    for name, made in (("shape", _in_gray(cloud)), ("intensity", replace(_in_gray(cloud), colors=gray))):
+        scan_map = prepare_map(made, Workers(2), has_features=False)
+        assert scan_map.has_shape
+        assert scan_map.has_intensity == (name == "intensity")
+        settings = CoarseToFineSettings(gravity="known")
+        photo = rooms.as_panorama(rooms.query(PATTERNED, width=WIDTH).rgb)
+        pose = localize(scan_map, photo, settings, Workers(2), Stopwatch()).pose
+        found[name] = rooms.errors(pose, rooms.query(PATTERNED).pose)[0]
+    assert found["intensity"] < 0.03
+    assert found["shape"] > 1.0
+
+
+@pytest.mark.parametrize("R", [LEVEL, exp_so3(np.array([0.0, 0.1, 0.0])), TILTED])
+def test_the_true_rotation_is_one_of_four_by_lines_and_walls(R):
+    taken = rooms.query(SEED, width=WIDTH)
+    axes = find_axes(_turned(taken.rgb, R))
+    tried = align_lines(_shape_map(), axes, R)
+    assert tried.shape == (4, 3, 3)
+    true = R @ taken.pose.R_cam_from_world @ _shape_map().R_map_from_world.T
+    assert np.degrees(min(angle_between(one, true) for one in tried)) < 4.0
+    assert align_lines(_shape_map(), axes, exp_so3(np.array([0.5, 0.0, 0.0])) @ R).shape == (0, 3, 3)
+    assert align_lines(_shape_map(), [], R).shape == (0, 3, 3)
+
+
+def test_softer_images_are_whole_across_the_seam():
+    rgb = np.zeros((32, 64, 3), np.uint8)
+    rgb[:, 0] = 200
+    soft = soften(Panorama(rgb, np.ones((32, 64), bool)), 1.7).rgb
+    assert (soft[:, 1] == soft[:, -1]).all()
+    assert soft[16].sum() == pytest.approx(600, abs=10)
+
+
 def test_a_photo_of_another_room_is_not_localized():
     photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
     found = localize(_shape_map(), photo, CoarseToFineSettings(), Workers(2), Stopwatch())
@@ -230,6 +268,25 @@ def test_files_of_points_alone_are_read_and_others_say_how(tmp_path):
     with pytest.raises(InputError, match="no element 'vertex'") as refused:
         read_cloud(damaged)
     assert "ignore_colors" not in str(refused.value)
+
+
+def test_files_with_and_without_colours_are_one_scan_by_shape_alone(tmp_path):
+    points = np.round(np.asarray(rooms.room(1)[1].points[:1500], np.float64), 4)
+    np.save(tmp_path / "bare.npy", points)
+    np.save(tmp_path / "colored.npy", np.column_stack([points, np.full_like(points, 100.0)]))
+    np.savetxt(tmp_path / "gray.txt", np.column_stack([points, np.arange(1500.0)]))
+    both = [tmp_path / "bare.npy", tmp_path / "colored.npy"]
+    message = "bare.npy: found no colours, though .*colored.npy has them, wanted them in all"
+    with pytest.raises(InputError, match=message):
+        open_cloud(both)
+    assert open_cloud(both, CloudSettings(channels=WITHOUT_COLORS)).sources[1].channel == "shape"
+    mixed = open_cloud([both[0], tmp_path / "gray.txt"])
+    assert [source.channel for source in mixed.sources] == ["shape", "shape"]
+
+
+def test_arrays_without_colours_are_a_scan(tmp_path):
+    scan = piccolo.open_scan(rooms.room(1)[1].points, cache=False)
+    assert SHAPE_ALONE in scan.warnings
 
 
 def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):

@@ -16,7 +16,7 @@ from .progress import progress_bar, warn_once
 
 EPILOG = """\
 examples:
-  python tools/color_scan.py --cloud bare.e57 --ignore-colors --results poses.jsonl --out colored.e57
+  python tools/color_scan.py --cloud bare.e57 --results poses.jsonl --out colored.e57
   python tools/color_scan.py --cloud old.laz --results poses.jsonl --out colored.laz
 
 The photos are aligned with each other first, on the surfaces of the scan, and their exposures are balanced.

@@ -34,7 +34,7 @@ examples:
   python localize.py --cloud scan.ply --pano photos --relative transforms.json --out poses.jsonl
   python localize.py --cloud scan.ply --walk --pano frames --out walk.jsonl
   python localize.py --cloud scan.ply --video walk.mp4 0.5s --out walk.jsonl
-  python localize.py --cloud bare.e57 --ignore-colors --pano photos --color-scan colored.ply --out poses.jsonl
+  python localize.py --cloud bare.e57 --pano photos --color-scan colored.ply --out poses.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
 
 output: one JSON object per photo and line, in the order given (docs/RESULT.md); messages and progress go

@@ -28,7 +28,8 @@ class Octree(NamedTuple):
 
     def level(self, size: float) -> NDArray[np.float32]:
         """Return the nodes of the level whose voxels are nearest to `size` [m]."""
-        level = NUM_LEVELS - 1 - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, NUM_LEVELS - 1))
+        finest = len(self.level_start) - 2
+        level = finest - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, finest))
         return self.nodes[self.level_start[level] : self.level_start[level + 1]]
 
     def without_leaves(self) -> "Octree":

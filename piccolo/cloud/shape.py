@@ -23,7 +23,7 @@ VERTICAL_BORDER = 0.9, 0.98
 
 
 class Surroundings(NamedTuple):
-    """What is looked at around a voxel."""
+    """The neighbours of a voxel by which its edges are found."""
 
     normal_radius: float  # [m] in which its normal is found
     num_normal: int  # voxels in it, at most

@@ -73,6 +73,8 @@ def colors_of_edges(
     luminance = 0.25 + 0.5 * gray
     green = 0.2 * (strength - 0.5)
     difference = 0.15 * (2.0 * vertical - strength)
-    parts = luminance - green + difference, luminance + 2.0 * green, luminance - green - difference
-    rgb = np.stack(np.broadcast_arrays(*parts), axis=-1)
+    rgb = np.empty((*np.shape(strength), 3), np.result_type(strength, np.float32))
+    rgb[..., 0] = luminance - green + difference
+    rgb[..., 1] = luminance + 2.0 * green
+    rgb[..., 2] = luminance - green - difference
     return np.clip(np.rint(255.0 * rgb), 0.0, 255.0).astype(np.uint8)
