@@ -32,6 +32,7 @@ QUERY = Query(
     seen=Once(lambda: Seen([], join_keypoints([]))),
     cache=Cache(VIEWS),
     num_parts=2,
+    rotations=np.empty((0, 3, 3)),
 )
 
 

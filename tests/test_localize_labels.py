@@ -68,7 +68,7 @@ def test_ignored_labels_stand_in_the_result_and_everything_ignored_is_refused(sc
 
 def test_wrong_use_of_labels_is_refused(scene, capsys):
     for code, options, message in (
-        (2, "--labels --intensity-as-gray", "--labels, --intensity-as-gray: found both"),
+        (2, "--labels --ignore-colors", "--ignore-colors, --labels: found both"),
         (2, "--labels --fov 90", "--labels: found --fov or --projection too"),
         (3, "--labels", "clean_0.jpg: this kind of picture holds no labels, wanted a PNG"),
     ):
