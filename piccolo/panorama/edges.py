@@ -33,7 +33,8 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> P
     source = resize(panorama, WIDTH)
     across, down = gradients(source)
     strength = np.hypot(across, down)
-    horizontal = np.abs(np.sum(tangents(WIDTH, R_cam_from_level) * np.stack([across, down], -1), axis=-1))
+    level_across, level_down = level_directions(WIDTH, R_cam_from_level)
+    horizontal = np.abs(level_across * across + level_down * down)
     cosine = horizontal / np.maximum(strength, 1e-9)
     strength = np.clip(np.sqrt(strength / FULL_GRADIENT), 0.0, 1.0)
     vertical = strength * np.clip((cosine - VERTICAL[0]) / (VERTICAL[1] - VERTICAL[0]), 0.0, 1.0)
@@ -71,7 +72,7 @@ def find_inner(panorama: Panorama) -> NDArray[np.bool_]:
     return np.asarray(cv2.erode(panorama.is_valid.view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=2)
 def tangent_axes(width: int) -> tuple[Array, Array]:
     """Return the unit directions (H, W, 3), across to the right and down, at each pixel."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
@@ -80,13 +81,14 @@ def tangent_axes(width: int) -> tuple[Array, Array]:
     return right, np.stack([x * z / rho, y * z / rho, -rho], axis=-1)
 
 
-def tangents(width: int, R_cam_from_level: Array) -> NDArray[np.float64]:
-    """Return the horizontal direction (H, W, 2) at each pixel, as its parts across and down the image."""
-    rays = pixel_rays(width)
+def level_directions(width: int, R_cam_from_level: Array) -> tuple[Array, Array]:
+    """Return the parts (H, W), across and down the image, of the unit level direction at each pixel."""
     right, below = tangent_axes(width)
-    horizontal = np.cross(R_cam_from_level[:, 2], rays)
-    horizontal /= np.maximum(np.linalg.norm(horizontal, axis=-1, keepdims=True), 1e-9)
-    return np.stack([(horizontal * right).sum(axis=-1), (horizontal * below).sum(axis=-1)], axis=-1)
+    up_cam = R_cam_from_level[:, 2]
+    across = np.einsum("hwi,i->hw", below, up_cam)  # of up x ray, with ray x right = below
+    down = -np.einsum("hwi,i->hw", right, up_cam)
+    length = np.maximum(np.hypot(across, down), 1e-9)
+    return across / length, down / length
 
 
 def blur(image: NDArray[Pixel], sigma: float) -> NDArray[Pixel]:
