@@ -38,7 +38,7 @@ def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> P
     cosine = horizontal / np.maximum(strength, 1e-9)
     strength = np.clip(np.sqrt(strength / FULL_GRADIENT), 0.0, 1.0)
     vertical = strength * np.clip((cosine - VERTICAL[0]) / (VERTICAL[1] - VERTICAL[0]), 0.0, 1.0)
-    gray = source.rgb.astype(np.float32).mean(axis=2) / np.float32(255.0) if has_gray else 0.5
+    gray = mean_level(source) / np.float32(255.0) if has_gray else 0.5
     shown = find_inner(source).astype(np.float32)
     weight = np.maximum(blur(shown, SPREAD), 1e-6)
     strength = blur(strength * shown, SPREAD) / weight
@@ -53,13 +53,19 @@ def soften(panorama: Panorama, sigma: float) -> Panorama:
 
 def gradients(panorama: Panorama) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return the derivatives (H, W) of the grey's logarithm, right and down, by pixels of the equator."""
-    gray = np.log(panorama.rgb.astype(np.float32).mean(axis=2) + np.float32(DARK))
+    gray = np.log(mean_level(panorama) + np.float32(DARK))
     smooth = cv2.GaussianBlur(wrap(gray), (0, 0), SMOOTHING)
     inner = slice(MARGIN, -MARGIN)
     right = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 1, 0)[inner, inner], np.float32) / np.float32(32.0)
     down = np.asarray(cv2.Scharr(smooth, cv2.CV_32F, 0, 1)[inner, inner], np.float32) / np.float32(32.0)
     right /= np.maximum(row_cosines(len(gray)), LEAST_COS)[:, None].astype(np.float32)
     return right, down
+
+
+def mean_level(panorama: Panorama) -> NDArray[np.float32]:
+    """Return the mean (H, W) of the three colours [levels]."""
+    red, green, blue = np.moveaxis(panorama.rgb.astype(np.float32), -1, 0)
+    return np.asarray((red + green + blue) / np.float32(3.0), np.float32)
 
 
 def row_cosines(height: int) -> Array:

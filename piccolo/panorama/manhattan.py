@@ -32,6 +32,7 @@ def find_axes(panorama: Panorama) -> list[Array]:
     if len(normals) < LEAST_EDGES:
         return []
     tried = make_grid(NUM_RINGS).directions.astype(np.float64)
+    tried = tried[tried[:, 2] >= 0.0]
     some, some_weights = normals[::VOTERS], weights[::VOTERS]
     votes = np.array([some_weights @ (np.abs(some @ direction) < ACROSS) for direction in tried])
     first = sharpen_axis(normals, weights, tried[np.argmax(votes)])
