@@ -56,6 +56,8 @@ def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
     num_parts = len(query.features)
     looks_first = method.uses_features and method.uses_search and is_whole(query)
     attempts: list[tuple[int, Attempt]] = [(0, look_first)] if looks_first else []
+    if len(query.rotations):
+        attempts.append((0, look_along_walls))
     if method.uses_features:
         attempts += [(k + 1, search_matches) for k in range(num_parts)]
     is_partial = query.photo.is_partial
@@ -78,6 +80,15 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found
         with watch.stage("refine"):
             found = known + refine(first, starts, FIRST_BEAM)
             return found, is_clear(query, found) and score_starts(first, starts) >= MIRROR_RATIO * of_mirror()
+
+
+def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
+    """Search the few rotations of a photo whose lines lie along walls; True if one pose alone is clear."""
+    with watch.stage("search"):
+        starts = search_poses(query, "known")
+    with watch.stage("refine"):
+        found = known + refine(query, starts, FIRST_BEAM)
+        return found, is_clear(query, found)
 
 
 def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:

@@ -10,6 +10,7 @@ from ..geometry.pose import Pose
 from .comparison import mask_occluders, score_pose
 from .query import Query
 from .refinement import (
+    FINE_LIMITS,
     FULL_LOSS,
     MIN_GAIN,
     Fit,
@@ -114,6 +115,8 @@ def descend_on_points(
     pose = h.pose
     for _ in range(num_rounds):
         center = pose.center_world
+        if query.scan_map.has_shape:
+            pose = descend(shown.points_at(pose), shown.photo.images.fine(), pose, FINE_LIMITS)
         pose = descend(shown.points_at(pose), shown.photo.images.full(), pose, limits)
         if math.dist(pose.center_world, center) < arrived:
             break

@@ -19,6 +19,7 @@ SURE_SCORE = 0.05  # least score of the best pose
 SURE_MARGIN = 0.5  # least margin over the best pose elsewhere
 SURE_MATCHES = 12  # wrong poses have 5; in repeated places more, but then several poses have them
 CLEAR_SCORE = 0.3  # least score by whole views without features: see docs/METHOD.md
+CLEAR_SHAPE = 0.1  # least score by edges
 CLEAR_MARGIN = 0.5  # least margin by whole views
 
 
@@ -106,4 +107,5 @@ def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
 def is_clear(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
     """Return True if one pose alone explains a whole photo."""
     found = select(query, rank(hypotheses))
-    return found.best.score >= CLEAR_SCORE and found.margin >= CLEAR_MARGIN
+    least = CLEAR_SHAPE if query.scan_map.has_shape else CLEAR_SCORE
+    return found.best.score >= least and found.margin >= CLEAR_MARGIN

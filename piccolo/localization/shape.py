@@ -13,10 +13,9 @@ from ..scan_map.scan_map import ScanMap
 from .attempts import brief_query, score_starts
 from .query import find_tilt, prepare_query
 from .search import search_poses
-from .selection import CLEAR_MARGIN, Selection
+from .selection import CLEAR_MARGIN, CLEAR_SHAPE, Selection
 from .settings import CoarseToFineSettings, MethodConfig
 
-CLEAR_SHAPE = 0.1  # least score of a pose that makes further searches needless
 NUM_TILTS = 3  # that are searched in full, at most
 LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the horizon, at most
 
