@@ -113,9 +113,9 @@ def descend_on_points(
     The descent uses the masked query `shown`; the result is discarded if the whole photo's score falls.
     """
     pose = h.pose
-    for _ in range(num_rounds):
+    for k in range(num_rounds):
         center = pose.center_world
-        if query.scan_map.has_shape:
+        if k == 0 and query.scan_map.has_shape:
             pose = descend(shown.points_at(pose), shown.photo.images.fine(), pose, FINE_LIMITS)
         pose = descend(shown.points_at(pose), shown.photo.images.full(), pose, limits)
         if math.dist(pose.center_world, center) < arrived:
