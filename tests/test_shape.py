@@ -20,12 +20,15 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.shape import paint_shape
 from piccolo.cloud.stream import Cloud
+from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
+from piccolo.localization.query import prepare_query
+from piccolo.localization.selection import assess_alone
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
@@ -214,6 +217,16 @@ def test_a_photo_of_another_room_is_not_localized():
     photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
     found = localize(_shape_map(), photo, CoarseToFineSettings(), Workers(2), Stopwatch())
     assert found.status == "not_localized"
+
+
+def test_a_part_of_the_sphere_counts_less():
+    taken = rooms.query(SEED, width=WIDTH)
+    is_valid = np.zeros(taken.rgb.shape[:2], bool)
+    is_valid[:, : WIDTH // 4] = True
+    for shown, ratio in ((np.ones_like(is_valid), 1.0), (is_valid, 0.5)):
+        query = prepare_query(Panorama(taken.rgb, shown), _shape_map(), CoarseToFineSettings(), Workers(1))
+        (standing,) = assess_alone(query, [Hypothesis(_shape_map().from_world(taken.pose), 0.2)])
+        assert standing.score == pytest.approx(0.2 * ratio, rel=0.02)
 
 
 def test_a_map_of_the_shape_is_kept_as_one(tmp_path):

@@ -69,7 +69,9 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
         of_prior = log_prior if wrong else 0.0
         is_drawn = query.photo.is_partial
         is_shape = query.scan_map.has_shape
-        standings.append(Standing(1.0, h.score, num_matches, of_prior, is_drawn, is_shape))
+        # with fewer blocks, chance explains more of them
+        score = h.score * math.sqrt(query.photo.small.valid_share) if is_shape and is_drawn else h.score
+        standings.append(Standing(1.0, score, num_matches, of_prior, is_drawn, is_shape))
     return standings
 
 
