@@ -77,7 +77,7 @@ def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> 
         try:
             source = format_.open_source(path, settings, channel)
         except MissingChannelError as error:
-            missing.append(error)
+            missing.append(error.with_traceback(None))  # it would keep the file open
             continue
         notes = (str(missing[0]),) if missing and settings.channels[0] == "colors" else ()
         return source._replace(channel=channel, warnings=(*source.warnings, *notes))
