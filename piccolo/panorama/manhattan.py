@@ -33,8 +33,8 @@ def find_axes(panorama: Panorama) -> list[Array]:
         return []
     tried = make_grid(NUM_RINGS).directions.astype(np.float64)
     tried = tried[tried[:, 2] >= 0.0]
-    some, some_weights = normals[::VOTERS], weights[::VOTERS]
-    votes = np.array([some_weights @ (np.abs(some @ direction) < ACROSS) for direction in tried])
+    some = normals[::VOTERS]
+    votes = np.array([weights[::VOTERS] @ (np.abs(some @ direction) < ACROSS) for direction in tried])
     first = sharpen_axis(normals, weights, tried[np.argmax(votes)])
     votes[np.abs(tried @ first) > SQUARE] = -1.0
     second = sharpen_axis(normals, weights, tried[np.argmax(votes)])

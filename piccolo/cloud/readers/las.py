@@ -322,8 +322,7 @@ def _gray_source(header: LasHeader, layout: LasLayout) -> PointSource:
     """Return the points in grey, by their intensity."""
     largest, num_samples = _largest(header, layout, "intensity")
     if largest == 0:
-        why = f"it is 0 in all {num_samples} points checked"
-        raise MissingChannelError(f"{header.path}: has no intensity: {why}")
+        raise MissingChannelError(f"{header.path}: the intensity is 0 in all {num_samples} points checked")
     read_chunks = intensity_reader(partial(_read_scalar, header, layout, "intensity"))
     return PointSource(header.path, read_chunks, header.num_points)
 
