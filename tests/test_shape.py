@@ -197,11 +197,15 @@ def test_intensity_is_a_channel_of_its_own():
 def test_the_true_rotation_is_one_of_four_by_lines_and_walls(R):
     true = R @ rooms.query(SEED).pose.R_cam_from_world @ _shape_map().R_map_from_world.T
     axes = [*true.T, *-true.T]  # the walls of the room are along x and y
-    tried = align_lines(_shape_map(), axes, R)
+    tried = align_lines(_shape_map().yaw_of_walls, axes, R)
     assert tried.shape == (4, 3, 3)
     assert np.degrees(min(angle_between(one, true) for one in tried)) < 1.0
-    assert align_lines(_shape_map(), axes, exp_so3(np.array([0.5, 0.0, 0.0])) @ R).shape == (0, 3, 3)
-    assert align_lines(_shape_map(), [], R).shape == (0, 3, 3)
+    assert align_lines(_shape_map().yaw_of_walls, axes, exp_so3(np.array([0.5, 0.0, 0.0])) @ R).shape == (
+        0,
+        3,
+        3,
+    )
+    assert align_lines(_shape_map().yaw_of_walls, [], R).shape == (0, 3, 3)
 
 
 def test_softer_images_are_whole_across_the_seam():

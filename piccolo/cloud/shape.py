@@ -2,7 +2,8 @@
 
 A crease is where neighbouring normals differ, by the second eigenvalue of their mean outer product. A border
 is where a surface ends: the points around lie to one side. Both are painted as two of the three opponent
-channels of a colour: how strong the edge is, and how much stronger vertical ones are than the others.
+channels of a colour: how strong the edge is, and how much stronger vertical ones are than the others. The
+third is the intensity of the points, if they have one.
 """
 
 from typing import Any, NamedTuple

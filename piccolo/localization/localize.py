@@ -23,7 +23,7 @@ from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
-from .shape import Aligned, align_level, find_tilts, is_clear, is_tilt_known
+from .shape import Aligned, align_level, find_tilts, is_explained, is_tilt_known
 from .verdict import judge
 
 GUESSES = (
@@ -76,18 +76,19 @@ def find_pose(
     if not scan_map.has_shape:
         return find_once(scan_map, allowed_map, panorama, settings, workers, watch, method)
     axes = find_axes(panorama)
-    level = align_level(scan_map, panorama, axes, settings)
+    yaw_of_walls = scan_map.yaw_of_walls
+    level = align_level(yaw_of_walls, panorama, axes, settings)
 
     def search(one: Aligned) -> Found:
         return find_once(scan_map, allowed_map, panorama, one.settings, workers, watch, method, one.rotations)
 
     found = [search(level)]  # most cameras are about level
-    if not is_tilt_known(panorama, settings) and not is_clear(found[0].selection, level):
+    if not is_tilt_known(panorama, settings) and not is_explained(found[0].selection, level):
         with watch.stage("search"):
-            tilts = find_tilts(allowed_map, panorama, axes, settings, workers, method)
+            tilts = find_tilts(allowed_map, yaw_of_walls, panorama, axes, settings, workers, method)
         found += [search(tilt) for tilt in tilts]
     best = max(found, key=lambda one: one.selection.best.score)
-    if len(level.rotations) == 0 or is_clear(best.selection, level):
+    if len(level.rotations) == 0 or is_explained(best.selection, level):
         return best
     in_any_heading = search(level._replace(rotations=level.rotations[:0]))
     return max([best, in_any_heading], key=lambda one: one.selection.best.score)

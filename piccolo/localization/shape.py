@@ -33,19 +33,18 @@ def is_tilt_known(panorama: Panorama, settings: CoarseToFineSettings) -> bool:
     return settings.gravity == "known" or (has_attitude and settings.gravity != "unknown")
 
 
-def is_clear(found: Selection, searched: Aligned) -> bool:
+def is_explained(found: Selection, searched: Aligned) -> bool:
     """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
     is_alone = found.margin > CLEAR_MARGIN or len(searched.rotations) > 0
     return found.best.score > CLEAR_SHAPE and is_alone
 
 
-def align_lines(scan_map: ScanMap, axes: Sequence[Array], R_cam_from_level: Array) -> Array:
+def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_level: Array) -> Array:
     """Return the rotations (4, 3, 3), camera from map, that put level lines of a photo along the walls.
 
-    The axes (3,) are those of the photo's lines, R_cam_from_level (3, 3) is its tilt. (0, 3, 3) if the lines
-    or the scan have no such directions.
+    The yaw is `ScanMap.yaw_of_walls`, the axes (3,) are those of the photo's lines, R_cam_from_level (3, 3)
+    is its tilt. (0, 3, 3) if the lines or the scan have no such directions.
     """
-    yaw_of_walls = scan_map.yaw_of_walls
     level = np.array([axis @ R_cam_from_level for axis in axes]).reshape(-1, 3)
     level = level[np.abs(level[:, 2]) < LEVEL_SINE]
     if yaw_of_walls is None or len(level) != 4:
@@ -55,16 +54,17 @@ def align_lines(scan_map: ScanMap, axes: Sequence[Array], R_cam_from_level: Arra
 
 
 def align_level(
-    scan_map: ScanMap, panorama: Panorama, axes: Sequence[Array], settings: CoarseToFineSettings
+    yaw_of_walls: float | None, panorama: Panorama, axes: Sequence[Array], settings: CoarseToFineSettings
 ) -> Aligned:
     """Return the known tilt of a camera, level unless the photo or the settings say another."""
     known = replace(settings, gravity="known")
     R_cam_from_level, _ = find_tilt(panorama, known)
-    return Aligned(known, align_lines(scan_map, axes, R_cam_from_level))
+    return Aligned(known, align_lines(yaw_of_walls, axes, R_cam_from_level))
 
 
 def find_tilts(
     scan_map: ScanMap,
+    yaw_of_walls: float | None,
     panorama: Panorama,
     axes: Sequence[Array],
     settings: CoarseToFineSettings,
@@ -78,7 +78,7 @@ def find_tilts(
     tried = []
     for axis in axes:
         prior = replace(settings.prior, gravity_vector=tuple((-axis).tolist()))
-        tried.append(align_level(scan_map, panorama, axes, replace(settings, prior=prior)))
+        tried.append(align_level(yaw_of_walls, panorama, axes, replace(settings, prior=prior)))
     scores = []
     for one in tried:
         query = prepare_query(panorama, scan_map, one.settings, workers, method, one.rotations)

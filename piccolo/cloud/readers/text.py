@@ -318,7 +318,8 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     num_columns = len(line.split())
     columns = COLUMNS[channel].get(min(num_columns, 7))
     if columns is None:
-        found = f"{num_columns} columns, no {channel}: {quote_line(line)}"
+        lacking = "colours" if channel == "colors" else channel
+        found = f"{num_columns} columns, no {lacking}: {quote_line(line)}"
         error = MissingChannelError if min(num_columns, 7) in COLUMNS["shape"] else InputError
         raise error(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
     return line_source(path, LineLayout(columns, num_columns, has_counts=True), channel, PTS_WANTED)
