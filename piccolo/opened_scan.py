@@ -34,7 +34,7 @@ from .scan_map.named_scans import add_places, check_within
 from .scan_map.prior import GpsPrior, Prior, gps_prior
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk, WalkAbout, photo_facts
-from .walk.frames import Motion
+from .walk.motion import Motion
 from .walk.tracker import Tracker
 
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"

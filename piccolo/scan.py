@@ -23,7 +23,7 @@ from .scan_map.open_map import write_map
 from .scan_map.prior import Prior
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk
-from .walk.frames import MAX_ACCELERATION, MAX_SPEED, Motion
+from .walk.motion import MAX_ACCELERATION, MAX_SPEED, Motion
 
 Image = NDArray[np.uint8]  # (H, W, 3) RGB
 Mask = NDArray[np.bool_]  # (H, W)

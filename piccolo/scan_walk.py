@@ -19,8 +19,10 @@ from .panorama import Panorama, ReadOptions, read_photo
 from .panorama.photo import PhotoFacts, photo_of_array, read_photo_facts, sha256_of
 from .result import Failure, Result, Source, describe_failure, result_of, unreadable_result
 from .scan_map.named_scans import add_places
-from .walk.frames import Frame, check_times
+from .walk.beliefs import believe
+from .walk.frames import Frame
 from .walk.localize import WalkFrame, make_localization, make_localizations, result_alone
+from .walk.motion import check_times
 from .walk.second_look import finish
 from .walk.tracker import Tracker
 
@@ -160,17 +162,16 @@ class Walk:
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""
-        path = finish(self.tracker, self._panorama, show)
-        found = make_localizations(self.tracker, path)
+        path, beliefs = finish(self.tracker, self._panorama, show)
+        found = make_localizations(self.tracker, path, beliefs)
         return [
             self._result(taken, add_places(self.tracker.scan_map, f), walk)
             for taken, (f, walk) in zip(self.taken, found, strict=True)
         ]
 
     def _now(self, frame: Frame, number: int) -> Result:
-        probabilities = self.tracker.lattice.filter_last()
-        chosen = int(probabilities.argmax()) if len(probabilities) else None
-        found = make_localization(self.tracker, frame, probabilities, chosen)
+        path = self.tracker.lattice.filter_path()
+        found = make_localization(self.tracker, frame, believe(self.tracker.frames, path, number))
         walk = WalkFrame(frame.time, number, frame.how, result_alone(frame), None)
         return self._result(self.taken[number], add_places(self.tracker.scan_map, found), walk)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..files.json_file import read_text
 from ..panorama.photo import read_photo_facts
-from ..walk.frames import check_times
+from ..walk.motion import check_times
 
 EXIF = "exif"
 NAMES = "names"

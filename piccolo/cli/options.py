@@ -20,7 +20,7 @@ from ..panorama.model import Projection
 from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.prior import Prior
-from ..walk.frames import MAX_SPEED
+from ..walk.motion import MAX_SPEED
 from .command import check_least, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."

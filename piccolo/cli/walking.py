@@ -32,7 +32,7 @@ from ..panorama.video import frames_of
 from ..result import FAILED, Result, read_results
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from ..walk.frames import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
+from ..walk.motion import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY

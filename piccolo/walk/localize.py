@@ -12,12 +12,13 @@ from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import classify
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Alternative, Localization
-from ..geometry.pose import MAX_DISTANCE, Array, Pose, exp_so3
-from .frames import Frame, Motion
+from ..geometry.pose import Array, Pose, exp_so3
+from .beliefs import EVEN, Belief
+from .frames import Frame, probability_within
+from .motion import Motion
 from .path import Path
 from .tracker import Tracker
 
-SURE = 0.5  # frames with less are not smoothed with the others
 BANDS = 6  # of the information matrix beside its diagonal: two frames of three coordinates
 PRIOR_FLOOR = 1e-6  # [m^2] least variance of a position
 LONGEST_STEP = 3.0  # [s] frames farther apart do not limit the acceleration
@@ -54,23 +55,23 @@ class WalkFrame:
     gap: Gap | None  # before it
 
 
-def make_localizations(tracker: Tracker, path: Path) -> list[tuple[Localization, WalkFrame]]:
+def make_localizations(
+    tracker: Tracker, path: Path, beliefs: Sequence[Belief]
+) -> list[tuple[Localization, WalkFrame]]:
     """Return the result of each frame of a walk, poses smoothed together."""
-    found = [
-        make_localization(tracker, frame, probabilities, chosen)
-        for frame, probabilities, chosen in zip(tracker.frames, path.probabilities, path.chosen, strict=True)
-    ]
-    sure = [k for k, f in enumerate(found) if f.pose and f.covariance and f.confidence > SURE]
+    frames = tracker.frames
+    found = [make_localization(tracker, f, belief) for f, belief in zip(frames, beliefs, strict=True)]
+    sure = [k for k, f in enumerate(found) if f.pose and f.covariance and f.confidence > EVEN]
     located = [(f.pose, f.covariance) for k in sure if (f := found[k]).pose and f.covariance]
     begins = [0, *(n for n, k in enumerate(sure) if n and path.gaps[k]), len(sure)]
     for lo, hi in pairwise(begins):
-        times = [tracker.frames[k].time for k in sure[lo:hi]]
+        times = [frames[k].time for k in sure[lo:hi]]
         parts = smooth_positions(located[lo:hi], times, tracker.motion)
         for k, (pose, covariance) in zip(sure[lo:hi], parts, strict=True):
             found[k] = replace(found[k], pose=pose, covariance=covariance)
     return [
         (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), gap and Gap(gap[0], gap[1])))
-        for k, (f, frame, gap) in enumerate(zip(found, tracker.frames, path.gaps, strict=True))
+        for k, (f, frame, gap) in enumerate(zip(found, frames, path.gaps, strict=True))
     ]
 
 
@@ -80,36 +81,29 @@ def result_alone(frame: Frame) -> Alone | None:
     return None if a is None else Alone(a.status, a.confidence, a.pose)
 
 
-def make_localization(
-    tracker: Tracker, frame: Frame, probabilities: Array, chosen: int | None
-) -> Localization:
+def make_localization(tracker: Tracker, frame: Frame, belief: Belief) -> Localization:
     """Make a frame's result from its poses and the probabilities that the walk gives them."""
-    if not frame.states:
+    if not belief.states:
         return frame.alone or Localization()
-    order = sorted(range(len(frame.states)), key=lambda j: (j != chosen, -probabilities[j]))
-    best = frame.states[order[0]]
-    values = [float(probabilities[j]) for j in order]
-    if best.covariance is not None:
-        values[0] *= math.erf(MAX_DISTANCE / (best.covariance.largest_std * math.sqrt(2.0)))
-    # for a blurred or dark frame, its neighbours determine the place, but not the position in it
-    values[0] *= 1.0 / (1.0 + math.exp(-frame.log_odds))
-    none = max(1.0 - sum(values), 0.0)
+    best, *others = belief.states
+    within = probability_within(best.covariance)
+    confidence, *rest = (within * float(p) for p in belief.probabilities)
+    none = max(1.0 - confidence - sum(rest), 0.0)
     to_world = tracker.scan_map.to_world
-    is_own = frame.alone and frame.alone.pose is not None and order[0] == 0 and frame.how == "alone"
+    is_own = frame.alone and frame.states and best is frame.states[0]
     own = frame.alone if is_own and frame.alone else Localization()
-    status = classify(np.array([*values, none]), tracker.settings.min_confidence)
-    others = tuple(
-        Alternative(to_world(s.pose), s.score, s.num_matches, p)
-        for s, p in zip([frame.states[j] for j in order[1:]], values[1:], strict=True)
-    )
+    found = [
+        Alternative(to_world(s.pose), s.score or 0.0, s.num_matches, p)
+        for s, p in zip(others, rest, strict=True)
+    ]
     return Localization(
-        status,
-        values[0],
+        classify(np.array([confidence, *rest, none]), tracker.settings.min_confidence),
+        confidence,
         none,
         to_world(best.pose),
         own.loss,
         own.evidence,
-        others[:MAX_ALTERNATIVES],
+        tuple(found[:MAX_ALTERNATIVES]),
         best.covariance,
     )
 

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE, Hypothesis, sort_by_score, suppress_near
-from ..confidence.confidence import posterior
-from ..geometry.pose import Pose, exp_so3, log_so3, pose_errors
-from ..geometry.rotations import Gravity
+from ..confidence.alternatives import Hypothesis
+from ..confidence.confidence import LOCALIZED, posterior
+from ..geometry.pose import Pose, exp_so3, log_so3
+from ..geometry.rotations import uniform_yaws
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..localization.attempts import FIRST_BEAM, MIRROR_RATIO, brief_query, score_mirror, score_starts
+from ..localization.attempts import FIRST_BEAM, brief_query
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
 from ..localization.localize import localize
@@ -34,45 +34,41 @@ from ..localization.settings import CoarseToFineSettings
 from ..panorama import Panorama
 from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
+from .beliefs import EVEN
 from .frames import (
-    MAX_STEP,
-    NO_ACCELERATION,
-    OTHER_LOG_ODDS,
+    MOST_ODDS,
     Frame,
-    Motion,
     State,
+    is_same,
+    is_same_place,
     list_states,
+    log_odds_of_place,
     log_ratio,
-    state_centers,
+    put_state,
 )
 from .free_space import FreeSpace
-from .path import REACH_SLACK, Lattice
+from .motion import MAX_STEP, NO_ACCELERATION, Motion, carry
+from .path import COPY_LOG_ODDS, REACH_SLACK, TELLING_DISTANCE, Lattice
+from .places import MOST_PLACES, find_places, is_mirrored, log_behind
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
-MOST_LISTED = 12  # poses of a frame
-KEPT_BESIDE = 0.4  # of the best score: copies of a place are kept until the walk tells them apart
 LAST_LIMITS = Limits(FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
-MOST_TRACKED = 6  # poses from which a frame is tracked
-MOST_SOUGHT = 3  # of those at which it is not, around which it is looked for
-LEAST_WEIGHT = 0.02  # of such a pose, by the likeliest
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere
 LAST_SEARCH = 48  # and again, at the latest
-SHORT = 1.5  # [m] that a camera may have gone: a descent from there does not end in a neighbouring minimum
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
-USUAL = 0.95  # of the score of the frame before
-SURE = 0.9
-CHECKED_SURE = 8.0  # [m] walked, after which the whole scan is searched
-CHECKED_UNSURE = 4.0
+MOST_REFINED = 4  # places of a key frame, until one is as good as it looks
+USUAL = 0.95  # of the score of the frame before: a descent that ends with less goes on farther around
 
 
 class Follower(NamedTuple):
-    """A state from which the next frame is predicted."""
+    """A pose from which the next frame is predicted."""
 
-    state: State
+    pose: Pose
+    score: float
     time: float
-    earlier: Pose | None = None
+    earlier: Pose | None = None  # a pose before it
     earlier_time: float = 0.0
 
 
@@ -94,8 +90,6 @@ class Tracker:
         self.lattice: Lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
         self.num_lost: int = 0
         self.next_search: int = 1
-        self.walked: float = 0.0  # [m] since the whole scan was searched
-        self.is_sure: bool = False
 
     @property
     def frames(self) -> list[Frame]:
@@ -119,134 +113,171 @@ class Tracker:
         return query
 
     @one_blas_thread
-    def add(self, panorama: Panorama, query: Query, time: float) -> Frame:
+    def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
         """Localize the next frame, whose query is prepared."""
-        frame = Frame(time)
+        frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_far = bool(self.frames) and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
             self._follow(query, frame, not is_far)
-            is_lost = self.num_lost + 1 >= self.next_search
-            is_due = self.walked + self._distance_moved(frame) >= (
-                CHECKED_SURE if self.is_sure else CHECKED_UNSURE
-            )
-            if is_far or (is_lost and not frame.is_credible):
+            if is_far or (not frame.states and self.num_lost + 1 >= self.next_search):
                 self._search(query, panorama, frame)
-            elif is_due and frame.is_credible:
-                self._check(query, frame)
-        self.accept(frame)
+            elif frame.states and (frame.key is None or self._is_telling(frame)):
+                frame.make_key(list_key_states(query, frame.states))
+        self.lattice.add(frame)
+        if frame.is_key:
+            self._depart(query, frame)
+        self._count(frame)
         return frame
 
     def accept(self, frame: Frame) -> None:
-        """Add a frame that was localized now or earlier."""
-        self.walked += self._distance_moved(frame)
+        """Add a frame that was localized earlier."""
         self.lattice.add(frame)
-        if frame.how == "alone":
-            self.walked = 0.0
-        if frame.is_credible:
+        self._count(frame)
+
+    def _count(self, frame: Frame) -> None:
+        """Count the frames for which the camera is lost."""
+        if frame.arrived is not None or frame.departed is not None:
             self.num_lost = 0
             self.next_search = FIRST_SEARCH
-            self.is_sure = bool(self.lattice.filter_last().max() >= SURE)
             return
         self.num_lost += 1
-        if frame.how == "alone":
+        if frame.alone is not None:
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
 
-    def _distance_moved(self, frame: Frame) -> float:
-        """Return the distance [m] from the nearest pose of the frame before; 0 if either has none."""
-        before = next((f for f in reversed(self.frames) if f.states), None)
-        if before is None or not frame.states:
-            return 0.0
-        best = max(frame.states, key=lambda state: state.log_odds).pose.center_world
-        return float(np.linalg.norm(state_centers(before.states) - best, axis=1).min())
+    def _is_telling(self, frame: Frame) -> bool:
+        """Return True if the camera has moved so far since the last key frame that it sees another place."""
+        if frame.key is None or frame.arrived is None:
+            return False
+        move = frame.arrived.center_world - self._pose_since(frame.key).center_world
+        return float(np.linalg.norm(move)) >= TELLING_DISTANCE
 
     def _follow(self, query: Query, frame: Frame, looks_near: bool) -> None:
-        """Descend from the predictions of the last poses; search near them if that fails."""
-        followers = self.followers()
-        if not followers:
+        """Descend from the pose predicted by the last ones; search near it if that fails."""
+        follower = self._follower_to(frame)
+        if follower is None:
             return
-        ends = follow_all(query, followers, frame.time, self.motion)
-        is_there = any(end.score >= least_score(f) for f, end in zip(followers, ends, strict=True))
-        least = KEPT_BESIDE * max(end.score for end in ends) if is_there else CLEAR_SCORE
-        found = [end for end in ends if end.score >= least] if is_there else []
-        lost = [f for f, end in zip(followers, ends, strict=True) if not is_there or end.score < least]
-        for f in lost[:MOST_SOUGHT] if looks_near else []:
-            radius = self.motion.max_speed * (frame.time - f.time) + REACH_SLACK
-            if radius <= MAX_RADIUS:
-                found += find_near(query, f.state.pose, radius, least)
-        if found:
-            frame.put(make_states(query, found), "tracked" if is_there else "near")
+        tracked = follow(query, follower, frame.time, self.motion)
+        is_there = tracked.score >= least_score(follower)
+        near = [] if is_there or not looks_near else find_near(query, follower, frame.time, self.motion)
+        found = [tracked] if is_there else near
+        if not found or is_mirrored(query, found[0].pose):
+            return
+        frame.states = [make_state(query, found[0])]
+        frame.how = "tracked" if is_there else "near"
+        if len(found) == 1:
+            frame.arrived = found[0].pose
+            frame.key = self._last_key()
 
-    def followers(self) -> list[Follower]:
-        """Return the poses to track from: those of the last credible frame, then of a later one."""
-        known = [k for k, frame in enumerate(self.frames) if frame.states]
-        credible = [k for k in known if self.frames[k].is_credible][-1:]
-        later = [k for k in known[-1:] if k not in credible]
-        return [f for k in (*credible, *later) for f in self._followers_of(k, known)][:MOST_TRACKED]
+    def _last_key(self) -> int | None:
+        """Return the number of the last key frame that can be tracked from."""
+        numbers = (column.number for column in reversed(self.lattice.columns))
+        return next((k for k in numbers if self.frames[k].departed is not None), None)
 
-    def _followers_of(self, k: int, known: list[int]) -> list[Follower]:
-        """Return the poses of a frame, the likeliest first."""
-        last = self.frames[k]
-        weights = self.lattice.forward[k]
-        earlier = next((self.frames[m] for m in reversed(known) if m < k), None)
-        order = [int(i) for i in np.argsort(-weights, kind="stable")]
-        order = [i for i in order if weights[i] > weights.max() + np.log(LEAST_WEIGHT)]
-        return [self._follower(last, last.states[i], earlier) for i in order]
+    def _follower_to(self, frame: Frame) -> Follower | None:
+        """Return the pose to track a frame from: that of the last frame that was found."""
+        key = self._last_key()
+        if key is None:
+            return None
+        since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
+        last = self.frames[since[-1]]
+        pose = self._pose_since(since[-1])
+        score = last.states[0].score or LEAST_SCORE
+        if frame.odometry is not None and last.odometry is not None:
+            return Follower(carry(frame.odometry, last.odometry, pose), score, last.time)
+        if len(since) == 1:
+            return Follower(pose, score, last.time)
+        return Follower(pose, score, last.time, self._pose_since(since[-2]), self.frames[since[-2]].time)
 
-    def _follower(self, last: Frame, state: State, earlier: Frame | None) -> Follower:
-        if earlier is not None and earlier.states:
-            gaps = [np.linalg.norm(s.pose.center_world - state.pose.center_world) for s in earlier.states]
-            k = int(np.argmin(gaps))
-            if gaps[k] <= self.motion.max_speed * (last.time - earlier.time) + REACH_SLACK:
-                return Follower(state, last.time, earlier.states[k].pose, earlier.time)
-        return Follower(state, last.time)
-
-    def _check(self, query: Query, frame: Frame) -> None:
-        """Search the whole scan for a frame that was tracked."""
-        found = find_everywhere(query, CLEAR_SCORE)
-        if found:
-            frame.put(merge_states(query, frame.states, found), "alone")
+    def _pose_since(self, k: int) -> Pose:
+        frame = self.frames[k]
+        pose = frame.departed if frame.is_key else frame.arrived
+        if pose is None:
+            raise ValueError("a frame that was not found")
+        return pose
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
-        """Search the whole scan, and keep the tracked poses too."""
-        alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
-        tracked_to = [Hypothesis(state.pose, state.score) for state in frame.states]
-        states = list_states(self.scan_map, alone)
-        frame.put(merge_states(query, states, tracked_to) if states else frame.states, "alone")
-        frame.alone = alone
+        """Search the whole scan, and keep the pose that was tracked to, too."""
+        frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
+        found = list_states(self.scan_map, frame.alone)
+        if found and is_mirrored(query, found[0].pose):
+            found = []
+        found += frame.states
+        if found:
+            frame.how = "alone"
+            frame.make_key(list_key_states(query, found, frame.alone.status == LOCALIZED))
+
+    def _depart(self, query: Query, frame: Frame) -> None:
+        """Refine the likeliest place of a key frame; the next frames are tracked from there, if it is likely."""
+        for _ in range(MOST_REFINED):
+            probabilities = self.lattice.filter_last()
+            likeliest = frame.states[int(probabilities.argmax())]
+            if likeliest.is_refined:
+                frame.states = put_state(frame.states, likeliest)
+                frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
+                break
+            frame.states = refine_state(query, frame.states, likeliest)
+            self.lattice.change_last()
+        self.lattice.change_last()
 
 
-def merge_states(query: Query, states: list[State], others: Sequence[Hypothesis]) -> list[State]:
-    """Merge other poses into the states of a frame."""
-    for other in others:
-        more = associate(query, states, other)
-        states = states if more is None else [*states, more]
-    return states
+def list_key_states(query: Query, refined: Sequence[State], is_sure: bool = False) -> list[State]:
+    """List the states of a key frame: the poses that were refined for it, best first, and all other places.
+
+    If the photo is sure by itself, the others have all of one frame's evidence against them.
+    """
+    best = refined[0]
+    limit = -MOST_ODDS - COPY_LOG_ODDS if is_sure else 0.0
+    rough = [
+        State(p.pose, best.log_odds + min(p.behind, limit))
+        for p in find_places(query, best.pose)
+        if not any(is_same_place(p.pose, state.pose) for state in refined)
+    ]
+    states: list[State] = []
+    for state in (*refined, *rough):
+        if not any(is_same(state.pose, other.pose) for other in states):
+            states.append(state)
+    return states[:MOST_PLACES]
+
+
+def make_state(query: Query, end: Hypothesis) -> State:
+    """Make the state of a frame that has one pose, with its odds by whole views."""
+    covariance = estimate_covariance(query, end.pose)
+    asked = replace(query, num_parts=0)
+    probability = posterior(assess_poses(asked, end, []), covariance)[0]
+    odds = log_odds_of_place(float(probability), float(probability), covariance)
+    return State(end.pose, odds, end.score, covariance)
+
+
+def refine_state(query: Query, states: Sequence[State], rough: State) -> list[State]:
+    """Refine a rough state; its odds are then relative to those of the best refined one."""
+    best = max((s for s in states if s.is_refined), key=lambda s: s.log_odds)
+    end = track(query, rough.pose, LEAST_SCORE)
+    others = [s for s in states if s is not rough]
+    if any(s.is_refined and is_same(s.pose, end.pose) for s in others):
+        return others
+    at_best = Hypothesis(best.pose, best.score or 0.0)
+    first, second = posterior(assess_poses(replace(query, num_parts=0), at_best, [end]), None)[:2]
+    odds = best.log_odds + log_ratio(float(second), float(first))
+    return put_state(others, State(end.pose, odds, end.score, estimate_covariance(query, end.pose)))
 
 
 def least_score(f: Follower) -> float:
     """Return the least score with which a frame counts as tracked."""
-    return max(LEAST_SCORE, LEAST_KEPT * f.state.score)
-
-
-def follow_all(query: Query, followers: Sequence[Follower], time: float, motion: Motion) -> list[Hypothesis]:
-    """Track a frame from several poses in parallel; the query's images must be made."""
-    return list(query.workers.map(lambda f: follow(query, f, time, motion), followers, "descend"))
+    return max(LEAST_SCORE, LEAST_KEPT * f.score)
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
-    """Descend from a predicted pose; in a larger basin if it may be far off, or scores lower."""
+    """Descend from a predicted pose; in a larger basin if the frame scores less than the one before."""
     least = least_score(f)
-    seconds = time - f.time
-    starts = [f.state.pose]
+    starts = [f.pose]
     span = f.time - f.earlier_time
     if f.earlier is not None and span != 0.0:
-        reach = motion.max_speed * abs(seconds) + REACH_SLACK
-        starts.insert(0, predict(f.state.pose, f.earlier, seconds / span, reach))
+        reach = motion.max_speed * abs(time - f.time) + REACH_SLACK
+        starts.insert(0, predict(f.pose, f.earlier, (time - f.time) / span, reach))
     end = track(query, starts[0], least)
     if end.score < least:
         end = max([end, *(track(query, start, least) for start in starts[1:])], key=lambda h: h.score)
-    is_usual = end.score >= USUAL * f.state.score and motion.max_speed * abs(seconds) < SHORT
-    return end if is_usual or end.score < least else track_on(query, end)
+    return end if end.score >= USUAL * f.score or end.score < least else track_on(query, end)
 
 
 def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
@@ -286,67 +317,23 @@ def descend_last(query: Query, pose: Pose) -> Hypothesis:
     return score_pose(query, pose)
 
 
-def find_near(query: Query, near: Pose, radius: float, least_score: float) -> list[Hypothesis]:
-    """Search by whole views within a radius [m]; return poses of at least a score."""
-    x, y, z = (float(value) for value in query.scan_map.to_world(near).center_world)
+def find_near(query: Query, f: Follower, time: float, motion: Motion) -> list[Hypothesis]:
+    """Search by whole views within walking distance of a pose; return the best pose, and those like it.
+
+    Empty if the best is not clear, or the distance too great: then the whole scan is to be searched.
+    """
+    radius = motion.max_speed * abs(time - f.time) + REACH_SLACK
+    if radius > MAX_RADIUS:
+        return []
+    x, y, z = (float(value) for value in query.scan_map.to_world(f.pose).center_world)
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.sparse) == 0:
         return []
-    close = find_everywhere(replace(query, scan_map=some, cache=Cache(query.cache.views)), least_score)
-    least = KEPT_BESIDE * max((h.score for h in close), default=0.0)
-    ends = query.workers.map(lambda h: track(query, h.pose, least), close, "descend")
-    return [end for end in ends if end.score >= least]
-
-
-def find_everywhere(query: Query, least_score: float) -> list[Hypothesis]:
-    """Search the whole map by whole views; return poses and their copies, to centimetres, best first.
-
-    Empty if the best has less than the least score.
-    """
-    first = brief_query(replace(query, num_parts=0))
-    gravity: Gravity = "unknown" if query.settings.gravity == "unknown" else "known"
-    starts = search_poses(first, gravity)
-    score = score_starts(first, starts)
-    if score < least_score or score < MIRROR_RATIO * score_mirror(first):
+    level = f.pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
+    close = replace(query, scan_map=some, cache=Cache(query.cache.views), num_parts=0, rotations=level)
+    first = brief_query(close)
+    found = rank(refine(first, search_poses(first, "known"), FIRST_BEAM))
+    if found.best.score < CLEAR_SCORE:
         return []
-    found = rank(refine(first, starts, FIRST_BEAM), MOST_LISTED - 1)
-    if found.best.score < least_score:
-        return []
-    least = KEPT_BESIDE * found.best.score
-    return [h for h in (found.best, *found.alternatives) if h.score >= least]
-
-
-def make_states(query: Query, hypotheses: Sequence[Hypothesis]) -> list[State]:
-    """Make the states of a frame from its poses, best first, with odds by whole views."""
-    ranked = suppress_near(sort_by_score(hypotheses), MOST_LISTED, MIN_DISTANCE, MIN_ANGLE)
-    asked = replace(query, num_parts=0)
-    best, *others = ranked
-    covariance = estimate_covariance(query, best.pose)
-    standings = assess_poses(asked, best, others)
-    *probabilities, none = posterior(standings, covariance)
-    return [
-        State(h.pose, log_ratio(float(p), float(none)), h.score, covariance if h is best else None)
-        for h, p in zip(ranked, probabilities, strict=True)
-    ]
-
-
-def associate(query: Query, states: Sequence[State], found: Hypothesis) -> State | None:
-    """Make a state of another pose of a frame, with its odds relative to the best state.
-
-    None if the frame has the pose already, or if it is too much worse to be a copy.
-    """
-    best = max(states, key=lambda state: state.log_odds)
-    if any(is_same(state.pose, found.pose) for state in states):
-        return None
-    asked, at_best = replace(query, num_parts=0), Hypothesis(best.pose, best.score)
-    first, second = posterior(assess_poses(asked, at_best, [found]), None)[:2]
-    odds = best.log_odds + log_ratio(float(second), float(first))
-    if odds < best.log_odds - OTHER_LOG_ODDS:
-        return None
-    return State(found.pose, odds, found.score, estimate_covariance(query, found.pose), best.num_matches)
-
-
-def is_same(pose: Pose, other: Pose) -> bool:
-    """Return True if two poses are nearer than distinct poses are."""
-    distance, angle = pose_errors(pose, other)
-    return distance < MIN_DISTANCE and angle < MIN_ANGLE
+    like = [h for h in found.alternatives if log_behind(query, h.score / found.best.score) > -COPY_LOG_ODDS]
+    return [track(query, found.best.pose, CLEAR_SCORE), *like]

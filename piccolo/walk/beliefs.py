@@ -1,0 +1,75 @@
+"""What a walk says of a frame: its poses, and how likely each is."""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..geometry.pose import Array, Pose
+from .frames import Frame, State, is_same
+from .motion import carry
+from .path import MOST_EXPECTED, Path
+
+EVEN = 0.5  # less is not sure
+
+
+class Belief(NamedTuple):
+    """A frame's poses, best first."""
+
+    states: list[State]
+    probabilities: Array  # (S,) that each is of the frame's place
+    expected: Pose | None = None  # where tracking puts a frame, but where it was not refined
+
+    @property
+    def is_sure(self) -> bool:
+        """True if the first pose more likely is right than not."""
+        return len(self.states) > 0 and bool(self.probabilities[0] > EVEN)
+
+
+NOTHING = Belief([], np.empty(0))
+
+
+def believe(frames: Sequence[Frame], path: Path, k: int) -> Belief:
+    """Return what a path says of a frame: a key frame's places, or where it was tracked to from one."""
+    frame = frames[k]
+    if frame.is_key:
+        return believe_key(frame.states, path.probabilities[k], path.chosen[k])
+    return NOTHING if frame.key is None else believe_tracked(frames, path, k)
+
+
+def believe_key(states: Sequence[State], probabilities: Array, chosen: int | None) -> Belief:
+    """Return the states of a key frame, the chosen first and then by probability."""
+    order = sorted(range(len(states)), key=lambda j: (j != chosen, -probabilities[j]))
+    return Belief([states[j] for j in order], probabilities[order])
+
+
+def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
+    """Return the poses to which a frame was tracked, from each place where its key frame may be."""
+    frame = frames[k]
+    key = frame.key
+    if key is None or frame.arrived is None or path.chosen[key] is None:
+        return NOTHING
+    at_key = believe_key(frames[key].states, path.probabilities[key], path.chosen[key])
+    own = frame.states[0]
+    credible = 1.0 / (1.0 + math.exp(-own.log_odds - MOST_EXPECTED))
+    share = credible * share_of_next(frames, path, k, at_key)
+    departed = frames[key].departed or at_key.states[0].pose
+    carried = [carry(frame.arrived, departed, state.pose) for state in at_key.states]
+    if not is_same(carried[0], own.pose):
+        return Belief([], np.empty(0), carried[0])
+    others = [State(pose, own.log_odds) for pose in carried[1:]]
+    return Belief([own, *others], share * at_key.probabilities)
+
+
+def share_of_next(frames: Sequence[Frame], path: Path, k: int, at_key: Belief) -> float:
+    """Return the share of the belief in a key frame that the next one, tracked from it, leaves to a frame."""
+    key = frames[k].key
+    after = (n for n in range(k + 1, len(frames)) if frames[n].is_key)
+    n = next(after, None)
+    if n is None or frames[n].key != key:
+        return 1.0
+    chosen = path.chosen[n]
+    if chosen is None or path.gaps[n] is not None:
+        return EVEN
+    return min(float(path.probabilities[n][chosen] / max(at_key.probabilities[0], 1e-9)), 1.0)

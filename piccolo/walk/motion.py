@@ -1,0 +1,58 @@
+"""How a camera is carried: what a walk knows before it has seen a photo."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from ..errors import InputError
+from ..geometry.pose import Pose
+
+MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
+MAX_ACCELERATION = 2.0  # [m/s^2]
+MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
+JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place that was not scanned
+UNTIMED_JUMP_LOG = -4.0  # between frames without times
+NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The motion of a carried camera."""
+
+    max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
+    max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
+    is_timed: bool = True  # False if only the order of the frames is known
+    is_guess: bool = False  # True if no distance between frames was given: the poses found will give it
+
+    def __post_init__(self) -> None:
+        """Refuse speeds and accelerations that are not above 0."""
+        for name in ("max_speed", "max_acceleration"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value > 0.0):
+                raise InputError(f"{name}: found {value}, wanted a number above 0")
+
+    @property
+    def jump_log(self) -> float:
+        """Log odds of a jump, from a frame to a later one."""
+        return JUMP_LOG if self.is_timed else UNTIMED_JUMP_LOG
+
+
+def check_times(times: Sequence[float]) -> None:
+    """Refuse times that are not finite or do not rise."""
+    if not all(math.isfinite(time) for time in times):
+        raise InputError("times: found one that is no finite number, wanted seconds")
+    for k, (before, after) in enumerate(pairwise(times)):
+        if after <= before:
+            raise InputError(f"times: found {after} after {before} at frame {k + 1}, wanted them to rise")
+
+
+def carry(pose: Pose, beside: Pose, to: Pose) -> Pose:
+    """Return the pose that lies to `to` as `pose` does to `beside`: the same motion of the camera, elsewhere.
+
+    Poses are in any one frame each: pose and beside in that of an odometry, say, and to in the map.
+    """
+    R_to_from_world = to.R_cam_from_world
+    offset_cam = beside.R_cam_from_world @ (pose.center_world - beside.center_world)
+    R = pose.R_cam_from_world @ beside.R_cam_from_world.T @ R_to_from_world
+    return Pose(R, to.center_world + R_to_from_world.T @ offset_cam)
