@@ -210,7 +210,8 @@ class Tracker:
         """Refine the likeliest place of a key frame; the next frames are tracked from there, if it is likely."""
         for _ in range(MOST_REFINED):
             probabilities = self.lattice.filter_last()
-            likeliest = frame.states[int(probabilities.argmax())]
+            is_likely = probabilities >= EVEN * probabilities.max()
+            likeliest = frame.states[int(np.where(is_likely, [s.log_odds for s in frame.states], -np.inf).argmax())]
             if likeliest.is_refined:
                 frame.states = put_state(frame.states, likeliest)
                 frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
@@ -333,7 +334,7 @@ def find_near(query: Query, f: Follower, time: float, motion: Motion) -> list[Hy
     close = replace(query, scan_map=some, cache=Cache(query.cache.views), num_parts=0, rotations=level)
     first = brief_query(close)
     found = rank(refine(first, search_poses(first, "known"), FIRST_BEAM))
-    if found.best.score < CLEAR_SCORE:
+    if found.best.score < max(CLEAR_SCORE, least_score(f)):
         return []
     like = [h for h in found.alternatives if log_behind(query, h.score / found.best.score) > -COPY_LOG_ODDS]
     return [track(query, found.best.pose, CLEAR_SCORE), *like]
