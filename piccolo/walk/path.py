@@ -25,7 +25,7 @@ from .motion import Motion, carry
 COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
 TELLING_DISTANCE = 2.0  # [m] after which a frame is new evidence of its place
 REACH_SLACK = 0.3  # [m] beyond what a person walks
-MOST_EXPECTED = 3.0  # [log] that a place gains by being where it was to be expected
+MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 NEGLIGIBLE = 20.0  # [log] below the best
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
 
@@ -55,18 +55,23 @@ class _Column(NamedTuple):
 
     number: int  # of the frame
     emitted: Array  # (S,)
+    log_alike: float  # of the number of places that look like the photo
     steps: list[_Steps]
     forward: Array  # (S,) sums over ways, emissions included
     best: Array  # (S,) of the best way
     back: list[tuple[int, int] | None]  # column and state before
 
 
-def emissions(frame: Frame, before: Frame | None) -> Array:
-    """Return log odds (S,) of a frame's states against none, counting only new evidence."""
+def emissions(frame: Frame, before: Frame | None) -> tuple[Array, float]:
+    """Return log odds (S,) of a frame's states against none, counting only new evidence.
+
+    Their sum is what the frame's best pose has; the second result is the log of the number that share it.
+    """
     odds = np.array([state.log_odds for state in frame.states])
     share = 1.0 if before is None else fraction_moved(before, frame)
     behind = share * np.minimum(odds - odds.max() + COPY_LOG_ODDS, 0.0)
-    return np.asarray(np.clip(odds.max(), -MOST_ODDS, MOST_ODDS) + behind)
+    log_alike = float(np.logaddexp.reduce(behind))
+    return np.clip(odds.max(), -MOST_ODDS, MOST_ODDS) + behind - log_alike, log_alike
 
 
 def fraction_moved(before: Frame, frame: Frame) -> float:
@@ -140,8 +145,8 @@ class Lattice:
     def _append_column(self, k: int) -> None:
         frame = self.frames[k]
         before = self.frames[self.columns[-1].number] if self.columns else None
-        emitted = emissions(frame, before)
-        steps = self._steps_to(k)
+        emitted, log_alike = emissions(frame, before)
+        steps = self._steps_to(k, log_alike)
         sums = np.zeros(len(emitted))
         best = np.zeros(len(emitted))
         back: list[tuple[int, int] | None] = [None] * len(emitted)
@@ -153,40 +158,44 @@ class Lattice:
                 if ways[i, j] > best[j]:
                     best[j] = ways[i, j]
                     back[j] = (s.begin, int(i))
-        self.columns.append(_Column(k, emitted, steps, sums + emitted, best + emitted, back))
+        self.columns.append(_Column(k, emitted, log_alike, steps, sums + emitted, best + emitted, back))
         total = np.logaddexp.reduce(self.columns[-1].forward)
         self.ended.append(float(np.logaddexp(self.ended[-1], total)))
 
-    def _steps_to(self, k: int) -> list[_Steps]:
+    def _steps_to(self, k: int, log_alike: float) -> list[_Steps]:
         """Return the steps to a key frame from all earlier ones from which the path may lead to it."""
         steps: list[_Steps] = []
         passed = 0.0
         for n in range(len(self.columns) - 1, -1, -1):
             column = self.columns[n]
-            steps.append(_Steps(n, self._step(column.number, k)))
+            steps.append(_Steps(n, self._step(column.number, k, MOST_EXPECTED + log_alike)))
             passed += max(float(np.logaddexp.reduce(column.emitted)), 1.0)
             if passed > NEGLIGIBLE:
                 break
         return steps
 
-    def _step(self, m: int, k: int) -> Array:
+    def _step(self, m: int, k: int, most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another."""
         starts, ends = self.frames[m].states, self.frames[k].states
         if moved := motion_between(self.frames, m, k):
-            return np.where(is_moved(moved, starts, ends), MOST_EXPECTED, self.motion.jump_log)
-        seconds = self.frames[k].time - self.frames[m].time
+            return np.where(is_moved(moved, starts, ends), most_expected, self.motion.jump_log)
+        last, centers = self._last_tracked(m, k)
+        seconds = self.frames[k].time - self.frames[last].time
         limit = self.motion.max_speed * seconds + 5.0 * REACH_SLACK
-        centers = state_centers(starts)
         distances = np.array([self.space.distance(start, state_centers(ends), limit) for start in centers])
-        expected = np.array([[self._expected(start, limit)] for start in centers])
+        fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
+        expected = np.minimum(-np.log(fractions), most_expected)
         return log_transition(distances, seconds, self.motion, expected)
 
-    def _expected(self, start: Array, reach: float) -> float:
-        """Return the log odds that a pose within a reach [m] gains: the more, the less of the map lies there.
-
-        A frame's own odds assume that all places of the map are equally likely.
-        """
-        return min(-math.log(self.space.fraction_within(start, reach)), MOST_EXPECTED)
+    def _last_tracked(self, m: int, k: int) -> tuple[int, Array]:
+        """Return the last frame before `k` that was tracked from key frame `m`, and its positions (S, 3)."""
+        states = self.frames[m].states
+        departed = self.frames[m].departed
+        for n in range(k - 1, m, -1):
+            arrived = self.frames[n].arrived
+            if self.frames[n].key == m and arrived is not None and departed is not None:
+                return n, np.array([carry(arrived, departed, s.pose).center_world for s in states])
+        return m, state_centers(states)
 
     def filter_last(self) -> Array:
         """Return the probability (S,) of each state of the last key frame, given all frames so far."""

@@ -16,7 +16,7 @@ from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_yaws
 from ..geometry.sphere import wider_cells
 from ..geometry.suppression import non_maximum_suppression
-from ..localization.attempts import brief_query, mirror_query
+from ..localization.attempts import brief_query, is_whole, mirror_query, score_mirror, score_starts
 from ..localization.correlation import masked_correlation, weigh_by_area
 from ..localization.query import Query
 from ..localization.refinement import FIRST_ITERATIONS, descend_all
@@ -71,6 +71,14 @@ def is_mirrored(query: Query, pose: Pose) -> bool:
     R_mirrored = across @ pose.R_cam_from_world @ across
     mirror = mirror_query(query)
     return correlate_near(mirror, pose, R_mirrored) > correlate_near(query, pose, pose.R_cam_from_world)
+
+
+def is_mirror_image(query: Query) -> bool:
+    """Return True if the mirror image of a whole upright photo looks more like any place of the map."""
+    if not is_whole(query):
+        return False
+    first = brief_query(query)
+    return score_mirror(query) > score_starts(first, search_poses(first, "known"))
 
 
 def correlate_near(query: Query, pose: Pose, R_cam_from_map: Array) -> float:

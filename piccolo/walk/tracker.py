@@ -49,7 +49,7 @@ from .frames import (
 from .free_space import FreeSpace
 from .motion import MAX_STEP, NO_ACCELERATION, Motion, carry
 from .path import COPY_LOG_ODDS, REACH_SLACK, TELLING_DISTANCE, Lattice
-from .places import MOST_PLACES, find_places, is_mirrored, log_behind
+from .places import MOST_PLACES, find_places, is_mirror_image, is_mirrored, log_behind
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
 LEAST_KEPT = 0.6  # of the score of the frame before
@@ -198,13 +198,13 @@ class Tracker:
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan, and keep the pose that was tracked to, too."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
-        found = list_states(self.scan_map, frame.alone)
-        if found and is_mirrored(query, found[0].pose):
-            found = []
+        is_sure = frame.alone.status == LOCALIZED
+        is_wrong = not is_sure and is_mirror_image(query)
+        found = [] if is_wrong else list_states(self.scan_map, frame.alone)
         found += frame.states
         if found:
             frame.how = "alone"
-            frame.make_key(list_key_states(query, found, frame.alone.status == LOCALIZED))
+            frame.make_key(list_key_states(query, found, is_sure))
 
     def _depart(self, query: Query, frame: Frame) -> None:
         """Refine the likeliest place of a key frame; the next frames are tracked from there, if it is likely."""
@@ -250,10 +250,15 @@ def make_state(query: Query, end: Hypothesis) -> State:
 
 
 def refine_state(query: Query, states: Sequence[State], rough: State) -> list[State]:
-    """Refine a rough state; its odds are then relative to those of the best refined one."""
+    """Refine a rough state; its odds are then relative to those of the best refined one.
+
+    It is dropped if a frame would not be tracked there, or has that pose already.
+    """
     best = max((s for s in states if s.is_refined), key=lambda s: s.log_odds)
     end = track(query, rough.pose, LEAST_SCORE)
     others = [s for s in states if s is not rough]
+    if end.score < LEAST_SCORE or is_mirrored(query, end.pose):
+        return others
     if any(s.is_refined and is_same(s.pose, end.pose) for s in others):
         return others
     at_best = Hypothesis(best.pose, best.score or 0.0)
