@@ -207,7 +207,9 @@ class Lattice:
         if self.columns:
             probabilities = self.filter_last()
             path.probabilities[self.columns[-1].number] = probabilities
-            path.chosen[self.columns[-1].number] = int(probabilities.argmax())
+            # the frames after it are tracked from the first
+            is_tracked = self.frames[self.columns[-1].number].departed is not None
+            path.chosen[self.columns[-1].number] = 0 if is_tracked else int(probabilities.argmax())
         return path
 
     def smooth(self) -> Path:

@@ -338,7 +338,8 @@ def find_near(query: Query, f: Follower, time: float, motion: Motion) -> list[Hy
     level = f.pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
     close = replace(query, scan_map=some, cache=Cache(query.cache.views), num_parts=0, rotations=level)
     first = brief_query(close)
-    found = rank(refine(first, search_poses(first, "known"), FIRST_BEAM))
+    ends = refine(first, search_poses(first, "known"), FIRST_BEAM)
+    found = rank([h for h in ends if np.linalg.norm(h.pose.center_world - f.pose.center_world) <= radius])
     if found.best.score < max(CLEAR_SCORE, least_score(f)):
         return []
     like = [h for h in found.alternatives if log_behind(query, h.score / found.best.score) > -COPY_LOG_ODDS]
