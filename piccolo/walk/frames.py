@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
+from ..confidence.confidence import LOCALIZED
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..geometry.pose import MAX_DISTANCE, Array, Pose, pose_errors
@@ -59,6 +60,11 @@ class Frame:
     def log_odds(self) -> float:
         """Log odds that any of the frame's poses is right."""
         return max((state.log_odds for state in self.states), default=-math.inf)
+
+    @property
+    def is_localized_alone(self) -> bool:
+        """True if the photo is sure without the others."""
+        return self.alone is not None and self.alone.status == LOCALIZED
 
     def make_key(self, states: list[State]) -> None:
         """Make the frame a key frame with these states."""

@@ -5,8 +5,8 @@ place to place through free space, or as tracking or an odometry says; anything 
 A frame may also have none of its places, and the path goes on from an earlier one. Viterbi (1967) finds the
 likeliest path, forward-backward (Rabiner 1989) the probability of each place.
 
-Frames of one place have correlated errors: they tell places apart in proportion to the distance that the
-camera has moved, and only beyond the differences between exact copies of a room.
+Frames of one place have correlated errors: key frames are some distance apart, and they tell places apart
+only beyond the differences between exact copies of a room.
 """
 
 import math
@@ -23,7 +23,6 @@ from .free_space import FreeSpace
 from .motion import Motion, carry
 
 COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
-TELLING_DISTANCE = 2.0  # [m] after which a frame is new evidence of its place
 REACH_SLACK = 0.3  # [m] beyond what a person walks
 MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 NEGLIGIBLE = 20.0  # [log] below the best
@@ -62,24 +61,16 @@ class _Column(NamedTuple):
     back: list[tuple[int, int] | None]  # column and state before
 
 
-def emissions(frame: Frame, before: Frame | None) -> tuple[Array, float]:
-    """Return log odds (S,) of a frame's states against none, counting only new evidence.
+def emissions(frame: Frame) -> tuple[Array, float]:
+    """Return log odds (S,) of a key frame's states against none.
 
     Their sum is what the frame's best pose has; the second result is the log of the number that share it.
     """
     odds = np.array([state.log_odds for state in frame.states])
-    share = 1.0 if before is None else fraction_moved(before, frame)
-    behind = share * np.minimum(odds - odds.max() + COPY_LOG_ODDS, 0.0)
+    tolerance = 0.0 if frame.is_localized_alone else COPY_LOG_ODDS
+    behind = np.minimum(odds - odds.max() + tolerance, 0.0)
     log_alike = float(np.logaddexp.reduce(behind))
     return np.clip(odds.max(), -MOST_ODDS, MOST_ODDS) + behind - log_alike, log_alike
-
-
-def fraction_moved(before: Frame, frame: Frame) -> float:
-    """Return the fraction of a new place that a key frame shows, by the distance moved since another."""
-    begin, end = before.states[0].pose, frame.states[0].pose
-    if frame.arrived is not None and before.departed is not None:
-        begin, end = before.departed, frame.arrived
-    return min(float(np.linalg.norm(end.center_world - begin.center_world)) / TELLING_DISTANCE, 1.0)
 
 
 def log_transition(distance: Array, seconds: float, motion: Motion, expected: Array | float = 0.0) -> Array:
@@ -144,8 +135,7 @@ class Lattice:
 
     def _append_column(self, k: int) -> None:
         frame = self.frames[k]
-        before = self.frames[self.columns[-1].number] if self.columns else None
-        emitted, log_alike = emissions(frame, before)
+        emitted, log_alike = emissions(frame)
         steps = self._steps_to(k, log_alike)
         sums = np.zeros(len(emitted))
         best = np.zeros(len(emitted))

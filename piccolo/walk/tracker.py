@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import LOCALIZED, posterior
+from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3
 from ..geometry.rotations import uniform_yaws
 from ..jobs.blas import one_blas_thread
@@ -48,7 +48,7 @@ from .frames import (
 )
 from .free_space import FreeSpace
 from .motion import MAX_STEP, NO_ACCELERATION, Motion, carry
-from .path import COPY_LOG_ODDS, REACH_SLACK, TELLING_DISTANCE, Lattice
+from .path import COPY_LOG_ODDS, REACH_SLACK, Lattice
 from .places import MOST_PLACES, find_places, is_mirror_image, is_mirrored, log_behind
 
 LEAST_SCORE = 0.2  # of a frame that is tracked
@@ -57,6 +57,7 @@ LAST_LIMITS = Limits(FULL_LOSS, 10, 1e-5)  # of the last descent, as in refineme
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere
 LAST_SEARCH = 48  # and again, at the latest
+TELLING_DISTANCE = 2.0  # [m] after which a frame is new evidence of its place
 FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
 MOST_REFINED = 4  # places of a key frame, until one is as good as it looks
 USUAL = 0.95  # of the score of the frame before: a descent that ends with less goes on farther around
@@ -198,7 +199,7 @@ class Tracker:
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan, and keep the pose that was tracked to, too."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
-        is_sure = frame.alone.status == LOCALIZED
+        is_sure = frame.is_localized_alone
         is_wrong = not is_sure and is_mirror_image(query)
         found = [] if is_wrong else list_states(self.scan_map, frame.alone)
         found += frame.states
