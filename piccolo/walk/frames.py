@@ -7,7 +7,7 @@ wherever the key frame was, they are as far from there.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -80,9 +80,11 @@ class Frame:
     @classmethod
     def from_json(cls, document: dict[str, Any], alone: Localization | None) -> "Frame":
         """Make a frame from the output of `to_json` and its result alone."""
-        frame = cls(**{**document, "states": [_state_from_json(state) for state in document["states"]]})
-        poses = {name: _pose_from_json(document[name]) for name in POSES}
-        return replace(frame, alone=alone, **poses)
+        values: dict[str, Any] = {**document, "alone": alone}
+        values["states"] = [_state_from_json(state) for state in document["states"]]
+        for name in POSES:
+            values[name] = _pose_from_json(document[name])
+        return cls(**values)
 
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:

@@ -1,6 +1,5 @@
 """The results of a walk's frames: positions smoothed with a constant-acceleration prior."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

@@ -46,9 +46,7 @@ def find_places(query: Query, own: Pose) -> list[Place]:
     image = query.photo.images.search()
     _, own_scores = descend_all(query.scan_map, image, at_own, FIRST_ITERATIONS, query.workers)
     ends, scores = descend_all(query.scan_map, image, starts, FIRST_ITERATIONS, query.workers)
-    kept = non_maximum_suppression(
-        ends.R_cam_from_map, ends.center_map, MOST_PLACES, MIN_DISTANCE, MIN_ANGLE
-    )
+    kept = non_maximum_suppression(ends.R_cam_from_map, ends.center_map, MOST_PLACES, MIN_DISTANCE, MIN_ANGLE)
     ratios = scores[kept] / max(float(own_scores[0]), 1e-9)
     return [
         Place(pose, log_behind(query, float(ratio)))

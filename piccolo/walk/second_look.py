@@ -128,6 +128,4 @@ def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> N
     at_key = frames[key].states[chosen].pose
     departed = frames[key].departed = frames[key].departed or at_key
     arrived = carry(found.pose, at_key, departed)
-    frames[k] = replace(
-        frames[k], states=[found], is_key=False, key=key, arrived=arrived, departed=None
-    )
+    frames[k] = replace(frames[k], states=[found], is_key=False, key=key, arrived=arrived, departed=None)

@@ -208,11 +208,12 @@ class Tracker:
             frame.make_key(list_key_states(query, found, is_sure))
 
     def _depart(self, query: Query, frame: Frame) -> None:
-        """Refine the likeliest place of a key frame; the next frames are tracked from there, if it is likely."""
+        """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it."""
         for _ in range(MOST_REFINED):
             probabilities = self.lattice.filter_last()
             is_likely = probabilities >= EVEN * probabilities.max()
-            likeliest = frame.states[int(np.where(is_likely, [s.log_odds for s in frame.states], -np.inf).argmax())]
+            odds = [state.log_odds for state in frame.states]
+            likeliest = frame.states[int(np.where(is_likely, odds, -np.inf).argmax())]
             if likeliest.is_refined:
                 frame.states = put_state(frame.states, likeliest)
                 frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
