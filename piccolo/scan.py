@@ -278,6 +278,7 @@ class Scan:
         frames: Iterable[File | Image],
         times: Sequence[float] | NDArray[np.floating[Any]] | None = None,
         *,
+        odometry: Sequence[Pose | None] | None = None,
         max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
         mask: File | None = None,
@@ -308,6 +309,8 @@ class Scan:
             Photos in the order in which they were taken, each as in `localize`.
         times
             Time of each frame [s], increasing. Without times only the order counts.
+        odometry
+            Pose of the camera at each frame in the frame of an odometry [m]; None of a frame without one.
         max_speed, max_acceleration
             As in `track`.
         mask
@@ -333,13 +336,16 @@ class Scan:
         """
         given = check_arguments(Scan.localize_walk, locals())
         given.pop("frames")
-        given.pop("times", None)
+        for name in ("times", "odometry"):
+            given.pop(name, None)
         walk = self._track(given)
         taken = list(frames)
-        if times is not None and len(times) != len(taken):
-            raise InputError(f"`times`: found {len(times)} of {len(taken)} frames, wanted one of each")
+        for name, values in (("times", times), ("odometry", odometry)):
+            if values is not None and len(values) != len(taken):
+                raise InputError(f"`{name}`: found {len(values)} of {len(taken)} frames, wanted one of each")
         for k, frame in enumerate(taken):
-            walk.add(frame, None if times is None else times[k])
+            time = None if times is None else times[k]
+            walk.add(frame, time, odometry=None if odometry is None else odometry[k])
         return walk.finish()
 
     def occlusion_mask(  # noqa: PLR0913  options by name

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from .camera import Calibration
 from .confidence.localization import Localization
 from .files.json_file import reading_once
+from .geometry.pose import Pose
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Progress, no_progress
 from .localization.query import Query
@@ -75,13 +76,20 @@ class Walk:
         self.about = about
         self.taken: list[Taken] = []
 
-    def add(self, frame: Picture, time: float | None = None, name: str | None = None) -> Result:
+    def add(
+        self,
+        frame: Picture,
+        time: float | None = None,
+        name: str | None = None,
+        odometry: Pose | None = None,
+    ) -> Result:
         """Localize a frame, by it and the frames before.
 
         A frame that can't be read has a result that says so. `time` [s] counts from any beginning, and is
-        given for all frames or for none; `name` replaces the path in the result.
+        given for all frames or for none; `name` replaces the path in the result. `odometry` is the camera's
+        pose in any frame that all poses of an odometry share [m].
         """
-        return self.follow(self.prepare(frame, name), time)
+        return self.follow(self.prepare(frame, name), time, odometry)
 
     def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
         """Read a frame and prepare what does not depend on other frames; another thread may do it."""
@@ -104,7 +112,7 @@ class Walk:
         warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
         return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
 
-    def follow(self, prepared: Prepared, time: float | None = None) -> Result:
+    def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
         """Localize a prepared frame, as `add` does."""
         number = len(self.taken)
         taken, panorama, query = prepared
@@ -115,10 +123,10 @@ class Walk:
             self.tracker.forget_times()
         watch = Stopwatch(taken.seconds)
         if panorama is None or query is None:
-            self.accept(taken, Frame(when))
+            self.accept(taken, Frame(when, odometry=odometry))
         else:
             with watch.stage("track"):
-                self.tracker.add(panorama, query, when)
+                self.tracker.add(panorama, query, when, odometry)
             self.taken.append(taken)
         return self._now(self.tracker.frames[-1], number)
 

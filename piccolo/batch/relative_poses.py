@@ -12,6 +12,8 @@ from ..geometry.pose import Array, Pose, check_rotation, orthonormal, rotation_f
 from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
 
 WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio, or a TUM trajectory, in metres"
+ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
+NUM_KITTI = 12  # columns: T_world_from_cam without its last row
 MAX_SKEW = 1e-3  # of R R^T from the identity
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
@@ -39,6 +41,51 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
             raise InputError(f"{path}: found {len(found)} poses of {photo}, wanted one of each photo")
         chosen.append(found[0])
     return chosen
+
+
+def read_odometry(path: Path, frames: Sequence[Path], times: Sequence[float]) -> list[Pose | None]:
+    """Return each frame's pose in the frame of an odometry; None of a frame without one.
+
+    A transforms.json names its frames. A trajectory has a pose of each frame in order, or, of TUM, poses by
+    time [s] as the frames have it: each frame takes the nearest, within half of the time to the next frame.
+
+    Raises InputError if the file is no odometry, or of other frames.
+    """
+    if path.suffix == ".json":
+        by_name = {Path(name).name: pose for name, pose in read_transforms(path)}
+        found = [by_name.get(frame.name) for frame in frames]
+    else:
+        rows = [line.split() for line in read_text(path, ODOMETRY).splitlines() if line.strip()]
+        rows = [row for row in rows if not row[0].startswith("#")]
+        is_kitti = all(len(row) == NUM_KITTI for row in rows)
+        try:
+            poses = [read_kitti_row(row) if is_kitti else read_tum_row(row) for row in rows]
+            clock = np.array([] if is_kitti else [row[0] for row in rows], float)
+        except ValueError as error:
+            raise InputError(f"{path}: found {error}, {ODOMETRY}") from error
+        in_order: list[Pose | None] = [pose for _, pose in poses]
+        found = in_order
+        if len(poses) != len(frames):
+            found = [None if k is None else in_order[k] for k in find_nearest(clock, np.array(times, float))]
+    if not any(found):
+        raise InputError(f"{path}: found {len(frames)} frames and no pose of them, {ODOMETRY}")
+    return found
+
+
+def find_nearest(clock: Array, times: Array) -> list[int | None]:
+    """Return the number of the time (N,) nearest to each of others (M,), within half of their steps."""
+    if len(clock) == 0:
+        return [None] * len(times)
+    slack = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
+    nearest = [int(np.abs(clock - time).argmin()) for time in times]
+    return [k if abs(clock[k] - time) <= slack else None for k, time in zip(nearest, times, strict=True)]
+
+
+def read_kitti_row(row: Sequence[str]) -> NamedPose:
+    """Return the pose of a row, without a name: T_world_from_cam, camera axes right, down, forward."""
+    T = np.array(row, float).reshape(3, 4)
+    check_finite(T, "a row")
+    return "", make_pose(OPTICAL_FROM_CAM.T @ T[:, :3].T, T[:, 3], "a row")
 
 
 def read_transforms(path: Path) -> list[NamedPose]:

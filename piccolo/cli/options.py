@@ -194,6 +194,10 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--times SOURCE", text)
     text = f"maximum speed of the camera [m/s] (default {MAX_SPEED:g}); if only the order is known, "
     option(group, "--max-speed X", text + "maximum distance between frames [m] (default: estimated)")
+    text = (
+        "odometry of the camera [m], by which a walk tells identical places apart: TUM or KITTI trajectory, "
+    )
+    option(group, "--odometry FILE", text + "or transforms.json (ARKit)")
     text = "write the path on a plan of the scan, coloured by confidence: .png, .svg, .pdf or .dxf"
     option(group, "--plan FILE", text)
 

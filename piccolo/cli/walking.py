@@ -15,12 +15,14 @@ from typing import Any, NamedTuple
 from .. import __version__
 from ..batch.frame_times import times_of
 from ..batch.inputs import is_from_stdin
+from ..batch.relative_poses import read_odometry
 from ..batch.results_file import WAYS, Records
 from ..camera import Calibration
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stream, write_atomically
 from ..files.line_file import LineFile, open_locked, whole_lines, whole_size
 from ..files.temporary import temporary_folder
+from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
 from ..localization.settings import CoarseToFineSettings
@@ -40,7 +42,7 @@ from .outputs import check_suffix
 from .progress import progress_bar, show_progress
 
 STEP = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
-ONLY_WITH = ("times", "max_speed", "plan")
+ONLY_WITH = ("times", "max_speed", "odometry", "plan")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 KEY_BEGINS = b'{"'
 
@@ -51,6 +53,7 @@ class WalkInput(NamedTuple):
     path: Path
     time: float  # [s] since the first; of frames without times their number
     name: str  # in the results
+    odometry: Pose | None = None
 
 
 class WalkInputs(NamedTuple):
@@ -117,7 +120,8 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
         times = times_of(panoramas, arguments.times)
         numbers = times or [float(k) for k in range(len(panoramas))]
         frames = [WalkInput(p, t, str(p)) for p, t in zip(panoramas, numbers, strict=True)]
-        yield WalkInputs(frames, motion_of(arguments.max_speed, times is not None), 0.0)
+        motion = motion_of(arguments.max_speed, times is not None)
+        yield WalkInputs(add_odometry(frames, arguments.odometry), motion, 0.0)
         return
     motion = motion_of(arguments.max_speed, True)
     seconds, metres = measure_step(arguments.step, motion.max_speed)
@@ -126,7 +130,15 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
         bar = {"desc": "read the video", "unit": " frames", "leave": False}
         shots = show_progress(found, arguments.quiet, **bar)
         frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
-        yield WalkInputs(frames, motion, metres)
+        yield WalkInputs(add_odometry(frames, arguments.odometry), motion, metres)
+
+
+def add_odometry(frames: list[WalkInput], path: Path | None) -> list[WalkInput]:
+    """Return the frames with their poses in an odometry, if there is one."""
+    if path is None:
+        return frames
+    poses = read_odometry(path, [frame.path for frame in frames], [frame.time for frame in frames])
+    return [frame._replace(odometry=pose) for frame, pose in zip(frames, poses, strict=True)]
 
 
 def run_walk(
@@ -140,7 +152,7 @@ def run_walk(
     watch = Stopwatch()
     scan = open_scan()
     walk = scan.walk(read_options, settings, inputs.motion)
-    key = make_key(walk)
+    key = make_key(walk, arguments.odometry)
     if (counts := count_finished(arguments, key, inputs, read_options.rig)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
         write_plan(arguments.plan, scan, read_results([arguments.out]) if arguments.plan else [])
@@ -186,8 +198,10 @@ def write_plan(path: Path | None, scan: OpenedScan, results: Sequence[Result]) -
     write_plan_file(entries_of_walk(results), scan.prepared, path, ReportSettings())
 
 
-def make_key(walk: Walk) -> dict[str, Any]:
+def make_key(walk: Walk, odometry: Path | None) -> dict[str, Any]:
     """Return what must be the same where a walk goes on."""
+    if odometry is not None:
+        walk.about.settings["odometry_sha256"] = sha256_of(odometry, None)
     digest = walk.tracker.scan_map.scan_sha256 or None
     settings = json.loads(json.dumps(walk.about.settings))
     return {"settings": settings, "cloud_sha256": digest, "version": __version__}
@@ -213,7 +227,7 @@ def follow_all(
         with interruptible() as interruption:
             pairs = show_progress(prepared, arguments.quiet, **bar)
             for frame, wait in interruption.each(pairs) if file else pairs:
-                result = walk.follow(wait(), frame.time)
+                result = walk.follow(wait(), frame.time, frame.odometry)
                 if result.error is not None:
                     print_error(arguments, result.error, EXIT_BAD_INPUT)
                 if file is not None:

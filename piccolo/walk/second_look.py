@@ -23,6 +23,7 @@ from .tracker import (
     follow,
     least_score,
     make_state,
+    move_on,
     refine_state,
 )
 
@@ -110,7 +111,8 @@ def _find_lost(tracker: Tracker, path: Path, k: int, step: int, read: Read) -> N
         return
     query = tracker.prepare(panorama)
     state = believe(frames, path, sure).states[0]
-    follower = Follower(belief.expected or state.pose, state.score or LEAST_SCORE, frames[sure].time)
+    start = belief.expected or move_on(state.pose, frames[sure], frames[k])
+    follower = Follower(start, state.score or LEAST_SCORE, frames[sure].time)
     end = follow(query, follower, frames[k].time, tracker.motion)
     is_there = end.score >= least_score(follower)
     found = [end] if is_there else find_near(query, follower, frames[k].time, tracker.motion)

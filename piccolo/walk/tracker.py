@@ -118,7 +118,8 @@ class Tracker:
         """Localize the next frame, whose query is prepared."""
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
-            is_far = bool(self.frames) and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
+            is_known = odometry is not None or not self.frames
+            is_far = not is_known and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
             self._follow(query, frame, not is_far)
             if is_far or (not frame.states and self.num_lost + 1 >= self.next_search):
                 self._search(query, panorama, frame)
@@ -183,10 +184,8 @@ class Tracker:
         last = self.frames[since[-1]]
         pose = self._pose_since(since[-1])
         score = last.states[0].score or LEAST_SCORE
-        if frame.odometry is not None and last.odometry is not None:
-            return Follower(carry(frame.odometry, last.odometry, pose), score, last.time)
-        if len(since) == 1:
-            return Follower(pose, score, last.time)
+        if frame.odometry is not None or len(since) == 1:
+            return Follower(move_on(pose, last, frame), score, last.time)
         return Follower(pose, score, last.time, self._pose_since(since[-2]), self.frames[since[-2]].time)
 
     def _pose_since(self, k: int) -> Pose:
@@ -267,6 +266,13 @@ def refine_state(query: Query, states: Sequence[State], rough: State) -> list[St
     first, second = posterior(assess_poses(replace(query, num_parts=0), at_best, [end]), None)[:2]
     odds = best.log_odds + log_ratio(float(second), float(first))
     return put_state(others, State(end.pose, odds, end.score, estimate_covariance(query, end.pose)))
+
+
+def move_on(pose: Pose, before: Frame, frame: Frame) -> Pose:
+    """Return where the camera is at a frame by the odometry, if there is one, from its pose at another."""
+    if frame.odometry is None or before.odometry is None:
+        return pose
+    return carry(frame.odometry, before.odometry, pose)
 
 
 def least_score(f: Follower) -> float:
