@@ -35,7 +35,7 @@ from ..scenes.evaluation.query_result import (
     match_results,
     read_run,
 )
-from ..scenes.evaluation.walks import group_walks, walk_table
+from ..scenes.evaluation.walks import alone_table, group_walks, walk_table
 from ..scenes.scene import Query, Scene, find_scenes
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, Terminated, UsageError, checking_options, print_error, print_note
@@ -123,7 +123,7 @@ def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: 
     found.append(tables.threshold_table(rows, thresholds))
     found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
     if walks := group_walks(scenes, rows):
-        found.append(walk_table(walks, thresholds))
+        found += [walk_table(walks, thresholds), alone_table(walks, thresholds)]
     return "\n".join(table.markdown() for table in found)
 
 

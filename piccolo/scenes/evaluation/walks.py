@@ -8,6 +8,7 @@ import numpy as np
 
 from ...confidence.confidence import LOCALIZED
 from ...geometry.pose import Array, Pose, angle_between, pose_errors
+from ...walk.localize import Alone
 from ..scene import Query, Scene
 from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
 from .tables import ALL, Table
@@ -19,6 +20,7 @@ class Frame(NamedTuple):
     query: Query
     pose: Pose | None  # the best
     is_localized: bool
+    alone: Alone | None = None  # what was made of it without the others
 
     @property
     def sure_pose(self) -> Pose | None:
@@ -66,7 +68,9 @@ def group_walks(scenes: Iterable[Scene], rows: Iterable[QueryResult]) -> dict[tu
         for query in scene.queries:
             row = by_key.get((scene.name, scene.name_of(query)))
             if query.walk is not None and row is not None:
-                frame = Frame(query, row.result.best_pose, row.result.status == LOCALIZED)
+                result = row.result
+                alone = result.walk.alone if result.walk else None
+                frame = Frame(query, result.best_pose, result.status == LOCALIZED, alone)
                 walks.setdefault((scene.name, query.walk), []).append(frame)
     return {name: sorted(frames, key=_time) for name, frames in sorted(walks.items())}
 
@@ -133,6 +137,21 @@ def walk_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Thresholds
     columns = "walk", "frames", "correct", "localized", "wrong of all", "bad refused"
     errors = "ATE [m]", "RPE [m a frame]", "RPE [deg]", "first localized [s]"
     return Table(title, (*columns, *errors), tuple((name, *_cells(s)) for name, s in summaries.items()))
+
+
+def alone_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Thresholds) -> Table:
+    """Return a line a walk: its frames that were searched alone, by themselves and with the others."""
+    columns = [f"{what} {how}" for how in ("alone", "together") for what in ("correct", "localized", "wrong")]
+    rows = []
+    for name, frames in walks.items():
+        searched = [(frame, frame.alone) for frame in frames if frame.alone is not None]
+        alone = [f._replace(pose=a.pose, is_localized=a.status == LOCALIZED) for f, a in searched]
+        counts: list[str] = []
+        for some in (alone, [frame for frame, _ in searched]):
+            s = summarize_walk(some, thresholds) if some else None
+            counts += [f"{n}" for n in (s.num_correct, s.num_localized, s.num_wrong)] if s else ["-"] * 3
+        rows.append((" ".join(name), f"{len(searched)}", *counts))
+    return Table("frames that were searched in the whole scan", ("walk", "frames", *columns), tuple(rows))
 
 
 def _cells(s: WalkSummary) -> list[str]:
