@@ -20,9 +20,10 @@ from ..localization.attempts import brief_query, is_whole, mirror_query, score_m
 from ..localization.correlation import masked_correlation, weigh_by_area
 from ..localization.query import Query
 from ..localization.refinement import FIRST_ITERATIONS, descend_all
-from ..localization.search import Starts, search_poses, turn_panorama, widen_samples
+from ..localization.search import Starts, best_poses, search_poses, turn_panorama, widen_samples
 from ..views.candidate_views import WIDE_RINGS
 
+NUM_STARTS = 16  # of these that begin a descent
 NUM_NEAR = 64  # candidates around a pose, at which a photo is compared with its mirror image
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 
@@ -42,7 +43,7 @@ def find_places(query: Query, own: Pose) -> list[Place]:
     level = own.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
     first = brief_query(replace(query, rotations=level))
     starts = search_poses(first, "known")
-    at_own = Starts(own.R_cam_from_world[None], own.center_world[None], nearest(query, own, 1))
+    at_own = Starts(own.R_cam_from_world[None], own.center_world[None], nearest(query, own))
     image = query.photo.images.search()
     _, own_scores = descend_all(query.scan_map, image, at_own, FIRST_ITERATIONS, query.workers)
     ends, scores = descend_all(query.scan_map, image, starts, FIRST_ITERATIONS, query.workers)
@@ -62,13 +63,12 @@ def log_behind(query: Query, ratio: float) -> float:
 
 
 def is_mirrored(query: Query, pose: Pose) -> bool:
-    """Return True if the mirror image of a whole photo looks more like the views around a pose."""
+    """Return True if the mirror image of a whole photo explains more near a pose than the photo."""
     if query.photo.is_partial:
         return False
     across = np.diag([1.0, -1.0, 1.0])
     R_mirrored = across @ pose.R_cam_from_world @ across
-    mirror = mirror_query(query)
-    return correlate_near(mirror, pose, R_mirrored) > correlate_near(query, pose, pose.R_cam_from_world)
+    return score_near(mirror_query(query), pose, R_mirrored) > score_near(query, pose, pose.R_cam_from_world)
 
 
 def is_mirror_image(query: Query) -> bool:
@@ -79,8 +79,8 @@ def is_mirror_image(query: Query) -> bool:
     return score_mirror(query) > score_starts(first, search_poses(first, "known"))
 
 
-def correlate_near(query: Query, pose: Pose, R_cam_from_map: Array) -> float:
-    """Return the best correlation of a photo with the views near a pose, turned about the vertical."""
+def score_near(query: Query, pose: Pose, R_cam_from_map: Array) -> float:
+    """Return the best score after short descents near a pose, in a rotation turned about the vertical."""
     m = query.scan_map
     rotations = R_cam_from_map @ uniform_yaws(query.settings.num_yaws)
     samples, validity = turn_panorama(query.photo.images.search(), rotations)
@@ -88,10 +88,15 @@ def correlate_near(query: Query, pose: Pose, R_cam_from_map: Array) -> float:
     panorama = weigh_by_area(*wide, wider_cells(WIDE_RINGS)[1], 255)
     distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
     near = np.argsort(distances, kind="stable")[:NUM_NEAR]
-    return float(masked_correlation(m.wide_features[near], m.wide_seen[near], panorama, query.workers).max())
+    scores = masked_correlation(m.wide_features[near], m.wide_seen[near], panorama, query.workers)
+    row, turn, _ = best_poses(scores, NUM_STARTS)
+    candidate = m.sparse[near[row]]
+    starts = Starts(rotations[turn], m.centers[candidate], candidate)
+    image = query.photo.images.search()
+    return float(descend_all(m, image, starts, FIRST_ITERATIONS, query.workers)[1].max())
 
 
-def nearest(query: Query, pose: Pose, count: int) -> NDArray[np.int64]:
-    """Return the numbers (count,) of the candidates nearest to a pose."""
+def nearest(query: Query, pose: Pose) -> NDArray[np.int64]:
+    """Return the number (1,) of the candidate nearest to a pose."""
     distances = np.linalg.norm(query.scan_map.centers - pose.center_world, axis=1)
-    return np.argsort(distances, kind="stable")[:count]
+    return np.array([distances.argmin()])
