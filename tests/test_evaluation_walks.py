@@ -15,8 +15,15 @@ from piccolo.scenes.evaluation.query_result import (
     make_query_result,
     match_results,
 )
-from piccolo.scenes.evaluation.walks import group_walks, summarize_all, summarize_walk, walk_table
+from piccolo.scenes.evaluation.walks import (
+    alone_table,
+    group_walks,
+    summarize_all,
+    summarize_walk,
+    walk_table,
+)
 from piccolo.scenes.scene import Query, Scene
+from piccolo.walk.localize import Alone
 
 RATE = 2.0
 
@@ -144,3 +151,19 @@ def test_a_photo_without_an_answer_has_no_errors_and_is_read_back_without(tmp_pa
     assert (again.position_error, again.rotation_error) == (np.inf, np.inf)
     assert again.result.best_pose is not None
     assert not again.has_errors
+
+
+def test_frames_alone_and_together_are_counted_side_by_side(tmp_path):
+    """Of three searched alone, one was sure and wrong, and is right with the others."""
+    ((name, frames),) = frames_of(tmp_path, {}).items()
+    wrong = frames[0].query.pose
+    alone = {
+        0: Alone("localized", 0.95, frames[0].query.pose),
+        1: Alone("localized", 0.93, wrong),
+        3: Alone("ambiguous", 0.5, frames[3].query.pose),
+    }
+    frames = [frame._replace(alone=alone.get(k)) for k, frame in enumerate(frames)]
+    table = alone_table({name: frames}, PAPER_THRESHOLDS)
+    assert table.columns[2:5] == ("correct alone", "localized alone", "wrong alone")
+    assert table.rows == (("hall w", "3", "2", "2", "1", "3", "3", "0"),)
+    assert alone_table({name: [f._replace(alone=None) for f in frames]}, PAPER_THRESHOLDS).rows[0][2] == "-"

@@ -8,7 +8,8 @@ import pytest
 from poses import SIZE, result, tilted_poses
 from refusals import assert_refused
 
-from piccolo.batch.relative_poses import read_relative_poses
+from piccolo.batch.relative_poses import read_odometry, read_relative_poses
+from piccolo.errors import InputError
 from piccolo.scenes.export import Options, export
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
@@ -154,3 +155,40 @@ def test_a_file_that_is_none_is_refused(tmp_path):
     assert_refused("found bytes that are no text", read_relative_poses, tmp_path / "a.bin", [Path("1.jpg")])
     assert_refused("not a file but a folder", read_relative_poses, tmp_path, [Path("1.jpg")])
     assert_refused("cannot be|No such file", read_relative_poses, tmp_path / "none.txt", [Path("1.jpg")])
+
+
+@pytest.mark.parametrize(("name", "file"), [("tum", "poses.txt"), ("kitti", "poses.txt")])
+def test_an_odometry_has_a_pose_of_each_frame_in_order(tmp_path, name, file):
+    results = [result(photo, pose) for photo, pose in zip(PHOTOS, POSES, strict=True)]
+    options = Options(timestamps="name") if name == "tum" else Options()
+    export(results, name, tmp_path / file, options)
+    _assert_same(read_odometry(tmp_path / file, PHOTOS, [0.0, 1.0, 2.0, 3.0]), POSES)
+
+
+def test_an_odometry_of_more_poses_is_matched_by_time_or_name(tmp_path):
+    results = [result(Path(f"{k}.jpg"), pose) for k, pose in enumerate(POSES)]
+    export(results, "tum", tmp_path / "poses.txt", Options(timestamps="name"))
+    found = read_odometry(tmp_path / "poses.txt", PHOTOS[:3], [0.9, 2.1, 9.0])
+    _assert_same(found[:2], [POSES[1], POSES[2]])
+    assert found[2] is None
+    export(results, "nerfstudio", tmp_path / "transforms.json", Options(size=SIZE))
+    found = read_odometry(tmp_path / "transforms.json", [Path("a/2.jpg"), Path("a/9.jpg")], [0.0, 1.0])
+    _assert_same(found[:1], [POSES[2]])
+    assert found[1] is None
+
+
+def test_what_is_no_odometry_of_the_frames_is_refused(tmp_path):
+    times = [0.0, 1.0]
+    wanted = "wanted a TUM or KITTI trajectory or a transforms.json"
+    cases = {
+        "words": ("these eight words are no numbers at all\n", "could not convert string to float"),
+        "columns": ("1 2 3\n", "found 3 columns"),
+        "skew": ("1 0 0 0 0 2 0 0 0 0 1 0\n" * 2, "found a row: a matrix that"),
+        "late": ("50 0 0 0 0 0 0 1\n" * 3, "found 2 frames and no pose of them"),
+        "kitti of others": ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "found 2 frames and no pose of them"),
+    }
+    for name, (text, found) in cases.items():
+        path = _write(tmp_path / f"{name}.txt", text)
+        with pytest.raises(InputError, match=found) as error:
+            read_odometry(path, PHOTOS[:2], times)
+        assert wanted in str(error.value)

@@ -21,9 +21,11 @@ from piccolo.jobs.threads import Workers
 from piccolo.panorama import picture
 from piccolo.result import read_results
 from piccolo.scan_walk import Walk
+from piccolo.scenes.export.formats import tum_lines
 from piccolo.scenes.export.video import writing_video
 from piccolo.scenes.synthetic.world import free_position, photograph
 from piccolo.walk import tracker as tracker_module
+from piccolo.walk.motion import carry
 
 NUM_FRAMES, STEP_S = 8, 0.5
 
@@ -167,15 +169,39 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building)
     assert [(r.walk.how, r.walk.alone.status) for r in results] == [("alone", "localized")] * 4
 
 
-def test_however_sure_the_whole_scan_is_searched_now_and_then(scan, building, monkeypatch):
+def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, building, monkeypatch):
     _, queries = building
-    monkeypatch.setattr(tracker_module, "CHECKED_SURE", 0.4)  # [m] the camera goes 0.23 at a time
-    results = scan.localize_walk([q.image for q in queries], [q.time for q in queries], gravity="known")
+    monkeypatch.setattr(tracker_module, "TELLING_DISTANCE", 0.4)  # [m] the camera goes 0.23 at a time
+    walk = scan.track(gravity="known")
+    live = [walk.add(q.image, q.time) for q in queries]
+    _assert_right(live, queries)
+    assert [frame.is_key for frame in walk.tracker.frames] == [k % 2 == 0 for k in range(NUM_FRAMES)]
+    assert min(len(frame.states) for frame in walk.tracker.frames[::2]) > 1
+    results = walk.finish()
     _assert_right(results, queries)
-    is_searched = [r.walk.how == "alone" for r in results]
-    assert is_searched == [k % 2 == 0 for k in range(NUM_FRAMES)]
     assert results[0].walk.alone is not None
     assert all(r.walk.alone is None for r in results[1:])
+
+
+def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_path):
+    """The camera goes too far between frames to be tracked without; on the command line, too."""
+    folder, queries = building
+    some = [queries[k] for k in (0, 5, 7)]
+    moved = Pose(yaw_rotation(2.0), np.array([50.0, -3.0, 7.0]))
+    odometry = [carry(q.pose, queries[0].pose, moved) for q in some]
+    frames = [q.image for q in some]
+    results = scan.localize_walk(frames, odometry=odometry, gravity="known")
+    _assert_right(results, some)
+    assert [r.walk.how for r in results] == ["alone", "tracked", "tracked"]
+    with pytest.raises(InputError, match=r"^`odometry`: found 1 of 3 frames, wanted one of each$"):
+        scan.localize_walk(frames, odometry=odometry[:1])
+    lines = tum_lines([(f"{k}", pose) for k, pose in enumerate(odometry)], "optical")
+    (tmp_path / "odometry.tum").write_text("\n".join(lines))
+    out = tmp_path / "a.jsonl"
+    words = ["--walk", "--pano", *map(str, frames), "--odometry", str(tmp_path / "odometry.tum")]
+    assert _command(folder, *words, "--out", str(out)) == 0
+    assert [r.walk.how for r in read_results([out])] == ["alone", "tracked", "tracked"]
+    assert _command(folder, *words[:-2], "--out", str(out)) == 3  # the results are of another walk
 
 
 def test_a_walk_is_the_same_with_any_number_of_threads(building):
@@ -280,6 +306,12 @@ REFUSED = {
     "words": (["--video", "a.mp4", "1s", "2s"], 2, "--video: found 3 words, wanted a file and a step"),
     "step": (["--video", "a.mp4", "fast"], 2, "--video: found the step 'fast', wanted seconds or metres"),
     "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
+    "odometry alone": (["--pano", "a.jpg", "--odometry", "a.tum"], 2, "--odometry: only with --walk"),
+    "no odometry": (
+        ["--walk", "--pano", "a.jpg", "--times", "order", "--odometry", "missing.tum"],
+        3,
+        "missing.tum: cannot be read (No such file or directory)",
+    ),
     "no step": (["--walk", "--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: found 0.0, wanted"),
     "plan alone": (["--pano", "a.jpg", "--plan", "a.png"], 2, "--plan: only with --walk or --video"),
     "plan of a kind": (

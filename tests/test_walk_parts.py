@@ -11,8 +11,9 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.walk.frames import MAX_STEP, NO_ACCELERATION, Frame, Motion
+from piccolo.walk.frames import Frame
 from piccolo.walk.localize import PRIOR_FLOOR, smooth_positions
+from piccolo.walk.motion import MAX_STEP, NO_ACCELERATION, Motion
 from piccolo.walk.second_look import estimate_motion
 
 MOTION = Motion(2.0, 0.5)

@@ -1,35 +1,32 @@
+"""The path through a walk's key frames, against the sum over every way there is."""
+
 import itertools
+import math
 
 import numpy as np
 import pytest
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
-from piccolo.walk.frames import (
-    COPY_LOG_ODDS,
-    OTHER_LOG_ODDS,
-    Frame,
-    Motion,
-    State,
-    check_times,
-    state_centers,
-)
+from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
+from piccolo.walk.beliefs import believe
+from piccolo.walk.frames import Frame, State
+from piccolo.walk.motion import JUMP_LOG, Motion, carry, check_times
 from piccolo.walk.path import (
-    LEAST_TOLD,
-    TELLING_LOG,
-    UNLISTED,
+    COPY_LOG_ODDS,
+    MOST_EXPECTED,
     build_lattice,
     emissions,
-    fraction_moved,
-    log_entering,
-    log_leaving,
+    is_moved,
     log_transition,
+    motion_between,
 )
 
 MOTION = Motion(max_speed=1.0)
 
 
 class Open:
+    """Space without walls, of which every place within reach is a share."""
+
     def __init__(self, share=0.01):
         self.share = share
 
@@ -41,154 +38,173 @@ class Open:
         return self.share
 
 
-def _frame(time, *states, how="alone"):
-    """A frame with poses at (x, y, z), each with log odds."""
-    return Frame(float(time), [State(Pose(np.eye(3), np.array(p, float)), o, 0.5) for p, o in states], how)
+def _pose(*center, yaw=0.0):
+    return Pose(yaw_rotation(yaw), np.array(center, float))
 
 
-def _followed(time, *states):
-    """A frame whose poses were followed from others: the scan was not searched."""
-    return _frame(time, *states, how="tracked")
+def _key(time, *states, departs=0):
+    """A key frame with poses at (x, y, z), each with log odds."""
+    frame = Frame(time, [State(_pose(*center), odds, 0.5) for center, odds in states], "alone", is_key=True)
+    frame.departed = frame.states[departs].pose if frame.states else None
+    return frame
 
 
-def _ways(frames):
-    """All ways there are: of each frame a state, None where it is passed over, or UNLISTED.
-
-    What is unlisted goes on until a state, and begins where states are left, at a frame that has some.
-    """
-    for way in itertools.product(*([None, UNLISTED, *range(len(f.states))] for f in frames)):
-        at = UNLISTED
-        for f, j in zip(frames, way, strict=True):
-            if (j is None and at == UNLISTED) or (j == UNLISTED and at != UNLISTED and not f.states):
-                break
-            at = at if j is None else j
-        else:
-            yield way
+def _followed(time, key, center, odds=5.0):
+    """A frame that was tracked from a key frame."""
+    pose = _pose(*center)
+    return Frame(time, [State(pose, odds, 0.5)], "tracked", key=key, arrived=pose)
 
 
-class Logs:
-    """What a way through frames is made of, from their states."""
-
-    def __init__(self, frames, expected):
-        self.frames, self.expected, self.emitted = frames, expected, emissions(frames)
-
-    def steps(self, m, k):
-        """(S of m, S of k)."""
-        ends, seconds = state_centers(self.frames[k].states), self.frames[k].time - self.frames[m].time
-        gaps = np.linalg.norm(state_centers(self.frames[m].states)[:, None] - ends, axis=2)
-        return log_transition(gaps, seconds, MOTION, self.expected)
-
-    def unlisted(self, k):
-        if len(self.emitted[k]) == 0:
-            return 0.0
-        telling = [m for m in range(k) if self.frames[m].is_telling]
-        share = float(self.frames[k].is_telling)
-        share *= (
-            max(fraction_moved(self.frames[telling[-1]], self.frames[k]), LEAST_TOLD)
-            if telling and share
-            else 1.0
-        )
-        gained = max([0.0, *(self.steps(m, k).max() for m in range(k) if len(self.emitted[m]))])
-        return max(self.emitted[k].max() + gained - share * (TELLING_LOG + gained), 0.0)
-
-    def of(self, way):
-        log, before = 0.0, None
-        for k, j in ((k, j) for k, j in enumerate(way) if j is not None):
-            log += self.unlisted(k) if j == UNLISTED else self.emitted[k][j]
+def _naive(frames, share):
+    """Probabilities of all frames' states, and the likeliest way, by going every way there is."""
+    emitted = [emissions(frame) for frame in frames]
+    ways = {}
+    for way in itertools.product(*([None, *range(len(frame.states))] for frame in frames)):
+        log = 0.0
+        before = None
+        for k, j in enumerate(way):
+            if j is None:
+                continue
+            log += emitted[k][0][j]
             if before is not None:
                 m, i = before
-                steps = self.steps(m, k)
-                log += log_leaving(steps, self.frames[k])[i] if j == UNLISTED else steps[i, j]
-            elif j != UNLISTED:
-                log += log_entering(self.frames[k])
-            before = None if j == UNLISTED else (k, j)
-        return log
-
-
-def _naive(frames, expected):
-    """Probabilities of all frames' states, and the likeliest way, by going every way there is."""
-    logs = Logs(frames, expected)
-    ways = {way: logs.of(way) for way in _ways(frames)}
-    weights = [np.zeros(len(f.states)) for f in frames]
+                gap = np.linalg.norm(
+                    frames[k].states[j].pose.center_world - frames[m].states[i].pose.center_world
+                )
+                expected = min(-math.log(share), MOST_EXPECTED + emitted[k][1])
+                log += float(
+                    log_transition(np.array([gap]), frames[k].time - frames[m].time, MOTION, expected)[0]
+                )
+            before = k, j
+        ways[way] = log
+    total = sum(math.exp(log) for log in ways.values())
+    found = [np.zeros(len(frame.states)) for frame in frames]
     for way, log in ways.items():
         for k, j in enumerate(way):
-            if j not in (None, UNLISTED):
-                weights[k][j] += np.exp(log)
-    total = sum(np.exp(list(ways.values())))
-    best = max(ways, key=lambda way: ways[way])
-    return [w / total for w in weights], [None if j == UNLISTED else j for j in best]
+            if j is not None:
+                found[k][j] += math.exp(log) / total
+    return found, list(max(ways, key=ways.__getitem__))
 
 
 @pytest.mark.parametrize("seed", range(12))
 def test_probabilities_and_way_are_those_of_all_ways_there_are(seed):
     rng = np.random.default_rng(seed)
+    share = math.exp(-seed / 4)
     frames = []
-    for k in range(5):
-        states = [(rng.uniform(0.0, 4.0, 3), float(rng.normal(1.5, 2.0))) for _ in range(rng.integers(0, 4))]
-        how = rng.choice(["alone", "tracked"])
-        frames.append(_frame(k + 0.3 * rng.random(), *states, how=how))
-    lattice = build_lattice(frames, Open(np.exp(-seed / 4)), MOTION)
-    path, (probabilities, chosen) = lattice.smooth(), _naive(frames, seed / 4)
+    for k in range(4):
+        num = rng.integers(1, 4)
+        states = [(rng.uniform(0.0, 4.0, 3), float(rng.normal(0.5, 3.0))) for _ in range(num)]
+        frames.append(_key(k + 0.3 * rng.random(), *states))
+    lattice = build_lattice(frames, Open(share), MOTION)
+    path = lattice.smooth()
+    probabilities, chosen = _naive(frames, share)
     for found, wanted in zip(path.probabilities, probabilities, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
     assert path.chosen == chosen
-    if frames[-1].states:
-        np.testing.assert_allclose(lattice.filter_last(), probabilities[-1], rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(lattice.filter_last(), probabilities[-1], rtol=1e-9, atol=1e-12)
 
 
-COPIES = [((9.0 * i, 0, 50), 4.0) for i in range(5)]  # with one more a list that does not end there
+def test_places_that_look_alike_share_the_evidence():
+    copies = [((9.0 * i, 0, 0), 4.0 - 0.9 * COPY_LOG_ODDS * (i > 0)) for i in range(5)]
+    emitted, log_alike = emissions(_key(0, *copies, ((99, 0, 0), -8.0)))
+    np.testing.assert_allclose(emitted[:5], 4.0 - math.log(5.0), atol=1e-3)
+    assert log_alike == pytest.approx(math.log(5.0), abs=1e-3)
+    assert emitted[5] == pytest.approx(4.0 - 12.0 + COPY_LOG_ODDS - log_alike)
 
 
-def test_what_is_only_followed_tells_nothing_of_places_that_are_not_listed():
-    """A place as good as five others, and perhaps as more: only where there is one alone, all are sure."""
-    followed = [_frame(0, ((0, 0, 0), 4.0), *COPIES), *(_followed(k, ((k, 0, 0), 6.0)) for k in range(1, 20))]
-    unknown = build_lattice(followed, Open(), MOTION).smooth()
-    assert max(p[0] for p in unknown.probabilities) < 0.6
-    searched = [*followed, *(_frame(k, ((k, 0, 0), 6.0)) for k in range(20, 23))]
-    told = build_lattice(searched, Open(), MOTION).smooth()
-    assert told.chosen == [0] * 23
-    assert min(p[0] for p in told.probabilities) > 0.9
-
-
-def test_what_copies_say_of_each_other_does_not_add_up():
+def test_twin_rooms_are_told_apart_by_the_place_after_them_and_before_it_are_not():
     """Twenty frames in twin rooms, each a little for the wrong one; then a place that there is once."""
-    twins = [
-        _frame(k, ((0.1 * k, 0, 0), 3.0), ((0.1 * k + 20, 0, 0), 3.0 + 0.9 * COPY_LOG_ODDS))
-        for k in range(20)
-    ]
+    worse = 3.0 - 0.9 * COPY_LOG_ODDS
+    twins = [_key(2.0 * k, ((0.1 * k, 0, 0), worse), ((0.1 * k + 20, 0, 0), 3.0)) for k in range(20)]
     alone = build_lattice(twins, Open(), MOTION).smooth()
     np.testing.assert_allclose([p[0] / p.sum() for p in alone.probabilities], 0.5, atol=0.01)
-    told = build_lattice([*twins, _frame(20, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
+    told = build_lattice([*twins, _key(41.0, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
     assert told.chosen == [0] * 21
     assert min(p[0] for p in told.probabilities) > 0.95
 
 
-def test_what_tells_copies_apart_counts_as_far_as_the_camera_has_moved():
-    def behind(step, gap):
-        frames = [_frame(k, ((step * k, 0, 0), 6.0), ((step * k + 20, 0, 0), 6.0 - gap)) for k in range(2)]
-        return [odds[0] - odds[1] for odds in emissions(frames)]
+def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
+    """Two corridors alike; from the end of each a copy of a room is in reach, 90 degrees apart."""
+    before = _key(0, ((0, 0, 0), 5.0), ((40, 0, 0), 5.0))
+    after = _key(9, ((6, 0, 0), 5.0), ((40, 6, 0), 5.0))
+    unknown = build_lattice([before, after], Open(), MOTION).smooth()
+    np.testing.assert_allclose(unknown.probabilities[0], 0.5, atol=0.01)
+    after.key, after.arrived = 0, _pose(6, 0, 0)
+    tracked = build_lattice([before, after], Open(), MOTION).smooth()
+    assert tracked.probabilities[0][0] > 0.99
+    after.key = after.arrived = None
+    before.odometry, after.odometry = _pose(100, 0, 0, yaw=1.0), _pose(100, 0, 0, yaw=1.0)
+    turn = yaw_rotation(1.0).T
+    after.odometry = Pose(after.odometry.R_cam_from_world, turn @ np.array([6.0, 0, 0]) + [100.0, 0, 0])
+    measured = build_lattice([before, after], Open(), MOTION).smooth()
+    assert measured.probabilities[0][0] > 0.99
 
-    middle = (COPY_LOG_ODDS + OTHER_LOG_ODDS) / 2.0
-    first, at_once = behind(0.0, middle)
-    assert 0.0 < at_once < first < middle
-    assert behind(1.0, middle)[1] == pytest.approx((at_once + first) / 2.0)
-    assert behind(4.0, middle) == pytest.approx([first, first])
-    assert behind(4.0, COPY_LOG_ODDS) == pytest.approx([0.0, 0.0])
-    assert behind(0.0, OTHER_LOG_ODDS) == pytest.approx([OTHER_LOG_ODDS, OTHER_LOG_ODDS])
+
+def test_a_motion_is_carried_to_where_the_camera_is():
+    begin, end = _pose(1, 2, 3, yaw=0.4), Pose(exp_so3(np.array([0.1, 0.2, 1.0])), np.array([2.0, 2.5, 3.0]))
+    to = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([-5.0, 0.0, 1.0]))
+    carried = carry(end, begin, to)
+    motion = np.linalg.solve(begin.T_world_from_cam, end.T_world_from_cam)
+    np.testing.assert_allclose(to.T_world_from_cam @ motion, carried.T_world_from_cam, atol=1e-12)
+    back = carry(to, carried, end)
+    assert pose_errors(back, begin)[0] == pytest.approx(0.0, abs=1e-12)
+
+
+def test_known_motions_have_the_error_of_their_length():
+    frames = [_key(0, ((0, 0, 0), 5.0)), _key(1, ((30, 0, 0), 5.0))]
+    assert motion_between(frames, 0, 1) is None
+    frames[0].odometry, frames[1].odometry = _pose(0, 0, 0), _pose(29, 0, 0)
+    moved = motion_between(frames, 0, 1)
+    assert is_moved(moved, frames[0].states, frames[1].states).tolist() == [[True]]
+    frames[1].odometry = _pose(27, 0, 0)
+    assert not is_moved(motion_between(frames, 0, 1), frames[0].states, frames[1].states).any()
+    frames[1].odometry = _pose(30, 0, 0, yaw=0.5)
+    assert not is_moved(motion_between(frames, 0, 1), frames[0].states, frames[1].states).any()
 
 
 def test_a_jump_has_a_price_and_is_reported():
     frames = [
-        *(_frame(k, ((k, 0, 0), 5.0)) for k in range(4)),
-        *(_frame(k, ((k + 50, 0, 0), 5.0)) for k in range(4, 8)),
+        *(_key(k, ((k, 0, 0), 5.0)) for k in range(4)),
+        *(_key(k, ((k + 50, 0, 0), 5.0)) for k in range(4, 8)),
     ]
     path = build_lattice(frames, Open(), MOTION).smooth()
     assert path.chosen == [0] * 8
     assert path.gaps == [None] * 4 + [(51.0, 1.0)] + [None] * 3
-    lonely = [*frames[:4], _frame(4, ((54, 0, 0), 2.0)), _frame(5, ((5, 0, 0), 5.0))]
+    lonely = [*frames[:4], _key(4, ((54, 0, 0), 2.0)), _key(5, ((5, 0, 0), 5.0))]
     path = build_lattice(lonely, Open(), MOTION).smooth()
     assert path.chosen == [0, 0, 0, 0, None, 0]
     assert path.probabilities[4][0] < 0.01
+    assert log_transition(np.array([50.0]), 1.0, MOTION)[0] == JUMP_LOG
+
+
+def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there():
+    frames = [_key(0, ((0, 0, 0), 5.0), ((20, 0, 0), 5.0)), _followed(1, 0, (1, 0, 0)), Frame(2.0)]
+    here = build_lattice([*frames, _key(3, ((2, 0, 0), 6.0))], Open(), MOTION)
+    belief = believe(here.frames, here.smooth(), 1)
+    assert belief.is_sure
+    assert belief.states[0] is frames[1].states[0]
+    there = build_lattice([*frames, _key(3, ((22, 0, 0), 6.0))], Open(), MOTION)
+    belief = believe(there.frames, there.smooth(), 1)
+    assert not belief.is_sure
+    np.testing.assert_allclose(belief.expected.center_world, [21.0, 0.0, 0.0])
+    assert not believe(there.frames, there.smooth(), 2).is_sure
+
+
+def test_a_tracked_frame_before_a_contradiction_is_less_sure():
+    frames = [_key(0, ((0, 0, 0), 8.0)), _followed(1, 0, (1, 0, 0)), _key(2, ((70, 0, 0), 5.0))]
+    frames[2].key, frames[2].arrived = 0, _pose(2, 0, 0)
+    lattice = build_lattice(frames, Open(), MOTION)
+    path = lattice.smooth()
+    assert path.chosen == [0, None, None]
+    assert believe(frames, path, 1).probabilities[0] < 0.5 < believe(frames, path, 0).probabilities[0]
+
+
+def test_frames_come_back_from_json():
+    frame = _key(3.5, ((1, 2, 3), 4.0))
+    frame.arrived, frame.key, frame.odometry = _pose(1, 1, 1), 2, _pose(5, 5, 5, yaw=0.3)
+    again = Frame.from_json(frame.to_json(), None)
+    assert again.to_json() == frame.to_json()
+    assert again.odometry.R_cam_from_world.tobytes() == frame.odometry.R_cam_from_world.tobytes()
 
 
 def test_refusals():

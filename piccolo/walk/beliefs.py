@@ -1,4 +1,4 @@
-"""What a walk says of a frame: its poses, and how likely each is."""
+"""The poses that a frame of a walk may have by the path through all frames, and their probabilities."""
 
 import math
 from collections.abc import Sequence

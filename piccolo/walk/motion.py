@@ -1,4 +1,4 @@
-"""How a camera is carried: what a walk knows before it has seen a photo."""
+"""The motion of a carried camera: its speed, its smoothness, and the odds of a jump."""
 
 import math
 from collections.abc import Sequence

@@ -171,7 +171,8 @@ class Lattice:
             return np.where(is_moved(moved, starts, ends), most_expected, self.motion.jump_log)
         last, centers = self._last_tracked(m, k)
         seconds = self.frames[k].time - self.frames[last].time
-        limit = self.motion.max_speed * seconds + 5.0 * REACH_SLACK
+        least_jump = math.sqrt(2.0 * (most_expected - self.motion.jump_log))  # [deviations] beyond reach
+        limit = self.motion.max_speed * seconds + REACH_SLACK * (1.0 + least_jump)
         distances = np.array([self.space.distance(start, state_centers(ends), limit) for start in centers])
         fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
         expected = np.minimum(-np.log(fractions), most_expected)
