@@ -28,7 +28,7 @@ def test_nobody_walks_through_a_wall(two_rooms):
         for r in world.rooms
     )
     space, start = FreeSpace(scan_map, Workers(2)), first[np.argmax(first[:, 1])]
-    same = space.distance(start, first, 20.0)
+    same = space.distances(start[None], first, 20.0)[0]
     assert len(first) > 20
     assert np.isfinite(same).mean() > 0.95
     straight = np.linalg.norm(first - start, axis=1)
@@ -36,13 +36,22 @@ def test_nobody_walks_through_a_wall(two_rooms):
     assert np.median(same[straight > 1.0] / straight[straight > 1.0]) < 1.4
     assert len(second) > 20
     assert np.linalg.norm(second - start, axis=1).min() < 2.0
-    across = space.distance(start, second, 20.0)  # by the windows at best
+    across = space.distances(start[None], second, 20.0)[0]  # by the windows at best
     assert across.min() > np.linalg.norm(second - start, axis=1).min() + 1.5
-    assert np.isinf(space.distance(start, second, 2.3)).all()
+    assert np.isinf(space.distances(start[None], second, 2.3)).all()
 
 
 def test_far_places_are_beyond_the_limit(two_rooms):
     centers = two_rooms[1].centers
-    distance = FreeSpace(two_rooms[1], Workers(1)).distance(centers[0], centers, 1.0)
+    space = FreeSpace(two_rooms[1], Workers(1))
+    distance = space.distances(centers[:1], centers, 1.0)[0]
     assert np.isinf(distance[np.linalg.norm(centers - centers[0], axis=1) > 1.0]).all()
     assert distance[0] == 0.0
+
+
+def test_distances_are_the_same_one_by_one_and_together(two_rooms):
+    centers = two_rooms[1].centers
+    space = FreeSpace(two_rooms[1], Workers(1))
+    together = space.distances(centers[:9], centers[::7], 4.0)
+    alone = [space.distances(start[None], centers[::7], 4.0)[0] for start in centers[:9]]
+    assert together.tobytes() == np.array(alone).tobytes()

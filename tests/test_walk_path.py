@@ -30,8 +30,8 @@ class Open:
     def __init__(self, share=0.01):
         self.share = share
 
-    def distance(self, start, ends, limit):
-        straight = np.linalg.norm(ends - start, axis=1)
+    def distances(self, starts, ends, limit):
+        straight = np.linalg.norm(ends[None] - starts[:, None], axis=2)
         return np.where(straight > limit, np.inf, straight)
 
     def fraction_within(self, center, radius):

@@ -1,7 +1,7 @@
 """Walking distances from place to place, through free space and never through a wall."""
 
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,21 +20,12 @@ DETOUR = 1.1  # paths along a grid are so much longer
 ENDS = 0.6  # [m] to its nodes
 
 
-class _Reached(NamedTuple):
-    """Nodes within a limit [m] of a node, in ascending order, and the lengths of the paths to them."""
-
-    limit: float
-    nodes: NDArray[np.int64]
-    lengths: NDArray[np.float64]
-
-
 class FreeSpace:
     """A map's candidates as a graph, with edges between neighbours that see each other."""
 
     def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
         self.scan_map = scan_map
         self.workers = workers
-        self._known: dict[int, _Reached] = {}
 
     @cached_property
     def _tree(self) -> Any:
@@ -56,17 +47,24 @@ class FreeSpace:
         is_free = seen[: len(pairs)] + seen[len(pairs) :] > 0
         first, second = pairs[is_free].T
         length = np.linalg.norm(m.centers[second] - m.centers[first], axis=1)
-        return coo_matrix((length, (first, second)), (len(m.centers),) * 2).tocsr()
+        ends = np.concatenate([first, second]), np.concatenate([second, first])
+        return coo_matrix((np.tile(length, 2), ends), (len(m.centers),) * 2).tocsr()
 
-    def distance(self, start: Array, ends: Array, limit: float) -> Array:
-        """Return distances (N,) [m] from a place (3,) to others (N, 3) in the map; inf beyond a limit."""
-        straight = np.linalg.norm(ends - start, axis=1)
+    def distances(self, starts: Array, ends: Array, limit: float) -> Array:
+        """Return distances (S, N) [m] from places (S, 3) to others (N, 3) in the map; inf beyond a limit."""
+        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
+
+        straight = np.linalg.norm(ends[None] - starts[:, None], axis=2)
         walked = straight.copy()
         far = (straight > NEAR) & (straight <= limit)
-        if far.any():
-            _, nodes = self._tree.query(np.concatenate([start[None], ends[far]]))
-            along = self._path_lengths(int(nodes[0]), nodes[1:], DETOUR * (limit + 2.0 * ENDS))
-            walked[far] = np.maximum(straight[far], along / DETOUR - ENDS)
+        rows = np.flatnonzero(far.any(axis=1))
+        if len(rows):
+            _, end = self._tree.query(ends)
+            nodes, node = np.unique(self._tree.query(starts[rows])[1], return_inverse=True)
+            along = dijkstra(self._graph, indices=nodes, limit=DETOUR * (limit + 2.0 * ENDS))[node][:, end]
+            walked[rows] = np.where(
+                far[rows], np.maximum(straight[rows], along / DETOUR - ENDS), walked[rows]
+            )
         walked[walked > limit] = np.inf
         return np.asarray(walked)
 
@@ -74,18 +72,6 @@ class FreeSpace:
         """Return the fraction of candidates within a radius [m] of a place (3,), counting at least one."""
         near = self._tree.query_ball_point(center, radius, return_length=True)
         return max(int(near), 1) / max(len(self.scan_map.centers), 1)
-
-    def _path_lengths(self, node: int, ends: NDArray[np.int64], limit: float) -> NDArray[np.float64]:
-        """Return lengths (N,) of the shortest paths from a node to others (N,); inf beyond a limit [m]."""
-        from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
-
-        known = self._known.get(node)
-        if known is None or known.limit < limit:
-            lengths = np.asarray(dijkstra(self._graph, directed=False, indices=node, limit=limit))
-            near = np.flatnonzero(np.isfinite(lengths))
-            self._known[node] = known = _Reached(limit, near, lengths[near])
-        place = np.minimum(np.searchsorted(known.nodes, ends), len(known.nodes) - 1)
-        return np.asarray(np.where(known.nodes[place] == ends, known.lengths[place], np.inf))
 
 
 def look_past(

@@ -173,7 +173,7 @@ class Lattice:
         seconds = self.frames[k].time - self.frames[last].time
         least_jump = math.sqrt(2.0 * (most_expected - self.motion.jump_log))  # [deviations] beyond reach
         limit = self.motion.max_speed * seconds + REACH_SLACK * (1.0 + least_jump)
-        distances = np.array([self.space.distance(start, state_centers(ends), limit) for start in centers])
+        distances = self.space.distances(centers, state_centers(ends), limit)
         fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
         expected = np.minimum(-np.log(fractions), most_expected)
         return log_transition(distances, seconds, self.motion, expected)

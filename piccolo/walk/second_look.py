@@ -27,7 +27,6 @@ from .tracker import (
     refine_state,
 )
 
-MAX_SWEEPS = 4
 LEAST_LIKELY = 0.1  # probability of a place that is refined
 FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
 LEAST_STEP = 0.5  # [m] several photos of one place are no steps
@@ -47,10 +46,7 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
     num = len(tracker.frames)
     tracker.motion = estimate_motion(tracker)
     path = path_of(tracker)
-    for _ in range(MAX_SWEEPS):
-        rough = [k for k in range(num) if _list_rough(tracker, path, k)]
-        if not rough:
-            break
+    while rough := [k for k in range(num) if _list_rough(tracker, path, k)]:
         for k in show(iter(rough), len(rough), "refine"):
             _refine(tracker, path, k, read)
         path = path_of(tracker)
@@ -90,13 +86,12 @@ def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
 
 def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
     """Refine the likely places of a key frame."""
-    panorama = read(k)
-    if panorama is None:
-        return
-    query = tracker.prepare(panorama)
     frame = tracker.frames[k]
+    panorama = read(k)
+    query = None if panorama is None else tracker.prepare(panorama)
     for rough in [frame.states[j] for j in _list_rough(tracker, path, k)]:
-        frame.states = refine_state(query, frame.states, rough)
+        others = [state for state in frame.states if state is not rough]
+        frame.states = others if query is None else refine_state(query, frame.states, rough)
 
 
 def _find_lost(tracker: Tracker, path: Path, k: int, step: int, read: Read) -> None:
