@@ -199,6 +199,15 @@ def test_a_tracked_frame_before_a_contradiction_is_less_sure():
     assert believe(frames, path, 1).probabilities[0] < 0.5 < believe(frames, path, 0).probabilities[0]
 
 
+def test_nobody_turns_round_at_once():
+    """The same place seen the other way round is out of reach in half a second, not in two."""
+    for seconds, is_reached in ((0.5, False), (2.0, True)):
+        frames = [_key(0, ((0, 0, 0), 5.0)), _key(seconds, ((0, 0, 0), 5.0))]
+        frames[1].states = [State(_pose(0, 0, 0, yaw=math.pi), 5.0, 0.5)]
+        path = build_lattice(frames, Open(), MOTION).smooth()
+        assert (path.chosen == [0, 0] and path.gaps == [None, None]) == is_reached
+
+
 def test_frames_come_back_from_json():
     frame = _key(3.5, ((1, 2, 3), 4.0))
     frame.arrived, frame.key, frame.odometry = _pose(1, 1, 1), 2, _pose(5, 5, 5, yaw=0.3)

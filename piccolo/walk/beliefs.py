@@ -24,7 +24,7 @@ class Belief(NamedTuple):
     @property
     def is_sure(self) -> bool:
         """True if the first pose more likely is right than not."""
-        return len(self.states) > 0 and bool(self.probabilities[0] > EVEN)
+        return len(self.states) > 0 and self.states[0].is_refined and bool(self.probabilities[0] > EVEN)
 
 
 NOTHING = Belief([], np.empty(0))

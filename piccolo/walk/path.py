@@ -23,6 +23,7 @@ from .free_space import FreeSpace
 from .motion import Motion, carry
 
 COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
+MAX_TURN = math.pi  # [rad/s] of a person with a camera
 REACH_SLACK = 0.3  # [m] beyond what a person walks
 MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 NEGLIGIBLE = 20.0  # [log] below the best
@@ -105,10 +106,15 @@ def is_moved(
     begin, end, error = moved
     carried = [carry(end, begin, state.pose) for state in starts]
     centers = np.array([pose.center_world for pose in carried])
-    turns = np.array([pose.R_cam_from_world for pose in carried]).reshape(len(carried), 9)
-    R_ends = np.array([state.pose.R_cam_from_world for state in ends]).reshape(len(ends), 9)
     distances = np.linalg.norm(centers[:, None] - state_centers(ends)[None], axis=2)
-    return np.asarray((distances < error) & (turns @ R_ends.T > 1.0 + 2.0 * math.cos(MIN_ANGLE)))
+    return np.asarray((distances < error) & is_turned(carried, ends, MIN_ANGLE))
+
+
+def is_turned(starts: Sequence[Pose], ends: Sequence[State], angle: float) -> NDArray[np.bool_]:
+    """Return True (S, N) for the pairs of poses that are turned against each other by less than an angle."""
+    R_starts = np.array([pose.R_cam_from_world for pose in starts]).reshape(len(starts), 9)
+    R_ends = np.array([state.pose.R_cam_from_world for state in ends]).reshape(len(ends), 9)
+    return np.asarray(R_starts @ R_ends.T >= 1.0 + 2.0 * math.cos(min(angle, math.pi)) - 1e-9)
 
 
 class Lattice:
@@ -169,24 +175,27 @@ class Lattice:
         starts, ends = self.frames[m].states, self.frames[k].states
         if moved := motion_between(self.frames, m, k):
             return np.where(is_moved(moved, starts, ends), most_expected, self.motion.jump_log)
-        last, centers = self._last_tracked(m, k)
+        last, begins = self._last_tracked(m, k)
+        centers = np.array([pose.center_world for pose in begins])
         seconds = self.frames[k].time - self.frames[last].time
         least_jump = math.sqrt(2.0 * (most_expected - self.motion.jump_log))  # [deviations] beyond reach
         limit = self.motion.max_speed * seconds + REACH_SLACK * (1.0 + least_jump)
         distances = self.space.distances(centers, state_centers(ends), limit)
         fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
         expected = np.minimum(-np.log(fractions), most_expected)
+        if self.motion.is_timed:
+            distances[~is_turned(begins, ends, MAX_TURN * seconds)] = np.inf
         return log_transition(distances, seconds, self.motion, expected)
 
-    def _last_tracked(self, m: int, k: int) -> tuple[int, Array]:
-        """Return the last frame before `k` that was tracked from key frame `m`, and its positions (S, 3)."""
+    def _last_tracked(self, m: int, k: int) -> tuple[int, list[Pose]]:
+        """Return the last frame before `k` that was tracked from key frame `m`, and its poses."""
         states = self.frames[m].states
         departed = self.frames[m].departed
         for n in range(k - 1, m, -1):
             arrived = self.frames[n].arrived
             if self.frames[n].key == m and arrived is not None and departed is not None:
-                return n, np.array([carry(arrived, departed, s.pose).center_world for s in states])
-        return m, state_centers(states)
+                return n, [carry(arrived, departed, state.pose) for state in states]
+        return m, [state.pose for state in states]
 
     def filter_last(self) -> Array:
         """Return the probability (S,) of each state of the last key frame, given all frames so far."""

@@ -45,16 +45,22 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
     """
     num = len(tracker.frames)
     tracker.motion = estimate_motion(tracker)
-    path = path_of(tracker)
-    while rough := [k for k in range(num) if _list_rough(tracker, path, k)]:
-        for k in show(iter(rough), len(rough), "refine"):
-            _refine(tracker, path, k, read)
-        path = path_of(tracker)
+    path = _refine_likely(tracker, read, show)
     for step in (1, -1):
         for k in show(iter(range(num)[::step]), num, "look for lost frames"):
             _find_lost(tracker, path, k, step, read)
-    path = path_of(tracker)
+    path = _refine_likely(tracker, read, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
+
+
+def _refine_likely(tracker: Tracker, read: Read, show: Progress) -> Path:
+    """Refine the likely places of all key frames, until the path needs no others; return it."""
+    path = path_of(tracker)
+    while rough := [k for k in range(len(tracker.frames)) if _list_rough(tracker, path, k)]:
+        for k in show(iter(rough), len(rough), "refine"):
+            _refine(tracker, path, k, read)
+        path = path_of(tracker)
+    return path
 
 
 def path_of(tracker: Tracker) -> Path:
