@@ -2,7 +2,7 @@
 
 import inspect
 import types
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from os import PathLike
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -107,3 +107,9 @@ def plain(value: Any, kind: Any) -> Any:
     if isinstance(value, list | np.ndarray | tuple) and any(get_origin(k) is tuple for k in kinds):
         return tuple(item.item() if isinstance(item, np.generic) else item for item in value)
     return value
+
+
+def check_one_each(name: str, values: Sized | None, count: int, what: str) -> None:
+    """Refuse an argument that is not a value of each of several photos."""
+    if values is not None and len(values) != count:
+        raise InputError(f"`{name}`: found {len(values)} of {count} {what}s, wanted one of each {what}")

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import check_arguments
+from .arguments import check_arguments, check_one_each
 from .camera.files import open_calibration, read_rig
 from .cloud.soa import PackedPoints
 from .errors import InputError
@@ -212,9 +212,7 @@ class Scan:
         self._opened.check_options(read_options, settings)
         if relative_poses is not None:
             photos = list(panoramas)
-            if len(photos) != len(relative_poses):
-                found = f"{len(relative_poses)} of {len(photos)} photos"
-                raise InputError(f"`relative_poses`: found {found}, wanted one of each photo")
+            check_one_each("relative_poses", relative_poses, len(photos), "photo")
             bundle = self._opened.localize_bundle(photos, relative_poses, read_options, settings, is_masked)
             return iter(bundle)
 
@@ -310,7 +308,7 @@ class Scan:
         times
             Time of each frame [s], increasing. Without times only the order counts.
         odometry
-            Pose of the camera at each frame in the frame of an odometry [m]; None of a frame without one.
+            Pose of the camera at each frame in any common frame [m], or None.
         max_speed, max_acceleration
             As in `track`.
         mask
@@ -335,17 +333,16 @@ class Scan:
         ['localized', 'localized']
         """
         given = check_arguments(Scan.localize_walk, locals())
-        given.pop("frames")
-        for name in ("times", "odometry"):
+        for name in ("frames", "times", "odometry"):
             given.pop(name, None)
         walk = self._track(given)
         taken = list(frames)
-        for name, values in (("times", times), ("odometry", odometry)):
-            if values is not None and len(values) != len(taken):
-                raise InputError(f"`{name}`: found {len(values)} of {len(taken)} frames, wanted one of each")
-        for k, frame in enumerate(taken):
-            time = None if times is None else times[k]
-            walk.add(frame, time, odometry=None if odometry is None else odometry[k])
+        check_one_each("times", times, len(taken), "frame")
+        check_one_each("odometry", odometry, len(taken), "frame")
+        nothing = [None] * len(taken)
+        whens = nothing if times is None else times
+        for frame, time, pose in zip(taken, whens, nothing if odometry is None else odometry, strict=True):
+            walk.add(frame, time, odometry=pose)
         return walk.finish()
 
     def occlusion_mask(  # noqa: PLR0913  options by name
@@ -378,8 +375,8 @@ class Scan:
     def _track(self, given: dict[str, Any]) -> Walk:
         speed = given.pop("max_speed", None)
         acceleration = given.pop("max_acceleration")
-        read_options, settings, _ = self._parse(given)
         motion = Motion(MAX_SPEED if speed is None else speed, acceleration, is_guess=speed is None)
+        read_options, settings, _ = self._parse(given)
         return self._opened.walk(read_options, settings, motion)
 
     def _parse(self, given: Mapping[str, Any]) -> tuple[ReadOptions, Settings, Mask | None]:

@@ -110,7 +110,7 @@ def test_a_walk_keeps_within_a_prior(scan, building):
 
 def test_times_are_of_all_frames(scan, building):
     frames = [q.image for q in building[1][:2]]
-    with pytest.raises(InputError, match=r"^`times`: found 1 of 2 frames, wanted one of each$"):
+    with pytest.raises(InputError, match=r"^`times`: found 1 of 2 frames, wanted one of each frame$"):
         scan.localize_walk(frames, [0.0])
 
 
@@ -193,7 +193,7 @@ def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_p
     results = scan.localize_walk(frames, odometry=odometry, gravity="known")
     _assert_right(results, some)
     assert [r.walk.how for r in results] == ["alone", "tracked", "tracked"]
-    with pytest.raises(InputError, match=r"^`odometry`: found 1 of 3 frames, wanted one of each$"):
+    with pytest.raises(InputError, match=r"^`odometry`: found 1 of 3 frames, wanted one of each frame$"):
         scan.localize_walk(frames, odometry=odometry[:1])
     lines = tum_lines([(f"{k}", pose) for k, pose in enumerate(odometry)], "optical")
     (tmp_path / "odometry.tum").write_text("\n".join(lines))

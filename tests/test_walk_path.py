@@ -132,7 +132,8 @@ def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
     after.key, after.arrived = 0, _pose(6, 0, 0)
     tracked = build_lattice([before, after], Open(), MOTION).smooth()
     assert tracked.probabilities[0][0] > 0.99
-    after.key = after.arrived = None
+    after.key = None
+    after.arrived = None
     before.odometry, after.odometry = _pose(100, 0, 0, yaw=1.0), _pose(100, 0, 0, yaw=1.0)
     turn = yaw_rotation(1.0).T
     after.odometry = Pose(after.odometry.R_cam_from_world, turn @ np.array([6.0, 0, 0]) + [100.0, 0, 0])

@@ -120,10 +120,11 @@ class Tracker:
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_known = odometry is not None or not self.frames
             is_far = not is_known and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
-            self._follow(query, frame, not is_far)
+            if not is_far:
+                self._follow(query, frame)
             if is_far or (not frame.states and self.num_lost + 1 >= self.next_search):
                 self._search(query, panorama, frame)
-            elif frame.states and (frame.key is None or self._is_telling(frame)):
+            elif frame.states and self._is_telling(frame):
                 frame.make_key(list_key_states(query, frame.states))
         self.lattice.add(frame)
         if frame.is_key:
@@ -147,21 +148,23 @@ class Tracker:
             self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
 
     def _is_telling(self, frame: Frame) -> bool:
-        """Return True if the camera has moved so far since the last key frame that it sees another place."""
+        """Return True if the camera has moved so far since the last key frame that it sees another place.
+
+        A frame that was found near it, at one of several places, tells too.
+        """
         if frame.key is None or frame.arrived is None:
-            return False
+            return True
         move = frame.arrived.center_world - self._pose_since(frame.key).center_world
         return float(np.linalg.norm(move)) >= TELLING_DISTANCE
 
-    def _follow(self, query: Query, frame: Frame, looks_near: bool) -> None:
+    def _follow(self, query: Query, frame: Frame) -> None:
         """Descend from the pose predicted by the last ones; search near it if that fails."""
         follower = self._follower_to(frame)
         if follower is None:
             return
         tracked = follow(query, follower, frame.time, self.motion)
         is_there = tracked.score >= least_score(follower)
-        near = [] if is_there or not looks_near else find_near(query, follower, frame.time, self.motion)
-        found = [tracked] if is_there else near
+        found = [tracked] if is_there else find_near(query, follower, frame.time, self.motion)
         if not found or is_mirrored(query, found[0].pose):
             return
         frame.states = [make_state(query, found[0])]
@@ -196,13 +199,11 @@ class Tracker:
         return pose
 
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
-        """Search the whole scan, and keep the pose that was tracked to, too."""
+        """Search the whole scan for a frame, which is then a key frame."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         is_sure = frame.is_localized_alone
         is_wrong = not is_sure and is_mirror_image(query)
-        found = [] if is_wrong else list_states(self.scan_map, frame.alone)
-        found += frame.states
-        if found:
+        if found := [] if is_wrong else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
             frame.make_key(list_key_states(query, found, is_sure))
 
