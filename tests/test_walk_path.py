@@ -200,6 +200,16 @@ def test_a_tracked_frame_before_a_contradiction_is_less_sure():
     assert believe(frames, path, 1).probabilities[0] < 0.5 < believe(frames, path, 0).probabilities[0]
 
 
+def test_live_probabilities_are_those_of_the_last_key_frame_that_is_tracked_from():
+    frames = [_key(0, ((0, 0, 0), 5.0)), _key(1, ((70, 0, 0), -1.0), ((90, 0, 0), -2.0))]
+    frames[1].departed = None
+    lattice = build_lattice([*frames, _followed(2, 0, (2, 0, 0))], Open(), MOTION)
+    path = lattice.filter_path()
+    assert path.chosen == [0, 0, None]
+    assert path.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.exp(-5.0)))
+    assert believe(lattice.frames, path, 2).is_sure
+
+
 def test_nobody_turns_round_at_once():
     """The same place seen the other way round is out of reach in half a second, not in two."""
     for seconds, is_reached in ((0.5, False), (2.0, True)):

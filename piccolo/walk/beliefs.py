@@ -48,7 +48,7 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     """Return the poses to which a frame was tracked, from each place where its key frame may be."""
     frame = frames[k]
     key = frame.key
-    if key is None or frame.arrived is None or path.chosen[key] is None:
+    if key is None or frame.arrived is None or not frames[key].is_key or path.chosen[key] is None:
         return NOTHING
     at_key = believe_key(frames[key].states, path.probabilities[key], path.chosen[key])
     own = frame.states[0]

@@ -202,14 +202,18 @@ class Lattice:
         return np.asarray(np.exp(self.columns[-1].forward - self.ended[-1])) if self.columns else np.empty(0)
 
     def filter_path(self) -> Path:
-        """Return the likeliest state of the last key frame, given all frames so far."""
+        """Return the likeliest states of the last key frames, back to one from which frames are tracked.
+
+        Their probabilities are those of the time when each was the last.
+        """
         path = empty_path(len(self.frames))
-        if self.columns:
-            probabilities = self.filter_last()
-            path.probabilities[self.columns[-1].number] = probabilities
-            # the frames after it are tracked from the first
-            is_tracked = self.frames[self.columns[-1].number].departed is not None
-            path.chosen[self.columns[-1].number] = 0 if is_tracked else int(probabilities.argmax())
+        for column, ended in zip(self.columns[::-1], self.ended[::-1], strict=False):
+            is_tracked = self.frames[column.number].departed is not None
+            probabilities = np.exp(column.forward - ended)
+            path.probabilities[column.number] = probabilities
+            path.chosen[column.number] = 0 if is_tracked else int(probabilities.argmax())
+            if is_tracked:
+                break
         return path
 
     def smooth(self) -> Path:

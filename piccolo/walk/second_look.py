@@ -1,6 +1,6 @@
 """A second look at a walk's frames, when the frames after them are known too."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,7 +11,7 @@ from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
 from ..panorama import Panorama
 from .beliefs import Belief, believe
-from .frames import Frame, State
+from .frames import Frame, State, is_same
 from .motion import MAX_STEP, Motion, carry
 from .path import Path, build_lattice
 from .places import is_mirrored
@@ -46,9 +46,11 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
     num = len(tracker.frames)
     tracker.motion = estimate_motion(tracker)
     path = _refine_likely(tracker, read, show)
-    for step in (1, -1):
+    found: set[int] = set()
+    for step in (-1, 1):
         for k in show(iter(range(num)[::step]), num, "look for lost frames"):
-            _find_lost(tracker, path, k, step, read)
+            if _find_lost(tracker, path, k, step, read, found):
+                found.add(k)
     path = _refine_likely(tracker, read, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
 
@@ -100,16 +102,26 @@ def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
         frame.states = others if query is None else refine_state(query, frame.states, rough)
 
 
-def _find_lost(tracker: Tracker, path: Path, k: int, step: int, read: Read) -> None:
-    """Track a frame that is not sure from where it is to be expected, or look for it near a sure one."""
+def _find_lost(
+    tracker: Tracker, path: Path, k: int, step: int, read: Read, found_before: Collection[int]
+) -> bool:
+    """Track a frame that is not sure from where it is to be expected, or look for it near a sure one.
+
+    Return True if it is found. It is not looked for again where the tracker has looked for it.
+    """
     frames = tracker.frames
     belief = believe(frames, path, k)
     near = range(k - step, k - step * (FARTHEST + 1), -step)
     inside = [] if belief.is_sure else [m for m in near if 0 <= m < len(frames)]
     sure = next((m for m in inside if believe(frames, path, m).is_sure), None)
-    panorama = None if sure is None else read(k)
-    if sure is None or panorama is None or not panorama.is_valid.any():
-        return
+    if sure is None:
+        return False
+    was_there = step == 1 and sure not in found_before and not frames[k].is_key
+    if was_there and belief.expected is None and _was_followed(frames, path, sure):
+        return False
+    panorama = read(k)
+    if panorama is None or not panorama.is_valid.any():
+        return False
     query = tracker.prepare(panorama)
     state = believe(frames, path, sure).states[0]
     start = belief.expected or move_on(state.pose, frames[sure], frames[k])
@@ -117,9 +129,21 @@ def _find_lost(tracker: Tracker, path: Path, k: int, step: int, read: Read) -> N
     end = follow(query, follower, frames[k].time, tracker.motion)
     is_there = end.score >= least_score(follower)
     found = [end] if is_there else find_near(query, follower, frames[k].time, tracker.motion)
-    if len(found) == 1 and not is_mirrored(query, found[0].pose):
-        _hang(frames, path, k, sure, make_state(query, found[0]))
-        frames[k].how = "tracked" if is_there else "near"
+    if len(found) != 1 or is_mirrored(query, found[0].pose):
+        return False
+    _hang(frames, path, k, sure, make_state(query, found[0]))
+    frames[k].how = "tracked" if is_there else "near"
+    return True
+
+
+def _was_followed(frames: Sequence[Frame], path: Path, k: int) -> bool:
+    """Return True if the tracker was where the path says, and went on from there."""
+    key = k if frames[k].is_key else frames[k].key
+    chosen = None if key is None else path.chosen[key]
+    if key is None or chosen is None:
+        return False
+    departed = frames[key].departed
+    return departed is not None and is_same(departed, frames[key].states[chosen].pose)
 
 
 def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> None:
