@@ -210,6 +210,26 @@ def test_live_probabilities_are_those_of_the_last_key_frame_that_is_tracked_from
     assert believe(lattice.frames, path, 2).is_sure
 
 
+def test_tracking_is_known_by_way_of_later_key_frames():
+    """The second key frame was left from another place than it was tracked to: its twin."""
+    frames = [
+        _key(0, ((0, 0, 0), 5.0)),
+        _key(1, ((1, 0, 0), 5.0), ((31, 0, 0), 5.0), departs=1),
+        _key(2, ((2, 0, 0), 5.0), ((32, 0, 0), 5.0)),
+    ]
+    frames[1].key, frames[1].arrived = 0, _pose(1, 0, 0)
+    frames[2].key, frames[2].arrived = 1, _pose(32, 0, 0)
+    begin, end, _ = motion_between(frames, 0, 2)
+    np.testing.assert_allclose(end.center_world - begin.center_world, [2.0, 0.0, 0.0])
+    lattice = build_lattice(frames, Open(), MOTION)
+    again = build_lattice(frames, Open(), MOTION, lattice)
+    for found, wanted in zip(again.smooth().probabilities, lattice.smooth().probabilities, strict=True):
+        assert found.tobytes() == wanted.tobytes()
+    frames[2].states = frames[2].states[1:]
+    changed = build_lattice(frames, Open(), MOTION, lattice).smooth()
+    assert len(changed.probabilities[2]) == 1
+
+
 def test_nobody_turns_round_at_once():
     """The same place seen the other way round is out of reach in half a second, not in two."""
     for seconds, is_reached in ((0.5, False), (2.0, True)):

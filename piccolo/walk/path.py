@@ -89,14 +89,26 @@ def motion_between(frames: Sequence[Frame], m: int, k: int) -> tuple[Pose, Pose,
     By tracking, if it led from the one to the other, else by odometry; None if neither did.
     """
     before, frame = frames[m], frames[k]
-    if frame.key == m and frame.arrived is not None and before.departed is not None:
-        return before.departed, frame.arrived, MIN_DISTANCE
+    end = track_back(frames, m, k)
+    if end is not None and before.departed is not None:
+        return before.departed, end, MIN_DISTANCE
     poses = [f.odometry for f in frames[m : k + 1] if f.odometry is not None]
     if before.odometry is None or frame.odometry is None:
         return None
     steps = np.diff([pose.center_world for pose in poses], axis=0)
     walked = float(np.linalg.norm(steps, axis=1).sum())
     return before.odometry, frame.odometry, MIN_DISTANCE + DRIFT * walked
+
+
+def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
+    """Return where a frame was tracked to from key frame `m`, by way of later ones; None if it was not."""
+    key = frames[k].key
+    arrived = frames[k].arrived
+    if key is None or arrived is None or key <= m:
+        return arrived if key == m else None
+    at_key = track_back(frames, m, key)
+    departed = frames[key].departed
+    return None if at_key is None or departed is None else carry(arrived, departed, at_key)
 
 
 def is_moved(
@@ -124,6 +136,7 @@ class Lattice:
         self.space = space
         self.motion = motion
         self.frames: list[Frame] = []
+        self.known: dict[tuple[int, int], tuple[list[State], list[State], Array]] = {}  # steps taken before
         self.columns: list[_Column] = []
         self.ended: list[float] = [0.0]  # log of the sum over ways that end before each column
 
@@ -164,11 +177,20 @@ class Lattice:
         passed = 0.0
         for n in range(len(self.columns) - 1, -1, -1):
             column = self.columns[n]
-            steps.append(_Steps(n, self._step(column.number, k, MOST_EXPECTED + log_alike)))
+            log = self._step_once(column.number, k, MOST_EXPECTED + log_alike)
+            steps.append(_Steps(n, log))
             passed += max(float(np.logaddexp.reduce(column.emitted)), 1.0)
             if passed > NEGLIGIBLE:
                 break
         return steps
+
+    def _step_once(self, m: int, k: int, most_expected: float) -> Array:
+        """Return `_step`, or what it was if no state of the two frames has changed since."""
+        states = self.frames[m].states, self.frames[k].states
+        known = self.known.get((m, k))
+        if known is None or known[0] is not states[0] or known[1] is not states[1]:
+            known = self.known[m, k] = (*states, self._step(m, k, most_expected))
+        return known[2]
 
     def _step(self, m: int, k: int, most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another."""
@@ -251,9 +273,13 @@ class Lattice:
         return metres, self.frames[k].time - self.frames[m].time
 
 
-def build_lattice(frames: Sequence[Frame], space: FreeSpace, motion: Motion) -> Lattice:
-    """Build the lattice of frames in their order."""
+def build_lattice(
+    frames: Sequence[Frame], space: FreeSpace, motion: Motion, before: Lattice | None = None
+) -> Lattice:
+    """Build the lattice of frames in their order; what has not changed since another is taken from it."""
     lattice = Lattice(space, motion)
+    if before is not None:
+        lattice.known = before.known
     for frame in frames:
         lattice.add(frame)
     return lattice

@@ -57,17 +57,15 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
 
 def _refine_likely(tracker: Tracker, read: Read, show: Progress) -> Path:
     """Refine the likely places of all key frames, until the path needs no others; return it."""
-    path = path_of(tracker)
+    space = tracker.lattice.space
+    lattice = build_lattice(tracker.frames, space, tracker.motion)
+    path = lattice.smooth()
     while rough := [k for k in range(len(tracker.frames)) if _list_rough(tracker, path, k)]:
         for k in show(iter(rough), len(rough), "refine"):
             _refine(tracker, path, k, read)
-        path = path_of(tracker)
+        lattice = build_lattice(tracker.frames, space, tracker.motion, lattice)
+        path = lattice.smooth()
     return path
-
-
-def path_of(tracker: Tracker) -> Path:
-    """Return the path of all frames so far."""
-    return build_lattice(tracker.frames, tracker.lattice.space, tracker.motion).smooth()
 
 
 def estimate_motion(tracker: Tracker) -> Motion:
