@@ -20,7 +20,7 @@ from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..geometry.pose import Array, Pose
 from .frames import MOST_ODDS, Frame, State, state_centers
 from .free_space import FreeSpace
-from .motion import Motion, carry
+from .motion import JUMP_LOG, Motion, carry
 
 COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
 MAX_TURN = math.pi  # [rad/s] of a person with a camera
@@ -36,6 +36,10 @@ class Path(NamedTuple):
     chosen: list[int | None]  # the state of each frame on the likeliest way; None for no pose
     probabilities: list[Array]  # (S,) of each frame's states
     gaps: list[tuple[float, float] | None]  # [m], [s] before a frame that no walking person reaches
+
+
+# states of two frames, those that are walked from, and the log odds of the steps
+_Known = tuple[list[State], list[State], NDArray[np.bool_], NDArray[np.float64]]
 
 
 def empty_path(count: int) -> Path:
@@ -136,7 +140,7 @@ class Lattice:
         self.space = space
         self.motion = motion
         self.frames: list[Frame] = []
-        self.known: dict[tuple[int, int], tuple[list[State], list[State], Array]] = {}  # steps taken before
+        self.known: dict[tuple[int, int], _Known] = {}  # steps taken before
         self.columns: list[_Column] = []
         self.ended: list[float] = [0.0]  # log of the sum over ways that end before each column
 
@@ -177,27 +181,33 @@ class Lattice:
         passed = 0.0
         for n in range(len(self.columns) - 1, -1, -1):
             column = self.columns[n]
-            log = self._step_once(column.number, k, MOST_EXPECTED + log_alike)
-            steps.append(_Steps(n, log))
+            steps.append(_Steps(n, self._step_once(column, k, MOST_EXPECTED + log_alike)))
             passed += max(float(np.logaddexp.reduce(column.emitted)), 1.0)
             if passed > NEGLIGIBLE:
                 break
         return steps
 
-    def _step_once(self, m: int, k: int, most_expected: float) -> Array:
+    def _step_once(self, column: _Column, k: int, most_expected: float) -> Array:
         """Return `_step`, or what it was if no state of the two frames has changed since."""
+        m = column.number
         states = self.frames[m].states, self.frames[k].states
+        is_likely = column.forward >= column.forward.max() + JUMP_LOG
         known = self.known.get((m, k))
-        if known is None or known[0] is not states[0] or known[1] is not states[1]:
-            known = self.known[m, k] = (*states, self._step(m, k, most_expected))
-        return known[2]
+        is_same = known is not None and known[0] is states[0] and known[1] is states[1]
+        if known is None or not is_same or (known[2] != is_likely).any():
+            known = self.known[m, k] = (*states, is_likely, self._step(m, k, is_likely, most_expected))
+        return known[3]
 
-    def _step(self, m: int, k: int, most_expected: float) -> Array:
-        """Return log odds (S before, S) of the steps from a key frame to another."""
+    def _step(self, m: int, k: int, is_likely: NDArray[np.bool_], most_expected: float) -> Array:
+        """Return log odds (S before, S) of the steps from a key frame to another.
+
+        Nobody walks from a place that is less likely (S before,) than a jump from the best.
+        """
         starts, ends = self.frames[m].states, self.frames[k].states
         if moved := motion_between(self.frames, m, k):
             return np.where(is_moved(moved, starts, ends), most_expected, self.motion.jump_log)
         last, begins = self._last_tracked(m, k)
+        begins = [pose for pose, likely in zip(begins, is_likely, strict=True) if likely]
         centers = np.array([pose.center_world for pose in begins])
         seconds = self.frames[k].time - self.frames[last].time
         least_jump = math.sqrt(2.0 * (most_expected - self.motion.jump_log))  # [deviations] beyond reach
@@ -207,7 +217,9 @@ class Lattice:
         expected = np.minimum(-np.log(fractions), most_expected)
         if self.motion.is_timed:
             distances[~is_turned(begins, ends, MAX_TURN * seconds)] = np.inf
-        return log_transition(distances, seconds, self.motion, expected)
+        log = np.full((len(starts), len(ends)), self.motion.jump_log)
+        log[is_likely] = log_transition(distances, seconds, self.motion, expected)
+        return log
 
     def _last_tracked(self, m: int, k: int) -> tuple[int, list[Pose]]:
         """Return the last frame before `k` that was tracked from key frame `m`, and its poses."""
