@@ -230,6 +230,14 @@ def test_tracking_is_known_by_way_of_later_key_frames():
     assert len(changed.probabilities[2]) == 1
 
 
+def test_frames_tracked_from_a_dark_key_frame_speak_for_it_when_they_are_known():
+    dark = _key(0, ((0, 0, 0), -1.0))
+    alone = build_lattice([dark], Open(), MOTION).smooth()
+    assert alone.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.e))
+    told = build_lattice([dark, _followed(1, 0, (1, 0, 0), 4.0)], Open(), MOTION).smooth()
+    assert told.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.exp(-4.0)))
+
+
 def test_nobody_turns_round_at_once():
     """The same place seen the other way round is out of reach in half a second, not in two."""
     for seconds, is_reached in ((0.5, False), (2.0, True)):

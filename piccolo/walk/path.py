@@ -66,16 +66,18 @@ class _Column(NamedTuple):
     back: list[tuple[int, int] | None]  # column and state before
 
 
-def emissions(frame: Frame) -> tuple[Array, float]:
+def emissions(frame: Frame, tracked: float = -math.inf) -> tuple[Array, float]:
     """Return log odds (S,) of a key frame's states against none.
 
-    Their sum is what the frame's best pose has; the second result is the log of the number that share it.
+    Their sum is what the frame's best pose has, or the best of those tracked from it, if these are known and
+    have more; the second result is the log of the number that share it.
     """
     odds = np.array([state.log_odds for state in frame.states])
     tolerance = 0.0 if frame.is_localized_alone else COPY_LOG_ODDS
     behind = np.minimum(odds - odds.max() + tolerance, 0.0)
     log_alike = float(np.logaddexp.reduce(behind))
-    return np.clip(odds.max(), -MOST_ODDS, MOST_ODDS) + behind - log_alike, log_alike
+    best = min(max(float(odds.max()), tracked, -MOST_ODDS), MOST_ODDS)
+    return best + behind - log_alike, log_alike
 
 
 def log_transition(distance: Array, seconds: float, motion: Motion, expected: Array | float = 0.0) -> Array:
@@ -144,11 +146,11 @@ class Lattice:
         self.columns: list[_Column] = []
         self.ended: list[float] = [0.0]  # log of the sum over ways that end before each column
 
-    def add(self, frame: Frame) -> None:
-        """Add the next frame in time."""
+    def add(self, frame: Frame, tracked: float = -math.inf) -> None:
+        """Add the next frame in time; `tracked` are the log odds of frames that were tracked from it."""
         self.frames.append(frame)
         if frame.is_key:
-            self._append_column(len(self.frames) - 1)
+            self._append_column(len(self.frames) - 1, tracked)
 
     def change_last(self) -> None:
         """Take note that the last frame, a key frame, has other states."""
@@ -156,9 +158,9 @@ class Lattice:
         self.ended.pop()
         self._append_column(len(self.frames) - 1)
 
-    def _append_column(self, k: int) -> None:
+    def _append_column(self, k: int, tracked: float = -math.inf) -> None:
         frame = self.frames[k]
-        emitted, log_alike = emissions(frame)
+        emitted, log_alike = emissions(frame, tracked)
         steps = self._steps_to(k, log_alike)
         sums = np.zeros(len(emitted))
         best = np.zeros(len(emitted))
@@ -292,6 +294,10 @@ def build_lattice(
     lattice = Lattice(space, motion)
     if before is not None:
         lattice.known = before.known
+    tracked = np.full(len(frames), -np.inf)
     for frame in frames:
-        lattice.add(frame)
+        if frame.key is not None and frame.states:
+            tracked[frame.key] = max(tracked[frame.key], frame.states[0].log_odds)
+    for frame, best in zip(frames, tracked, strict=True):
+        lattice.add(frame, float(best))
     return lattice

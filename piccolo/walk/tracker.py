@@ -282,17 +282,23 @@ def least_score(f: Follower) -> float:
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
-    """Descend from a predicted pose; in a larger basin if the frame scores less than the one before."""
+    """Descend from a predicted pose; in a larger basin if the frame scores less than the one before.
+
+    An end that nobody reaches has no score.
+    """
     least = least_score(f)
     starts = [f.pose]
     span = f.time - f.earlier_time
+    reach = motion.max_speed * abs(time - f.time) + REACH_SLACK
     if f.earlier is not None and span != 0.0:
-        reach = motion.max_speed * abs(time - f.time) + REACH_SLACK
         starts.insert(0, predict(f.pose, f.earlier, (time - f.time) / span, reach))
     end = track(query, starts[0], least)
     if end.score < least:
         end = max([end, *(track(query, start, least) for start in starts[1:])], key=lambda h: h.score)
-    return end if end.score >= USUAL * f.score or end.score < least else track_on(query, end)
+    if least <= end.score < USUAL * f.score:
+        end = track_on(query, end)
+    is_reached = np.linalg.norm(end.pose.center_world - f.pose.center_world) <= reach
+    return end if is_reached else Hypothesis(end.pose, 0.0)
 
 
 def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
