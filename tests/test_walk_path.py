@@ -188,6 +188,8 @@ def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there(
     belief = believe(there.frames, there.smooth(), 1)
     assert not belief.is_sure
     np.testing.assert_allclose(belief.expected.center_world, [21.0, 0.0, 0.0])
+    assert belief.states[0].pose is belief.expected
+    assert belief.probabilities[0] == 0.5
     assert not believe(there.frames, there.smooth(), 2).is_sure
 
 

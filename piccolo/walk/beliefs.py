@@ -56,10 +56,12 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     share = credible * share_of_next(frames, path, k, at_key)
     departed = frames[key].departed or at_key.states[0].pose
     carried = [carry(frame.arrived, departed, state.pose) for state in at_key.states]
-    if not is_same(carried[0], own.pose):
-        return Belief([], np.empty(0), carried[0])
-    others = [State(pose, own.log_odds) for pose in carried[1:]]
-    return Belief([own, *others], share * at_key.probabilities)
+    probabilities = share * at_key.probabilities
+    states = [State(pose, own.log_odds) for pose in carried]
+    if is_same(carried[0], own.pose):
+        return Belief([own, *states[1:]], probabilities)
+    probabilities[0] = min(probabilities[0], EVEN)  # nothing was seen there
+    return Belief(states, probabilities, carried[0])
 
 
 def share_of_next(frames: Sequence[Frame], path: Path, k: int, at_key: Belief) -> float:
