@@ -140,30 +140,31 @@ class Walk:
         taken = self.taken[-1]
         frame = self.tracker.frames[-1]
         alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
-        photo = taken.photo and (taken.photo.sha256, taken.photo.image_size, taken.photo.capture_time)
-        about = {"pano": taken.name, "photo": photo, "seconds": taken.seconds, "warnings": taken.warnings}
-        failure = {"sha256": taken.sha256, "failure": taken.failure}
-        return json.dumps({**about, **failure, "frame": frame.to_json(), "alone": alone})
+        document = {
+            "pano": taken.name,
+            "sha256": taken.photo.sha256 if taken.photo else taken.sha256,
+            "is_read": taken.failure is None,
+            "seconds": taken.seconds,
+            "warnings": taken.warnings,
+            "frame": frame.to_json(),
+            "alone": alone,
+        }
+        return json.dumps(document)
 
     def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
         """Take the next frame from a line of `last_to_json`, if it is of this picture, unchanged."""
         document = json.loads(line)
-        failure = None
-        if document["failure"]:
-            text, is_passing = document["failure"]
-            failure = Failure(text, is_passing)
-        digest = document["photo"][0] if document["photo"] else document["sha256"]
-        is_same = document["pano"] == name and document["frame"]["time"] == time
-        if not is_same or (failure and failure.is_passing):
+        rig = self.read_options.rig
+        found = document["pano"], document["frame"]["time"], document["sha256"]
+        if found != (name, time, sha256_of(picture, rig)):
             return False
-        if sha256_of(picture, self.read_options.rig) != digest:
-            return False
-        photo = None
-        if document["photo"]:
-            (width, height), capture_time = document["photo"][1:]
-            photo = PhotoFacts(digest, (width, height), capture_time, None)
-        warnings = tuple(document["warnings"])
-        taken = Taken(picture, name, photo, document["seconds"], warnings, document["sha256"], failure)
+        if document["is_read"]:
+            seconds, warnings = document["seconds"], tuple(document["warnings"])
+            taken = Taken(picture, name, photo_facts(picture, rig), seconds, warnings)
+        else:
+            taken = self.prepare(picture, name).taken
+            if taken.failure is None or taken.failure.is_passing:
+                return False
         alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
         self.accept(taken, Frame.from_json(document["frame"], alone))
         return True

@@ -69,9 +69,8 @@ def test_a_path_goes_before_a_name(tmp_path):
     path = _transforms(tmp_path / "a.json", ("left/1.jpg", IDENTITY), ("right/1.jpg", moved.tolist()))
     left, right = read_relative_poses(path, [Path("left/1.jpg"), Path("right/1.jpg")])
     assert (left.center_world[0], right.center_world[0]) == (0.0, 5.0)
-    assert_refused(
-        "found 2 poses of x/1.jpg, wanted one of each photo", read_relative_poses, path, [Path("x/1.jpg")]
-    )
+    for read in (read_relative_poses, lambda path, photos: read_odometry(path, photos, [0.0])):
+        assert_refused("found 2 poses of x/1.jpg, wanted one of each photo", read, path, [Path("x/1.jpg")])
 
 
 def test_rounded_rotations_become_rotations(tmp_path):

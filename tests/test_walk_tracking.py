@@ -6,7 +6,6 @@ import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
-from piccolo.localization.comparison import score_pose
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker as tracker_module
@@ -14,13 +13,15 @@ from piccolo.walk.frames import State
 from piccolo.walk.motion import Motion
 from piccolo.walk.places import find_places, is_mirror_image, is_mirrored
 from piccolo.walk.tracker import (
+    SURE_ODDS,
     Follower,
+    Found,
+    find_from,
     find_near,
     follow,
     predict,
     refine_state,
     track,
-    track_on,
 )
 
 SEED = 1
@@ -40,35 +41,71 @@ def _off(pose, metres, degrees):
     return Pose(turn @ pose.R_cam_from_world, pose.center_world + metres * np.array([0.8, 0.6, 0.0]))
 
 
-def test_a_descent_that_stopped_short_goes_on_farther_around(seen):
-    query, true = seen
-    short = score_pose(query, _off(true, 0.12, 2.5))
-    end = track_on(query, short)
-    assert end.score > 1.2 * short.score
-    assert pose_errors(end.pose, true)[0] < 0.02
-    best = track(query, true, 0.2)
-    assert track_on(query, best).score >= best.score
-
-
-def test_a_frame_that_explains_less_than_the_one_before_is_looked_for_farther_around(seen, monkeypatch):
+def test_a_descent_goes_on_around_an_end_that_is_not_sure(seen, monkeypatch):
     query, true = seen
     asked = []
-    monkeypatch.setattr(tracker_module, "track_on", lambda query, end: asked.append(end) or end)
-    best = track(query, true, 0.2)
-    for usual, num_asked in ((1.0, 0), (1.05, 0), (1.3, 1), (2.0, 0)):  # as much; a little less; less; lost
-        asked.clear()
-        follow(query, Follower(true, usual * best.score, 0.0), 0.5, Motion())
-        assert len(asked) == num_asked, usual
+    perturb = tracker_module.perturb_middle
+    monkeypatch.setattr(
+        tracker_module, "perturb_middle", lambda query, pose: asked.append(pose) or perturb(query, pose)
+    )
+    end = track(query, true)
+    assert pose_errors(end.pose, true)[0] < 0.02
+    assert end.log_odds > SURE_ODDS
+    assert not asked
+    assert track(query, _off(true, 2.0, 90.0)) is None
+    assert len(asked) == 1
 
 
-def test_a_frame_is_found_near_if_it_scores_as_the_one_before(seen):
+def test_the_next_start_is_tried_if_the_first_leads_nowhere(seen):
     query, true = seen
-    near = Follower(_off(true, 0.8, 40.0), 0.3, 0.0)
+    far = _off(true, 2.0, 90.0)
+    assert pose_errors(track(query, far, true).pose, true)[0] < 0.02
+
+
+def test_a_frame_is_followed_no_farther_than_its_motion_allows(seen):
+    query, true = seen
+    behind = Follower(_off(true, -0.3, 0.0), 0.0)
+    assert follow(query, behind, 1.0, Motion()).pose.center_world == pytest.approx(
+        true.center_world, abs=0.02
+    )
+    assert follow(query, Follower(_off(true, -0.2, 0.0), 0.0), 1.0, Motion(max_speed=1e-3)) is not None
+    assert follow(query, Follower(_off(true, -0.4, 0.0), 0.0), 1.0, Motion(max_speed=1e-3)) is None
+    turned = Follower(true, 0.5, _off(true, -1.0, 0.0), 0.0)  # walks on at 2 m/s
+    assert follow(query, turned, 1.0, Motion(max_acceleration=4.0)) is not None
+    assert follow(query, turned, 1.0, Motion(max_acceleration=1.0)) is None
+
+
+def test_a_frame_is_found_near_a_pose(seen):
+    query, true = seen
+    near = Follower(_off(true, 0.8, 40.0), 0.0)
     found = find_near(query, near, 1.0, Motion())
-    assert pose_errors(found[0].pose, true)[0] < 0.02
-    assert find_near(query, near._replace(score=3.0), 1.0, Motion()) == []
-    assert find_near(query, near, 10.0, Motion()) == []  # too far to look around
-    assert find_near(query, Follower(_off(true, 50.0, 0.0), 0.3, 0.0), 1.0, Motion()) == []
+    assert (found.how, found.is_alone) == ("near", True)
+    assert pose_errors(found.state.pose, true)[0] < 0.02
+    assert find_near(query, near, 10.0, Motion()) is None, "too far to look around"
+    assert find_near(query, Follower(_off(true, 50.0, 0.0), 0.0), 1.0, Motion()) is None
+
+
+def test_a_better_pose_near_replaces_one_that_is_not_sure(seen, monkeypatch):
+    """It counts as tracked at the same place; elsewhere it must be the only one of its kind."""
+    query, true = seen
+    follower = Follower(true, 0.0)
+    own = State(true, 1.0, 0.5)
+    beside, elsewhere = _off(true, 0.2, 0.0), _off(true, 5.0, 0.0)
+    cases = (
+        (None, own, "tracked"),
+        (Found(State(beside, 0.5, 0.5), "near"), own, "tracked"),  # no better
+        (Found(State(beside, 3.5, 0.5), "near", is_alone=False), beside, "tracked"),
+        (Found(State(elsewhere, 3.5, 0.5), "near", is_alone=False), own, "tracked"),
+        (Found(State(elsewhere, 3.5, 0.5), "near"), elsewhere, "near"),
+    )
+    monkeypatch.setattr(tracker_module, "follow", lambda *_: own)
+    for near, wanted, how in cases:
+        monkeypatch.setattr(tracker_module, "find_near", lambda *_, near=near: near)
+        found = find_from(query, follower, 1.0, Motion())
+        assert (found.state if wanted is own else found.state.pose) is wanted
+        assert found.how == how
+    monkeypatch.setattr(tracker_module, "follow", lambda *_: None)
+    assert find_from(query, follower, 1.0, Motion()) is near
 
 
 def test_the_places_that_look_like_a_photo(seen):
@@ -97,7 +134,7 @@ def test_a_mirrored_photo_is_told_near_a_pose_and_anywhere(seen):
 
 def test_a_rough_place_is_refined_or_dropped(seen):
     query, true = seen
-    best = track(query, true, 0.2)
+    best = track(query, true)
     own = State(best.pose, 5.0, best.score)
     wrong = State(_off(true, 1.5, 120.0), 5.0)
     assert refine_state(query, [own, wrong], wrong) == [own]

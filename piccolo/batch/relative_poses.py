@@ -29,17 +29,26 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
     Raises InputError if the file is none of these, or has no pose of a photo, or two.
     """
     poses = read_transforms(path) if path.suffix == ".json" else read_lines(path)
+    found = match_names(path, poses, photos)
+    for photo, pose in zip(photos, found, strict=True):
+        if pose is None:
+            raise InputError(f"{path}: found 0 poses of {photo}, wanted one of each photo")
+    return [pose for pose in found if pose is not None]
+
+
+def match_names(path: Path, poses: Sequence[NamedPose], photos: Sequence[Path]) -> list[Pose | None]:
+    """Return the pose of each photo by its path, its name or its stem; InputError if there are two."""
     by_path = defaultdict[str, list[Pose]](list)
     by_name = defaultdict[str, list[Pose]](list)
     for name, pose in poses:
         by_path[name].append(pose)
         by_name[Path(name).name].append(pose)
-    chosen = []
+    chosen: list[Pose | None] = []
     for photo in photos:
         found = by_path.get(str(photo)) or by_name.get(photo.name) or by_name.get(photo.stem) or []
-        if len(found) != 1:
+        if len(found) > 1:
             raise InputError(f"{path}: found {len(found)} poses of {photo}, wanted one of each photo")
-        chosen.append(found[0])
+        chosen.append(found[0] if found else None)
     return chosen
 
 
@@ -52,8 +61,7 @@ def read_odometry(path: Path, frames: Sequence[Path], times: Sequence[float]) ->
     Raises InputError if the file is no odometry, or of other frames.
     """
     if path.suffix == ".json":
-        by_name = {Path(name).name: pose for name, pose in read_transforms(path)}
-        found = [by_name.get(frame.name) for frame in frames]
+        found = match_names(path, read_transforms(path), frames)
     else:
         rows = [line.split() for line in read_text(path, ODOMETRY).splitlines() if line.strip()]
         rows = [row for row in rows if not row[0].startswith("#")]

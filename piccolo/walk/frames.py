@@ -21,7 +21,7 @@ from ..scan_map.scan_map import ScanMap
 
 POSES = ("arrived", "departed", "odometry")  # of a Frame
 How = Literal["alone", "near", "tracked", "none"]
-SAME_PLACE = 1.5  # [m] poses nearer to each other
+SAME_PLACE = 2.0  # [m] poses nearer to each other: key frames are so far apart
 SAME_HEADING = math.radians(45.0)  # and this are of one place
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 

@@ -1,5 +1,6 @@
 """Walking distances from place to place, through free space and never through a wall."""
 
+import math
 from functools import cached_property
 from typing import Any
 
@@ -9,15 +10,16 @@ from numpy.typing import NDArray
 from ..geometry.pose import Array
 from ..geometry.sphere import find_cell
 from ..jobs.threads import Workers
+from ..scan_map.camera_positions import COARSE_SPACING, MIN_CLEARANCE
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import BLOCK, ranges_around
 
-REACH = 0.95  # [m] between neighbours in the grid of candidates, 0.6 m wide: across edges, not all corners
+REACH = (
+    1.6 * COARSE_SPACING
+)  # [m] between neighbours in the grid of candidates: across edges, not all corners
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
-NEAR = 0.5  # [m] cameras keep 0.25 m from a wall: nearer ones have none between them
-DETOUR = 1.1  # paths along a grid are so much longer
-ENDS = 0.6  # [m] to its nodes
+DETOUR = 1.0 / math.cos(math.pi / 8.0)  # paths along edges and across squares are at most so much longer
 
 
 class FreeSpace:
@@ -55,15 +57,17 @@ class FreeSpace:
         from scipy.sparse.csgraph import dijkstra  # noqa: PLC0415
 
         straight = np.linalg.norm(ends[None] - starts[:, None], axis=2)
-        walked = straight.copy()
-        far = (straight > NEAR) & (straight <= limit)
+        walked = straight.copy()  # nothing is between places so near that both keep clear of it
+        far = (straight > 2.0 * MIN_CLEARANCE) & (straight <= limit)
         rows = np.flatnonzero(far.any(axis=1))
         if len(rows):
             _, end = self._tree.query(ends)
             nodes, node = np.unique(self._tree.query(starts[rows])[1], return_inverse=True)
-            along = dijkstra(self._graph, indices=nodes, limit=DETOUR * (limit + 2.0 * ENDS))[node][:, end]
+            along = dijkstra(self._graph, indices=nodes, limit=DETOUR * (limit + 2.0 * COARSE_SPACING))[node][
+                :, end
+            ]
             walked[rows] = np.where(
-                far[rows], np.maximum(straight[rows], along / DETOUR - ENDS), walked[rows]
+                far[rows], np.maximum(straight[rows], along / DETOUR - COARSE_SPACING), walked[rows]
             )
         walked[walked > limit] = np.inf
         return np.asarray(walked)

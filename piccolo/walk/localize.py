@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import classify
@@ -18,7 +18,6 @@ from .motion import Motion
 from .path import Path
 from .tracker import Tracker
 
-BANDS = 6  # of the information matrix beside its diagonal: two frames of three coordinates
 PRIOR_FLOOR = 1e-6  # [m^2] least variance of a position
 LONGEST_STEP = 3.0  # [s] frames farther apart do not limit the acceleration
 
@@ -114,55 +113,36 @@ def smooth_positions(located: Sequence[Located], times: Sequence[float], motion:
     second difference by time of three consecutive frames and s the motion's deviation [m/s^2]. Rotations
     follow their positions by each frame's own covariance.
     """
-    from scipy.linalg import solveh_banded  # noqa: PLC0415  # only walks wait for it
+    from scipy.sparse import block_diag, eye, kron  # noqa: PLC0415  # only walks wait for it
+    from scipy.sparse.linalg import splu  # noqa: PLC0415
 
     if len(located) < 3:
         return list(located)
-    own = [c.matrix[3:, 3:] + PRIOR_FLOOR * np.eye(3) for _, c in located]
-    information = np.zeros((BANDS + 3, 3 * len(located)))
-    right = np.zeros(3 * len(located))
-    for k, covariance in enumerate(own):
-        _add(information, k, k, np.asarray(np.linalg.inv(covariance)))
     rows = acceleration_rows(times, motion)
-    for k, row in rows:
-        for i in range(3):
-            for j in range(i, 3):
-                _add(information, k + i, k + j, np.eye(3) * row[i] * row[j])
-        a = sum(row[i] * located[k + i][0].center_world for i in range(3))
-        for i in range(3):
-            right[3 * (k + i) : 3 * (k + i) + 3] -= row[i] * a
-    moves = solveh_banded(information, right).reshape(-1, 3)
-    variances = marginal_covariances(information)
-    return [
-        move_pose(pose, covariance, move, variance)
-        for (pose, covariance), move, variance in zip(located, moves, variances, strict=True)
-    ]
+    smooth = kron(rows.T @ rows, eye(3))
+    own = [np.linalg.inv(c.matrix[3:, 3:] + PRIOR_FLOOR * np.eye(3)) for _, c in located]
+    factor = splu((block_diag(own) + smooth).tocsc())
+    centers = np.concatenate([pose.center_world for pose, _ in located])
+    moves = factor.solve(-(smooth @ centers)).reshape(-1, 3)
+    smoothed = []
+    for k, (pose, covariance) in enumerate(located):
+        part = slice(3 * k, 3 * k + 3)
+        variance = factor.solve(np.eye(3 * len(located), 3, -3 * k))[part]
+        smoothed.append(move_pose(pose, covariance, moves[k], variance))
+    return smoothed
 
 
-def acceleration_rows(times: Sequence[float], motion: Motion) -> list[tuple[int, Array]]:
-    """Return, for each three frames, the index of the first and the factors (3,) of x_k in a_k / s."""
-    rows = []
-    for k in range(len(times) - 2):
-        before, after = np.diff(times[k : k + 3])
-        if max(before, after) > LONGEST_STEP:
-            continue
-        row = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after]) * 2.0 / (before + after)
-        rows.append((k, row / motion.max_acceleration))
-    return rows
+def acceleration_rows(times: Sequence[float], motion: Motion) -> Any:
+    """Return the sparse matrix (N - 2, N) that takes positions to a_k / s."""
+    from scipy.sparse import csr_matrix  # noqa: PLC0415
 
-
-def marginal_covariances(information: NDArray[np.float64]) -> list[Array]:
-    """Return the covariance (3, 3) of each position from the banded information matrix (upper)."""
-    from scipy.linalg import cho_solve_banded, cholesky_banded  # noqa: PLC0415
-
-    n = information.shape[1] // 3
-    factor = cholesky_banded(information)
-    found = []
-    for k in range(n):  # few hundred frames: a solution each
-        right = np.zeros((3 * n, 3))
-        right[3 * k : 3 * k + 3] = np.eye(3)
-        found.append(cho_solve_banded((factor, False), right)[3 * k : 3 * k + 3])
-    return found
+    steps = np.diff(times)
+    before, after = steps[:-1], steps[1:]
+    factors = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after])
+    factors *= 2.0 / (before + after) / motion.max_acceleration
+    factors[:, np.maximum(before, after) > LONGEST_STEP] = 0.0
+    row, offset = np.indices((len(before), 3))
+    return csr_matrix((factors.T.ravel(), (row.ravel(), (row + offset).ravel())), (len(before), len(times)))
 
 
 def move_pose(pose: Pose, covariance: PoseCovariance, move: Array, variance: Array) -> Located:
@@ -179,12 +159,3 @@ def move_pose(pose: Pose, covariance: PoseCovariance, move: Array, variance: Arr
     matrix[3:, 3:] = variance
     turned = Pose(exp_so3(gain @ move) @ pose.R_cam_from_world, pose.center_world + move)
     return turned, replace(covariance, matrix=0.5 * (matrix + matrix.T))
-
-
-def _add(banded: NDArray[np.float64], k: int, j: int, block: Array) -> None:
-    """Add a block (3, 3) of frames k <= j to a banded matrix in upper form."""
-    for a in range(3):
-        for b in range(3):
-            off = 3 * (j - k) + b - a
-            if off >= 0:
-                banded[-1 - off, 3 * j + b] += block[a, b]

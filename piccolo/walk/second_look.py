@@ -6,7 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..confidence.confidence import LOCALIZED
+from ..confidence.alternatives import MIN_DISTANCE
+from ..confidence.confidence import LOCALIZED, MIN_CONFIDENCE
 from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
 from ..panorama import Panorama
@@ -14,24 +15,9 @@ from .beliefs import Belief, believe
 from .frames import Frame, State, is_same
 from .motion import MAX_STEP, Motion, carry
 from .path import Path, build_lattice
-from .places import is_mirrored
-from .tracker import (
-    LEAST_SCORE,
-    Follower,
-    Tracker,
-    find_near,
-    follow,
-    least_score,
-    make_state,
-    move_on,
-    refine_state,
-)
+from .tracker import MAX_RADIUS, Follower, Tracker, find_from, move_on, refine_state
 
-LEAST_LIKELY = 0.1  # probability of a place that is refined
-FARTHEST = 12  # frames from one that is sure, in which lost ones are looked for
-LEAST_STEP = 0.5  # [m] several photos of one place are no steps
-MOST_STEPS = 0.9  # of the steps found: the longest is LONGER than so many of them
-LONGER = 1.5
+LONGER = 3.0  # than the median step: no step of photos without times
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
@@ -75,14 +61,14 @@ def estimate_motion(tracker: Tracker) -> Motion:
         return motion
     alone = [f.alone.pose if f.alone and f.alone.status == LOCALIZED else None for f in tracker.frames]
     pairs = [(a.center_world, b.center_world) for a, b in pairwise(alone) if a is not None and b is not None]
-    steps = [step for a, b in pairs if (step := float(np.linalg.norm(b - a))) >= LEAST_STEP]
-    longest = LONGER * float(np.quantile(steps, MOST_STEPS, method="higher")) if steps else 0.0
+    steps = [step for a, b in pairs if (step := float(np.linalg.norm(b - a))) >= MIN_DISTANCE]
+    longest = LONGER * float(np.median(steps)) if steps else 0.0
     return replace(motion, max_speed=max(MAX_STEP, longest), is_guess=False)
 
 
 def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
     """List the likely states of a frame that were not refined."""
-    is_likely = path.probabilities[k] > LEAST_LIKELY
+    is_likely = path.probabilities[k] > 1.0 - MIN_CONFIDENCE  # less leaves another sure
     return [
         j
         for j, state in enumerate(tracker.frames[k].states)
@@ -109,29 +95,42 @@ def _find_lost(
     """
     frames = tracker.frames
     belief = believe(frames, path, k)
-    near = range(k - step, k - step * (FARTHEST + 1), -step)
-    inside = [] if belief.is_sure else [m for m in near if 0 <= m < len(frames)]
-    sure = next((m for m in inside if believe(frames, path, m).is_sure), None)
-    if sure is None:
+    sure = [] if belief.is_sure else _list_sure(tracker, path, k, step)
+    if not sure:
         return False
-    was_there = step == 1 and sure not in found_before and not frames[k].is_key
-    if was_there and belief.expected is None and _was_followed(frames, path, sure):
+    was_there = step == 1 and sure[0] not in found_before and not frames[k].is_key
+    if was_there and belief.expected is None and _was_followed(frames, path, sure[0]):
         return False
     panorama = read(k)
     if panorama is None or not panorama.is_valid.any():
         return False
     query = tracker.prepare(panorama)
-    state = believe(frames, path, sure).states[0]
-    start = belief.expected or move_on(state.pose, frames[sure], frames[k])
-    follower = Follower(start, state.score or LEAST_SCORE, frames[sure].time)
-    end = follow(query, follower, frames[k].time, tracker.motion)
-    is_there = end.score >= least_score(follower)
-    found = [end] if is_there else find_near(query, follower, frames[k].time, tracker.motion)
-    if len(found) != 1 or is_mirrored(query, found[0].pose):
+    poses = [believe(frames, path, m).states[0].pose for m in sure]
+    times = [frames[m].time for m in sure]
+    if belief.expected or frames[k].odometry or len(sure) == 1:
+        start = belief.expected or move_on(poses[0], frames[sure[0]], frames[k])
+        follower = Follower(start, times[0])
+    else:
+        follower = Follower(poses[0], times[0], poses[1], times[1])
+    found = find_from(query, follower, frames[k].time, tracker.motion)
+    if found is None or not found.is_alone:
         return False
-    _hang(frames, path, k, sure, make_state(query, found[0]))
-    frames[k].how = "tracked" if is_there else "near"
+    _hang(frames, path, k, sure[0], found.state)
+    frames[k].how = found.how
     return True
+
+
+def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
+    """List the nearest two sure frames in one direction from which a frame can be found."""
+    frames = tracker.frames
+    sure: list[int] = []
+    for m in range(k - step, len(frames) if step < 0 else -1, -step):
+        reach = tracker.motion.max_speed * abs(frames[k].time - frames[m].time)
+        if reach > MAX_RADIUS or len(sure) == 2:
+            break
+        if believe(frames, path, m).is_sure:
+            sure.append(m)
+    return sure
 
 
 def _was_followed(frames: Sequence[Frame], path: Path, k: int) -> bool:

@@ -16,12 +16,11 @@ from ..jobs.threads import Workers
 from ..localization.attempts import FIRST_BEAM, brief_query
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
+from ..localization.last_descent import FULL_LIMITS
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
 from ..localization.refinement import (
-    FULL_LOSS,
-    Limits,
     descend,
     descend_fine,
     descend_middle,
@@ -29,7 +28,7 @@ from ..localization.refinement import (
     refine,
 )
 from ..localization.search import search_poses
-from ..localization.selection import CLEAR_SCORE, assess_poses, rank
+from ..localization.selection import assess_poses, rank
 from ..localization.settings import CoarseToFineSettings
 from ..panorama import Panorama
 from ..scan_map.prior import Prior
@@ -37,7 +36,9 @@ from ..scan_map.scan_map import ScanMap
 from .beliefs import EVEN
 from .frames import (
     MOST_ODDS,
+    SAME_PLACE,
     Frame,
+    How,
     State,
     is_same,
     is_same_place,
@@ -48,29 +49,31 @@ from .frames import (
 )
 from .free_space import FreeSpace
 from .motion import MAX_STEP, NO_ACCELERATION, Motion, carry
-from .path import COPY_LOG_ODDS, REACH_SLACK, Lattice
+from .path import COPY_LOG_ODDS, MOST_EXPECTED, REACH_SLACK, Lattice
 from .places import MOST_PLACES, find_places, is_mirror_image, is_mirrored, log_behind
 
-LEAST_SCORE = 0.2  # of a frame that is tracked
-LEAST_KEPT = 0.6  # of the score of the frame before
-LAST_LIMITS = Limits(FULL_LOSS, 10, 1e-5)  # of the last descent, as in refinement
+SURE_ODDS = 4.0  # [log] 98 %: of 580 wrong ends of descents near the pose two had more than 2.4, 3.1 at most
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere
 LAST_SEARCH = 48  # and again, at the latest
-TELLING_DISTANCE = 2.0  # [m] after which a frame is new evidence of its place
-FAR = 3.0  # [m] from frame to frame, where each is searched in the whole scan
 MOST_REFINED = 4  # places of a key frame, until one is as good as it looks
-USUAL = 0.95  # of the score of the frame before: a descent that ends with less goes on farther around
 
 
 class Follower(NamedTuple):
     """A pose from which the next frame is predicted."""
 
     pose: Pose
-    score: float
     time: float
     earlier: Pose | None = None  # a pose before it
     earlier_time: float = 0.0
+
+
+class Found(NamedTuple):
+    """The pose of a frame that was found from another's."""
+
+    state: State
+    how: How
+    is_alone: bool = True  # False if other poses near look like it
 
 
 class Tracker:
@@ -119,7 +122,10 @@ class Tracker:
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_known = odometry is not None or not self.frames
-            is_far = not is_known and self.motion.max_speed * (time - self.frames[-1].time) >= FAR
+            is_far = (
+                not is_known
+                and self.motion.max_speed * (time - self.frames[-1].time) > SAME_PLACE + REACH_SLACK
+            )
             if not is_far:
                 self._follow(query, frame)
             if is_far or (not frame.states and self.num_lost + 1 >= self.next_search):
@@ -155,22 +161,20 @@ class Tracker:
         if frame.key is None or frame.arrived is None:
             return True
         move = frame.arrived.center_world - self._pose_since(frame.key).center_world
-        return float(np.linalg.norm(move)) >= TELLING_DISTANCE
+        return float(np.linalg.norm(move)) >= SAME_PLACE
 
     def _follow(self, query: Query, frame: Frame) -> None:
         """Descend from the pose predicted by the last ones; search near it if that fails."""
         follower = self._follower_to(frame)
         if follower is None:
             return
-        tracked = follow(query, follower, frame.time, self.motion)
-        is_there = tracked.score >= least_score(follower)
-        found = [tracked] if is_there else find_near(query, follower, frame.time, self.motion)
-        if not found or is_mirrored(query, found[0].pose):
+        found = find_from(query, follower, frame.time, self.motion)
+        if found is None:
             return
-        frame.states = [make_state(query, found[0])]
-        frame.how = "tracked" if is_there else "near"
-        if len(found) == 1:
-            frame.arrived = found[0].pose
+        frame.states = [found.state]
+        frame.how = found.how
+        if found.is_alone:
+            frame.arrived = found.state.pose
             frame.key = self._last_key()
 
     def _last_key(self) -> int | None:
@@ -186,10 +190,9 @@ class Tracker:
         since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
         last = self.frames[since[-1]]
         pose = self._pose_since(since[-1])
-        score = last.states[0].score or LEAST_SCORE
         if frame.odometry is not None or len(since) == 1:
-            return Follower(move_on(pose, last, frame), score, last.time)
-        return Follower(pose, score, last.time, self._pose_since(since[-2]), self.frames[since[-2]].time)
+            return Follower(move_on(pose, last, frame), last.time)
+        return Follower(pose, last.time, self._pose_since(since[-2]), self.frames[since[-2]].time)
 
     def _pose_since(self, k: int) -> Pose:
         frame = self.frames[k]
@@ -257,16 +260,13 @@ def refine_state(query: Query, states: Sequence[State], rough: State) -> list[St
     It is dropped if a frame would not be tracked there, or has that pose already.
     """
     best = max((s for s in states if s.is_refined), key=lambda s: s.log_odds)
-    end = track(query, rough.pose, LEAST_SCORE)
+    end = track(query, rough.pose)
     others = [s for s in states if s is not rough]
-    if end.score < LEAST_SCORE or is_mirrored(query, end.pose):
+    if end is None or any(s.is_refined and is_same(s.pose, end.pose) for s in others):
         return others
-    if any(s.is_refined and is_same(s.pose, end.pose) for s in others):
-        return others
-    at_best = Hypothesis(best.pose, best.score or 0.0)
-    first, second = posterior(assess_poses(replace(query, num_parts=0), at_best, [end]), None)[:2]
-    odds = best.log_odds + log_ratio(float(second), float(first))
-    return put_state(others, State(end.pose, odds, end.score, estimate_covariance(query, end.pose)))
+    ends = [Hypothesis(s.pose, s.score or 0.0) for s in (best, end)]
+    first, second = posterior(assess_poses(replace(query, num_parts=0), ends[0], ends[1:]), None)[:2]
+    return put_state(others, replace(end, log_odds=best.log_odds + log_ratio(float(second), float(first))))
 
 
 def move_on(pose: Pose, before: Frame, frame: Frame) -> Pose:
@@ -276,29 +276,38 @@ def move_on(pose: Pose, before: Frame, frame: Frame) -> Pose:
     return carry(frame.odometry, before.odometry, pose)
 
 
-def least_score(f: Follower) -> float:
-    """Return the least score with which a frame counts as tracked."""
-    return max(LEAST_SCORE, LEAST_KEPT * f.score)
+def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
+    """Find a frame from the pose of another: by descents from there, and by a search around if not sure."""
+    state = follow(query, f, time, motion)
+    if state is not None and state.log_odds >= SURE_ODDS:
+        return Found(state, "tracked")
+    near = find_near(query, f, time, motion)
+    if state is None:
+        return near
+    if near is not None and near.state.log_odds > state.log_odds:
+        if is_same_place(near.state.pose, state.pose):
+            return Found(near.state, "tracked")
+        if near.is_alone:
+            return near
+    return Found(state, "tracked")
 
 
-def follow(query: Query, f: Follower, time: float, motion: Motion) -> Hypothesis:
-    """Descend from a predicted pose; in a larger basin if the frame scores less than the one before.
+def follow(query: Query, f: Follower, time: float, motion: Motion) -> State | None:
+    """Descend from a predicted pose, and from the last one if that is not sure.
 
-    An end that nobody reaches has no score.
+    None if there is no pose, or nobody reaches it.
     """
-    least = least_score(f)
     starts = [f.pose]
-    span = f.time - f.earlier_time
-    reach = motion.max_speed * abs(time - f.time) + REACH_SLACK
-    if f.earlier is not None and span != 0.0:
-        starts.insert(0, predict(f.pose, f.earlier, (time - f.time) / span, reach))
-    end = track(query, starts[0], least)
-    if end.score < least:
-        end = max([end, *(track(query, start, least) for start in starts[1:])], key=lambda h: h.score)
-    if least <= end.score < USUAL * f.score:
-        end = track_on(query, end)
-    is_reached = np.linalg.norm(end.pose.center_world - f.pose.center_world) <= reach
-    return end if is_reached else Hypothesis(end.pose, 0.0)
+    reach = radius = motion.max_speed * abs(time - f.time) + REACH_SLACK
+    if f.earlier is not None and f.time != f.earlier_time:
+        ratio = (time - f.time) / (f.time - f.earlier_time)
+        starts.insert(0, predict(f.pose, f.earlier, ratio, reach))
+        radius = min(reach, motion.max_acceleration * (time - f.time) ** 2 + REACH_SLACK)
+    end = track(query, *starts)
+    if end is None:
+        return None
+    moves = [float(np.linalg.norm(end.pose.center_world - at.center_world)) for at in (starts[0], f.pose)]
+    return end if moves[0] <= radius and moves[1] <= reach else None
 
 
 def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
@@ -314,48 +323,49 @@ def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> P
     return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
 
 
-def track(query: Query, start: Pose, least_score: float) -> Hypothesis:
-    """Descend from a predicted pose; perturb it if the end has less than the least score."""
-    near = descend_fine(query, descend_middle(query, start).pose)
-    if near.score < least_score:
-        around = descend_fine(query, perturb_middle(query, near.pose).pose)
-        near = max(near, around, key=lambda fit: fit.score)
-    end = descend_last(query, near.pose)
-    if end.score >= least_score:
-        return end
-    return max(end, score_pose(query, near.pose), key=lambda h: h.score)
+def track(query: Query, *starts: Pose) -> State | None:
+    """Descend from poses until an end is sure, else from poses around the best end.
 
-
-def track_on(query: Query, end: Hypothesis) -> Hypothesis:
-    """Perturb a tracked pose and descend again; return the better of the two."""
-    around = descend_last(query, descend_fine(query, perturb_middle(query, end.pose).pose).pose)
-    return max(end, around, key=lambda h: h.score)
+    None if the end more likely is wrong than right, or the photo mirrored.
+    """
+    ends: list[State] = []
+    for start in starts:
+        ends.append(make_state(query, descend_last(query, descend_middle(query, start).pose)))
+        if ends[-1].log_odds >= SURE_ODDS:
+            break
+    end = max(ends, key=lambda state: state.log_odds)
+    if end.log_odds < SURE_ODDS:
+        around = make_state(query, descend_last(query, perturb_middle(query, end.pose).pose))
+        end = max(end, around, key=lambda state: state.log_odds)
+    return None if end.log_odds < 0.0 or is_mirrored(query, end.pose) else end
 
 
 def descend_last(query: Query, pose: Pose) -> Hypothesis:
-    """Descend on the points themselves, and score the end by comparison with the photo."""
-    pose = descend(query.points_at(pose), query.photo.images.full(), pose, LAST_LIMITS)
+    """Descend on fine cells and the points themselves, and score the end by comparison with the photo."""
+    pose = descend_fine(query, pose).pose
+    pose = descend(query.points_at(pose), query.photo.images.full(), pose, FULL_LIMITS)
     return score_pose(query, pose)
 
 
-def find_near(query: Query, f: Follower, time: float, motion: Motion) -> list[Hypothesis]:
-    """Search by whole views within walking distance of a pose; return the best pose, and those like it.
+def find_near(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
+    """Search by whole views within walking distance of a pose.
 
-    Empty if the best is not clear, or the distance too great: then the whole scan is to be searched.
+    None if no pose is sure, or the distance is too great: then the whole scan is to be searched.
     """
     radius = motion.max_speed * abs(time - f.time) + REACH_SLACK
     if radius > MAX_RADIUS:
-        return []
+        return None
     x, y, z = (float(value) for value in query.scan_map.to_world(f.pose).center_world)
     some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
     if len(some.sparse) == 0:
-        return []
+        return None
     level = f.pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
     close = replace(query, scan_map=some, cache=Cache(query.cache.views), num_parts=0, rotations=level)
     first = brief_query(close)
     ends = refine(first, search_poses(first, "known"), FIRST_BEAM)
     found = rank([h for h in ends if np.linalg.norm(h.pose.center_world - f.pose.center_world) <= radius])
-    if found.best.score < max(CLEAR_SCORE, least_score(f)):
-        return []
-    like = [h for h in found.alternatives if log_behind(query, h.score / found.best.score) > -COPY_LOG_ODDS]
-    return [track(query, found.best.pose, CLEAR_SCORE), *like]
+    state = track(query, found.best.pose)
+    if state is None or state.log_odds < MOST_EXPECTED:  # it is not where it was to be expected
+        return None
+    behind = [log_behind(query, h.score / max(found.best.score, 1e-9)) for h in found.alternatives]
+    return Found(state, "near", max(behind, default=-np.inf) <= -COPY_LOG_ODDS)

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ class Frame(NamedTuple):
 
 
 class WalkSummary(NamedTuple):
-    """Statistics of a walk, or of several."""
+    """Statistics of walks."""
 
     num_frames: int
     num_correct: int  # of the frames that have an answer
@@ -39,7 +39,7 @@ class WalkSummary(NamedTuple):
     num_refused: int  # of these: not localized
     squared_errors: Array  # (N,) of the positions of localized frames [m2]
     squared_steps: Array  # (M, 2) of the motion between neighbours both localized: [m2], [rad2]
-    first_sure: float | None  # [s] from the first frame to the first that is localized; None if none is
+    first_sure: float | None  # [s] until the last of the walks has a sure frame; None if one has none
 
     @property
     def ate(self) -> float:
@@ -86,53 +86,44 @@ def step_errors(true: tuple[Pose, Pose], found: tuple[Pose, Pose]) -> tuple[floa
     return float(np.linalg.norm(error[:3, 3])), angle_between(error[:3, :3], np.eye(3))
 
 
-def summarize_walk(frames: Sequence[Frame], thresholds: Thresholds = PAPER_THRESHOLDS) -> WalkSummary:
-    """Return the statistics of one walk, its frames (at least one) in the order of time."""
+def summarize_walks(
+    walks: Sequence[Sequence[Frame]], thresholds: Thresholds = PAPER_THRESHOLDS
+) -> WalkSummary:
+    """Return the statistics of walks, the frames of each in the order of time."""
+    frames = [frame for walk in walks for frame in walk]
     good = [frame for frame in frames if frame.query.is_answerable]
-    bad = [frame for frame in frames if not frame.query.is_answerable]
     errors = [pose_errors(f.pose, f.query.pose) if f.pose else (np.inf, np.inf) for f in good]
     is_correct = [d < thresholds.max_distance and a < thresholds.max_angle for d, a in errors]
     is_sure = [frame.is_localized for frame in good]
-    num_refused = sum(not frame.is_localized for frame in bad)
-    num_wrong = sum(a and not b for a, b in zip(is_sure, is_correct, strict=True)) + len(bad) - num_refused
-    squared = [d**2 for (d, _), sure in zip(errors, is_sure, strict=True) if sure]
+    num_refused = sum(not frame.is_localized for frame in frames if not frame.query.is_answerable)
+    num_bad = len(frames) - len(good)
+    num_wrong = sum(a and not b for a, b in zip(is_sure, is_correct, strict=True)) + num_bad - num_refused
     steps = [
         step_errors((a.query.pose, b.query.pose), (a.sure_pose, b.sure_pose))
-        for a, b in itertools.pairwise(frames)
+        for walk in walks
+        for a, b in itertools.pairwise(walk)
         if a.sure_pose and b.sure_pose
     ]
-    sure_times = [_time(frame) - _time(frames[0]) for frame in frames if frame.is_localized]
-    squared_steps = np.array(steps).reshape(-1, 2) ** 2
+    firsts = [next((_time(f) - _time(walk[0]) for f in walk if f.is_localized), np.inf) for walk in walks]
+    first_sure = max(firsts, default=np.inf)
     return WalkSummary(
         len(frames),
         sum(is_correct),
         sum(is_sure),
         num_wrong,
-        len(bad),
+        num_bad,
         num_refused,
-        np.array(squared),
-        squared_steps,
-        min(sure_times, default=None),
+        np.array([d**2 for (d, _), sure in zip(errors, is_sure, strict=True) if sure]),
+        np.array(steps).reshape(-1, 2) ** 2,
+        first_sure if np.isfinite(first_sure) else None,
     )
-
-
-def summarize_all(summaries: Sequence[WalkSummary]) -> WalkSummary:
-    """Return the statistics of all frames of several walks, and the latest of their first sure frames."""
-    names = WalkSummary._fields[:6]
-    counts: dict[str, Any] = {name: sum(getattr(summary, name) for summary in summaries) for name in names}
-    squared = np.concatenate([summary.squared_errors for summary in summaries])
-    steps = np.concatenate([summary.squared_steps for summary in summaries])
-    firsts = [summary.first_sure for summary in summaries]
-    known = [first for first in firsts if first is not None]
-    first_sure = max(known) if len(known) == len(firsts) else None
-    return WalkSummary(**counts, squared_errors=squared, squared_steps=steps, first_sure=first_sure)
 
 
 def walk_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Thresholds) -> Table:
     """Return a line a walk, and one of all."""
-    summaries = {" ".join(name): summarize_walk(frames, thresholds) for name, frames in walks.items()}
+    summaries = {" ".join(name): summarize_walks([frames], thresholds) for name, frames in walks.items()}
     if len(summaries) > 1:
-        summaries[ALL] = summarize_all(list(summaries.values()))
+        summaries[ALL] = summarize_walks(list(walks.values()), thresholds)
     title = f"walks; correct: {thresholds}; ATE, RPE: RMSE of localized frames"
     columns = "walk", "frames", "correct", "localized", "wrong of all", "bad refused"
     errors = "ATE [m]", "RPE [m a frame]", "RPE [deg]", "first localized [s]"
@@ -148,8 +139,8 @@ def alone_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Threshold
         alone = [f._replace(pose=a.pose, is_localized=a.status == LOCALIZED) for f, a in searched]
         counts: list[str] = []
         for some in (alone, [frame for frame, _ in searched]):
-            s = summarize_walk(some, thresholds) if some else None
-            counts += [f"{n}" for n in (s.num_correct, s.num_localized, s.num_wrong)] if s else ["-"] * 3
+            s = summarize_walks([some], thresholds)
+            counts += [f"{n}" for n in (s.num_correct, s.num_localized, s.num_wrong)]
         rows.append((" ".join(name), f"{len(searched)}", *counts))
     return Table("frames that were searched in the whole scan", ("walk", "frames", *columns), tuple(rows))
 
