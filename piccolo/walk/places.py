@@ -24,7 +24,7 @@ from ..localization.search import Starts, best_poses, search_poses, turn_panoram
 from ..views.candidate_views import WIDE_RINGS
 
 NUM_STARTS = 16  # of these that begin a descent
-NUM_NEAR = 64  # candidates around a pose, at which a photo is compared with its mirror image
+NUM_NEAR = 256  # candidates around a pose, about 3 m, at which a photo is compared with its mirror image
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 
 

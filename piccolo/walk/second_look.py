@@ -1,6 +1,6 @@
 """A second look at a walk's frames, when the frames after them are known too."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
 from ..panorama import Panorama
 from .beliefs import Belief, believe
-from .frames import Frame, State, is_same
+from .frames import Frame, State
 from .motion import MAX_STEP, Motion, carry
 from .path import Path, build_lattice
 from .tracker import MAX_RADIUS, Follower, Tracker, find_from, move_on, refine_state
@@ -32,11 +32,8 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
     num = len(tracker.frames)
     tracker.motion = estimate_motion(tracker)
     path = _refine_likely(tracker, read, show)
-    found: set[int] = set()
-    for step in (-1, 1):
-        for k in show(iter(range(num)[::step]), num, "look for lost frames"):
-            if _find_lost(tracker, path, k, step, read, found):
-                found.add(k)
+    for k in show(iter(range(num)[::-1]), num, "look for lost frames"):
+        _find_lost(tracker, path, k, read)
     path = _refine_likely(tracker, read, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
 
@@ -86,24 +83,17 @@ def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
         frame.states = others if query is None else refine_state(query, frame.states, rough)
 
 
-def _find_lost(
-    tracker: Tracker, path: Path, k: int, step: int, read: Read, found_before: Collection[int]
-) -> bool:
+def _find_lost(tracker: Tracker, path: Path, k: int, read: Read) -> None:
     """Track a frame that is not sure from where it is to be expected, or look for it near a sure one.
 
-    Return True if it is found. It is not looked for again where the tracker has looked for it.
+    That is a later one, as the tracker came from earlier ones, if there is one.
     """
     frames = tracker.frames
     belief = believe(frames, path, k)
-    sure = [] if belief.is_sure else _list_sure(tracker, path, k, step)
-    if not sure:
-        return False
-    was_there = step == 1 and sure[0] not in found_before and not frames[k].is_key
-    if was_there and belief.expected is None and _was_followed(frames, path, sure[0]):
-        return False
-    panorama = read(k)
+    sure = [] if belief.is_sure else _list_sure(tracker, path, k, 1) or _list_sure(tracker, path, k, -1)
+    panorama = read(k) if sure else None
     if panorama is None or not panorama.is_valid.any():
-        return False
+        return
     query = tracker.prepare(panorama)
     poses = [believe(frames, path, m).states[0].pose for m in sure]
     times = [frames[m].time for m in sure]
@@ -113,34 +103,22 @@ def _find_lost(
     else:
         follower = Follower(poses[0], times[0], poses[1], times[1])
     found = find_from(query, follower, frames[k].time, tracker.motion)
-    if found is None or not found.is_alone:
-        return False
-    _hang(frames, path, k, sure[0], found.state)
-    frames[k].how = found.how
-    return True
+    if found is not None and found.is_alone:
+        _hang(frames, path, k, sure[0], found.state)
+        frames[k].how = found.how
 
 
 def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
     """List the nearest two sure frames in one direction from which a frame can be found."""
     frames = tracker.frames
     sure: list[int] = []
-    for m in range(k - step, len(frames) if step < 0 else -1, -step):
+    for m in range(k + step, len(frames) if step > 0 else -1, step):
         reach = tracker.motion.max_speed * abs(frames[k].time - frames[m].time)
         if reach > MAX_RADIUS or len(sure) == 2:
             break
         if believe(frames, path, m).is_sure:
             sure.append(m)
     return sure
-
-
-def _was_followed(frames: Sequence[Frame], path: Path, k: int) -> bool:
-    """Return True if the tracker was where the path says, and went on from there."""
-    key = k if frames[k].is_key else frames[k].key
-    chosen = None if key is None else path.chosen[key]
-    if key is None or chosen is None:
-        return False
-    departed = frames[key].departed
-    return departed is not None and is_same(departed, frames[key].states[chosen].pose)
 
 
 def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> None:
