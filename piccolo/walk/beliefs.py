@@ -19,7 +19,7 @@ class Belief(NamedTuple):
 
     states: list[State]
     probabilities: Array  # (S,) that each is of the frame's place
-    expected: Pose | None = None  # where tracking puts a frame, but where it was not refined
+    expected: Pose | None = None  # where tracking surely puts a frame, but where it was not refined
 
     @property
     def is_sure(self) -> bool:
@@ -60,8 +60,9 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     states = [State(pose, own.log_odds) for pose in carried]
     if is_same(carried[0], own.pose):
         return Belief([own, *states[1:]], probabilities)
+    expected = carried[0] if probabilities[0] > EVEN else None
     probabilities[0] = min(probabilities[0], EVEN)  # nothing was seen there
-    return Belief(states, probabilities, carried[0])
+    return Belief(states, probabilities, expected)
 
 
 def share_of_next(frames: Sequence[Frame], path: Path, k: int, at_key: Belief) -> float:

@@ -17,7 +17,8 @@ from .motion import MAX_STEP, Motion, carry
 from .path import Path, build_lattice
 from .tracker import MAX_RADIUS, Follower, Tracker, find_from, move_on, refine_state
 
-LONGER = 3.0  # than the median step: no step of photos without times
+MOST_STEPS = 0.9  # of photos without times: the longest step is LONGER than so many of them
+LONGER = 1.5
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
@@ -59,7 +60,7 @@ def estimate_motion(tracker: Tracker) -> Motion:
     alone = [f.alone.pose if f.alone and f.alone.status == LOCALIZED else None for f in tracker.frames]
     pairs = [(a.center_world, b.center_world) for a, b in pairwise(alone) if a is not None and b is not None]
     steps = [step for a, b in pairs if (step := float(np.linalg.norm(b - a))) >= MIN_DISTANCE]
-    longest = LONGER * float(np.median(steps)) if steps else 0.0
+    longest = LONGER * float(np.quantile(steps, MOST_STEPS, method="higher")) if steps else 0.0
     return replace(motion, max_speed=max(MAX_STEP, longest), is_guess=False)
 
 
@@ -84,28 +85,41 @@ def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
 
 
 def _find_lost(tracker: Tracker, path: Path, k: int, read: Read) -> None:
-    """Track a frame that is not sure from where it is to be expected, or look for it near a sure one.
-
-    That is a later one, as the tracker came from earlier ones, if there is one.
-    """
+    """Track a frame that is not sure from where it is to be expected, or look for it near a sure one."""
     frames = tracker.frames
     belief = believe(frames, path, k)
-    sure = [] if belief.is_sure else _list_sure(tracker, path, k, 1) or _list_sure(tracker, path, k, -1)
-    panorama = read(k) if sure else None
+    ways = [] if belief.is_sure else _list_ways(tracker, path, k)
+    key = frames[k].key
+    if key is not None and belief.expected is not None:
+        ways.insert(0, (key, Follower(belief.expected, frames[k].time)))
+    panorama = read(k) if ways else None
     if panorama is None or not panorama.is_valid.any():
         return
     query = tracker.prepare(panorama)
+    for begin, follower in ways:
+        found = find_from(query, follower, frames[k].time, tracker.motion)
+        if found is not None and found.is_alone:
+            _hang(frames, path, k, begin, found.state)
+            frames[k].how = found.how
+            return
+
+
+def _list_ways(tracker: Tracker, path: Path, k: int) -> list[tuple[int, Follower]]:
+    """List the sure frame from which a frame can be found, if there is one, with its pose.
+
+    It is a later one if possible, as the tracker came from earlier ones.
+    """
+    frames = tracker.frames
+    sure = _list_sure(tracker, path, k, 1) or _list_sure(tracker, path, k, -1)
+    if not sure:
+        return []
     poses = [believe(frames, path, m).states[0].pose for m in sure]
     times = [frames[m].time for m in sure]
-    if belief.expected or frames[k].odometry or len(sure) == 1:
-        start = belief.expected or move_on(poses[0], frames[sure[0]], frames[k])
-        follower = Follower(start, times[0])
+    if frames[k].odometry or len(sure) == 1:
+        follower = Follower(move_on(poses[0], frames[sure[0]], frames[k]), times[0])
     else:
         follower = Follower(poses[0], times[0], poses[1], times[1])
-    found = find_from(query, follower, frames[k].time, tracker.motion)
-    if found is not None and found.is_alone:
-        _hang(frames, path, k, sure[0], found.state)
-        frames[k].how = found.how
+    return [(sure[0], follower)]
 
 
 def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
