@@ -179,13 +179,17 @@ def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
     return covariance
 
 
-def estimate_covariance(query: Query, pose: Pose, of_camera: Array | None = None) -> PoseCovariance | None:
+def estimate_covariance(
+    query: Query, pose: Pose, of_camera: Array | None = None, seen_from: Pose | None = None
+) -> PoseCovariance | None:
     """Estimate the covariance of a pose, in world axes; None where the points do not fix it.
 
-    `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration.
+    `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration. `seen_from` is a pose
+    so near that it sees the same points, those behind occluders among them.
     """
-    query = mask_occluders(query, pose)
-    points = remove_poles(query.points_at(pose).around(pose.center_world), pose)
+    whole, query = query, mask_occluders(query, pose)
+    seen = query.points_at(pose) if seen_from is None else whole.points_at(seen_from)
+    points = remove_poles(seen.around(pose.center_world), pose)
     points = points._replace(channels=to_levels(points.channels))
     covariance = compute_covariance(query, points, pose)
     if covariance is None:

@@ -16,7 +16,7 @@ from ..jobs.threads import Workers
 from ..localization.attempts import FIRST_BEAM, brief_query
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
-from ..localization.last_descent import FULL_LIMITS
+from ..localization.last_descent import FULL_LIMITS, NEARLY
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
@@ -245,15 +245,6 @@ def list_key_states(query: Query, refined: Sequence[State], is_sure: bool = Fals
     return states[:MOST_PLACES]
 
 
-def make_state(query: Query, end: Hypothesis) -> State:
-    """Make the state of a frame that has one pose, with its odds by whole views."""
-    covariance = estimate_covariance(query, end.pose)
-    asked = replace(query, num_parts=0)
-    probability = posterior(assess_poses(asked, end, []), covariance)[0]
-    odds = log_odds_of_place(float(probability), float(probability), covariance)
-    return State(end.pose, odds, end.score, covariance)
-
-
 def refine_state(query: Query, states: Sequence[State], rough: State) -> list[State]:
     """Refine a rough state; its odds are then relative to those of the best refined one.
 
@@ -330,21 +321,26 @@ def track(query: Query, *starts: Pose) -> State | None:
     """
     ends: list[State] = []
     for start in starts:
-        ends.append(make_state(query, descend_last(query, descend_middle(query, start).pose)))
+        ends.append(descend_last(query, descend_middle(query, start).pose))
         if ends[-1].log_odds >= SURE_ODDS:
             break
     end = max(ends, key=lambda state: state.log_odds)
     if end.log_odds < SURE_ODDS:
-        around = make_state(query, descend_last(query, perturb_middle(query, end.pose).pose))
+        around = descend_last(query, perturb_middle(query, end.pose).pose)
         end = max(end, around, key=lambda state: state.log_odds)
     return None if end.log_odds < 0.0 or is_mirrored(query, end.pose) else end
 
 
-def descend_last(query: Query, pose: Pose) -> Hypothesis:
-    """Descend on fine cells and the points themselves, and score the end by comparison with the photo."""
-    pose = descend_fine(query, pose).pose
-    pose = descend(query.points_at(pose), query.photo.images.full(), pose, FULL_LIMITS)
-    return score_pose(query, pose)
+def descend_last(query: Query, start: Pose) -> State:
+    """Descend on fine cells, then on the points themselves; return the end, with its odds by whole views."""
+    near = descend_fine(query, start).pose
+    pose = descend(query.points_at(near), query.photo.images.full(), near, FULL_LIMITS)
+    end = score_pose(query, pose)
+    is_near = np.linalg.norm(pose.center_world - near.center_world) < NEARLY
+    covariance = estimate_covariance(query, pose, seen_from=near if is_near else None)
+    standings = assess_poses(replace(query, num_parts=0), end, [])
+    probability = float(posterior(standings, covariance)[0])
+    return State(pose, log_odds_of_place(probability, probability, covariance), end.score, covariance)
 
 
 def find_near(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
