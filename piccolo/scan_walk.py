@@ -143,7 +143,7 @@ class Walk:
         document = {
             "pano": taken.name,
             "sha256": taken.photo.sha256 if taken.photo else taken.sha256,
-            "is_read": taken.failure is None,
+            "is_passing": taken.failure and taken.failure.is_passing,
             "seconds": taken.seconds,
             "warnings": taken.warnings,
             "frame": frame.to_json(),
@@ -156,15 +156,13 @@ class Walk:
         document = json.loads(line)
         rig = self.read_options.rig
         found = document["pano"], document["frame"]["time"], document["sha256"]
-        if found != (name, time, sha256_of(picture, rig)):
+        if found != (name, time, sha256_of(picture, rig)) or document["is_passing"]:
             return False
-        if document["is_read"]:
+        if document["is_passing"] is None:
             seconds, warnings = document["seconds"], tuple(document["warnings"])
             taken = Taken(picture, name, photo_facts(picture, rig), seconds, warnings)
         else:
             taken = self.prepare(picture, name).taken
-            if taken.failure is None or taken.failure.is_passing:
-                return False
         alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
         self.accept(taken, Frame.from_json(document["frame"], alone))
         return True

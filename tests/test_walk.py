@@ -171,8 +171,8 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building)
 
 def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, building, monkeypatch):
     _, queries = building
-    monkeypatch.setattr(tracker_module, "TELLING_DISTANCE", 0.4)  # [m] the camera goes 0.23 at a time
-    walk = scan.track(gravity="known")
+    monkeypatch.setattr(tracker_module, "SAME_PLACE", 0.4)  # [m] the camera goes 0.23 at a time
+    walk = scan.track(max_speed=0.6, gravity="known")
     live = [walk.add(q.image, q.time) for q in queries]
     _assert_right(live, queries)
     assert [frame.is_key for frame in walk.tracker.frames] == [k % 2 == 0 for k in range(NUM_FRAMES)]

@@ -1,5 +1,6 @@
 """Tracking of a camera through a scan, frame by frame, from past frames only."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from ..jobs.threads import Workers
 from ..localization.attempts import FIRST_BEAM, brief_query
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
-from ..localization.last_descent import FULL_LIMITS, NEARLY
+from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
@@ -268,9 +269,9 @@ def move_on(pose: Pose, before: Frame, frame: Frame) -> Pose:
 
 
 def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
-    """Find a frame from the pose of another: by descents from there, and by a search around if not sure."""
+    """Find a frame from the pose of another: by descents from there, or by a search around."""
     state = follow(query, f, time, motion)
-    if state is not None and state.log_odds >= SURE_ODDS:
+    if state is not None and state.log_odds >= MOST_EXPECTED:
         return Found(state, "tracked")
     near = find_near(query, f, time, motion)
     if state is None:
@@ -315,29 +316,33 @@ def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> P
 
 
 def track(query: Query, *starts: Pose) -> State | None:
-    """Descend from poses until an end is sure, else from poses around the best end.
+    """Descend from poses until an end is likely, and from poses around the best if it is not sure.
 
     None if the end more likely is wrong than right, or the photo mirrored.
     """
     ends: list[State] = []
-    for start in starts:
-        ends.append(descend_last(query, descend_middle(query, start).pose))
-        if ends[-1].log_odds >= SURE_ODDS:
-            break
+    highest = -math.inf
+    for start in (*starts, None):
+        end = max(ends, key=lambda state: state.log_odds, default=None)
+        if end is not None and end.log_odds >= (SURE_ODDS if start is None else 0.0):
+            continue
+        middle = perturb_middle(query, ends[-1].pose) if start is None else descend_middle(query, start)
+        fit = descend_fine(query, middle.pose)
+        if fit.score > highest:
+            ends.append(descend_last(query, fit.pose))
+            highest = fit.score
     end = max(ends, key=lambda state: state.log_odds)
-    if end.log_odds < SURE_ODDS:
-        around = descend_last(query, perturb_middle(query, end.pose).pose)
-        end = max(end, around, key=lambda state: state.log_odds)
     return None if end.log_odds < 0.0 or is_mirrored(query, end.pose) else end
 
 
 def descend_last(query: Query, start: Pose) -> State:
-    """Descend on fine cells, then on the points themselves; return the end, with its odds by whole views."""
-    near = descend_fine(query, start).pose
-    pose = descend(query.points_at(near), query.photo.images.full(), near, FULL_LIMITS)
+    """Descend on the points themselves; return the end, with its odds by whole views."""
+    pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
     end = score_pose(query, pose)
-    is_near = np.linalg.norm(pose.center_world - near.center_world) < NEARLY
-    covariance = estimate_covariance(query, pose, seen_from=near if is_near else None)
+    is_near = np.linalg.norm(pose.center_world - start.center_world) < NEARLY
+    covariance = None
+    if end.score >= HOPELESS_SCORE:
+        covariance = estimate_covariance(query, pose, seen_from=start if is_near else None)
     standings = assess_poses(replace(query, num_parts=0), end, [])
     probability = float(posterior(standings, covariance)[0])
     return State(pose, log_odds_of_place(probability, probability, covariance), end.score, covariance)
