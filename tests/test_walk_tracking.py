@@ -56,12 +56,6 @@ def test_a_descent_goes_on_around_an_end_that_is_not_sure(seen, monkeypatch):
     assert len(asked) == 1
 
 
-def test_the_next_start_is_tried_if_the_first_leads_nowhere(seen):
-    query, true = seen
-    far = _off(true, 2.0, 90.0)
-    assert pose_errors(track(query, far, true).pose, true)[0] < 0.02
-
-
 def test_a_frame_is_followed_no_farther_than_its_motion_allows(seen):
     query, true = seen
     behind = Follower(_off(true, -0.3, 0.0), 0.0)

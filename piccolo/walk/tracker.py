@@ -1,6 +1,5 @@
 """Tracking of a camera through a scan, frame by frame, from past frames only."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -285,20 +284,16 @@ def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found |
 
 
 def follow(query: Query, f: Follower, time: float, motion: Motion) -> State | None:
-    """Descend from a predicted pose, and from the last one if that is not sure.
-
-    None if there is no pose, or nobody reaches it.
-    """
-    starts = [f.pose]
+    """Descend from a predicted pose; None if there is no end, or nobody reaches it."""
+    start = f.pose
     reach = radius = motion.max_speed * abs(time - f.time) + REACH_SLACK
     if f.earlier is not None and f.time != f.earlier_time:
-        ratio = (time - f.time) / (f.time - f.earlier_time)
-        starts.insert(0, predict(f.pose, f.earlier, ratio, reach))
+        start = predict(f.pose, f.earlier, (time - f.time) / (f.time - f.earlier_time), reach)
         radius = min(reach, motion.max_acceleration * (time - f.time) ** 2 + REACH_SLACK)
-    end = track(query, *starts)
+    end = track(query, start)
     if end is None:
         return None
-    moves = [float(np.linalg.norm(end.pose.center_world - at.center_world)) for at in (starts[0], f.pose)]
+    moves = [float(np.linalg.norm(end.pose.center_world - at.center_world)) for at in (start, f.pose)]
     return end if moves[0] <= radius and moves[1] <= reach else None
 
 
@@ -315,23 +310,17 @@ def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> P
     return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
 
 
-def track(query: Query, *starts: Pose) -> State | None:
-    """Descend from poses until an end is likely, and from poses around the best if it is not sure.
+def track(query: Query, start: Pose) -> State | None:
+    """Descend from a pose, and from poses around the end if it is not sure.
 
     None if the end more likely is wrong than right, or the photo mirrored.
     """
-    ends: list[State] = []
-    highest = -math.inf
-    for start in (*starts, None):
-        end = max(ends, key=lambda state: state.log_odds, default=None)
-        if end is not None and end.log_odds >= (SURE_ODDS if start is None else 0.0):
-            continue
-        middle = perturb_middle(query, ends[-1].pose) if start is None else descend_middle(query, start)
-        fit = descend_fine(query, middle.pose)
-        if fit.score > highest:
-            ends.append(descend_last(query, fit.pose))
-            highest = fit.score
-    end = max(ends, key=lambda state: state.log_odds)
+    fit = descend_fine(query, descend_middle(query, start).pose)
+    end = descend_last(query, fit.pose)
+    if end.log_odds < SURE_ODDS:
+        around = descend_fine(query, perturb_middle(query, end.pose).pose)
+        if around.score > fit.score:
+            end = max(end, descend_last(query, around.pose), key=lambda state: state.log_odds)
     return None if end.log_odds < 0.0 or is_mirrored(query, end.pose) else end
 
 
