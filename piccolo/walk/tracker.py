@@ -13,7 +13,7 @@ from ..geometry.rotations import uniform_yaws
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..localization.attempts import FIRST_BEAM, brief_query
+from ..localization.attempts import brief_query
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
 from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY
@@ -29,7 +29,7 @@ from ..localization.refinement import (
 )
 from ..localization.search import search_poses
 from ..localization.selection import assess_poses, rank
-from ..localization.settings import CoarseToFineSettings
+from ..localization.settings import Beam, CoarseToFineSettings
 from ..panorama import Panorama
 from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
@@ -53,6 +53,7 @@ from .path import COPY_LOG_ODDS, MOST_EXPECTED, REACH_SLACK, Lattice
 from .places import MOST_PLACES, find_places, is_mirror_image, is_mirrored, log_behind
 
 SURE_ODDS = 4.0  # [log] 98 %: of 580 wrong ends of descents near the pose two had more than 2.4, 3.1 at most
+NEAR_BEAM = Beam(25, 6, 3, 1)  # of a search near, whose best pose is tracked
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere
 LAST_SEARCH = 48  # and again, at the latest
@@ -352,7 +353,7 @@ def find_near(query: Query, f: Follower, time: float, motion: Motion) -> Found |
     level = f.pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
     close = replace(query, scan_map=some, cache=Cache(query.cache.views), num_parts=0, rotations=level)
     first = brief_query(close)
-    ends = refine(first, search_poses(first, "known"), FIRST_BEAM)
+    ends = refine(first, search_poses(first, "known"), NEAR_BEAM)
     found = rank([h for h in ends if np.linalg.norm(h.pose.center_world - f.pose.center_world) <= radius])
     state = track(query, found.best.pose)
     if state is None or state.log_odds < MOST_EXPECTED:  # it is not where it was to be expected
