@@ -64,9 +64,9 @@ def test_a_frame_is_followed_no_farther_than_its_motion_allows(seen):
     )
     assert follow(query, Follower(_off(true, -0.2, 0.0), 0.0), 1.0, Motion(max_speed=1e-3)) is not None
     assert follow(query, Follower(_off(true, -0.4, 0.0), 0.0), 1.0, Motion(max_speed=1e-3)) is None
-    turned = Follower(true, 0.5, _off(true, -1.0, 0.0), 0.0)  # walks on at 2 m/s
-    assert follow(query, turned, 1.0, Motion(max_acceleration=4.0)) is not None
-    assert follow(query, turned, 1.0, Motion(max_acceleration=1.0)) is None
+    turned = Follower(true, 0.5, _off(true, -0.35, 0.0), 0.0)  # walked at 0.7 m/s, and stands
+    assert follow(query, turned, 1.0, Motion(max_acceleration=2.0)) is not None
+    assert follow(query, turned, 1.0, Motion(max_acceleration=0.1)) is None
 
 
 def test_a_frame_is_found_near_a_pose(seen):
