@@ -187,17 +187,17 @@ def estimate_covariance(
     `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration. `seen_from` is a pose
     so near that it sees the same points, those behind occluders among them.
     """
-    whole, query = query, mask_occluders(query, pose)
-    seen = query.points_at(pose) if seen_from is None else whole.points_at(seen_from)
+    shown = mask_occluders(query, pose)
+    seen = shown.points_at(pose) if seen_from is None else query.points_at(seen_from)
     points = remove_poles(seen.around(pose.center_world), pose)
     points = points._replace(channels=to_levels(points.channels))
-    covariance = compute_covariance(query, points, pose)
+    covariance = compute_covariance(shown, points, pose)
     if covariance is None:
         return None
     J = np.eye(6)
     J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
     pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
-    covariance_map = J @ covariance @ J.T + source_covariance(query, points, pixel_share)
+    covariance_map = J @ covariance @ J.T + source_covariance(shown, points, pixel_share)
     std_of_fit = None
     if of_camera is not None:
         std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))

@@ -15,9 +15,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import BLOCK, ranges_around
 
-REACH = (
-    1.6 * COARSE_SPACING
-)  # [m] between neighbours in the grid of candidates: across edges, not all corners
+REACH = 1.6 * COARSE_SPACING  # [m] to neighbours in the grid: across edges, not all corners
 SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
 DETOUR = 1.0 / math.cos(math.pi / 8.0)  # paths along edges and across squares are at most so much longer
 

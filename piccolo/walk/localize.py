@@ -19,6 +19,7 @@ from .path import Path
 from .tracker import Tracker
 
 PRIOR_FLOOR = 1e-6  # [m^2] least variance of a position
+LONGEST_STEP = 3.0  # [s] frames farther apart do not limit the acceleration
 
 # A frame's pose and covariance, both in the world
 Located = tuple[Pose, PoseCovariance]
@@ -139,6 +140,7 @@ def acceleration_rows(times: Sequence[float], motion: Motion) -> Any:
     before, after = steps[:-1], steps[1:]
     factors = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after])
     factors *= 2.0 / (before + after) / motion.max_acceleration
+    factors[:, np.maximum(before, after) > LONGEST_STEP] = 0.0
     row, offset = np.indices((len(before), 3))
     return csr_matrix((factors.T.ravel(), (row.ravel(), (row + offset).ravel())), (len(before), len(times)))
 

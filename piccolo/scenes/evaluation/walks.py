@@ -140,7 +140,7 @@ def alone_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Threshold
         counts: list[str] = []
         for some in (alone, [frame for frame, _ in searched]):
             s = summarize_walks([some], thresholds)
-            counts += [f"{n}" for n in (s.num_correct, s.num_localized, s.num_wrong)]
+            counts += [f"{n}" if some else "-" for n in (s.num_correct, s.num_localized, s.num_wrong)]
         rows.append((" ".join(name), f"{len(searched)}", *counts))
     return Table("frames that were searched in the whole scan", ("walk", "frames", *columns), tuple(rows))
 
