@@ -1,7 +1,6 @@
 """A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
-import json
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -41,20 +40,28 @@ class WalkAbout:
 
 @dataclass(frozen=True)
 class Taken:
-    """A frame as given by the user."""
+    """What is known of a frame besides its poses."""
 
-    picture: Picture
     name: str
     photo: PhotoFacts | None  # None of one that can't be read
     seconds: dict[str, float]
     warnings: tuple[str, ...] = ()
-    sha256: str | None = None  # of a photo that can't be read
-    failure: Failure | None = None  # why it can't
+    sha256: str | None = None  # of the file or files
+    failure: Failure | None = None  # why it can't be read
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A frame as it is kept on disk until the walk is finished."""
+
+    taken: Taken
+    frame: Frame
 
 
 class Prepared(NamedTuple):
     """A frame that is ready to be tracked."""
 
+    picture: Picture
     taken: Taken
     panorama: Panorama | None  # None of one that can't be read
     query: Query | None
@@ -74,6 +81,7 @@ class Walk:
         self.tracker = tracker
         self.read_options = read_options
         self.about = about
+        self.pictures: list[Picture] = []
         self.taken: list[Taken] = []
 
     def add(
@@ -106,16 +114,17 @@ class Walk:
                     raise
                 failure = Failure(text.replace(str(frame), name), is_passing)
                 digest = sha256_of(Path(frame), self.read_options.rig)
-                return Prepared(Taken(frame, name, None, watch.seconds, (), digest, failure), None, None)
+                return Prepared(frame, Taken(name, None, watch.seconds, (), digest, failure), None, None)
         with watch.stage("prepare"):
             query = self.tracker.prepare(panorama)
         warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
-        return Prepared(Taken(frame, name, photo, watch.seconds, warnings), panorama, query)
+        taken = Taken(name, photo, watch.seconds, warnings, photo.sha256)
+        return Prepared(frame, taken, panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
         """Localize a prepared frame, as `add` does."""
         number = len(self.taken)
-        taken, panorama, query = prepared
+        picture, taken, panorama, query = prepared
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
             check_times([self.tracker.frames[-1].time, when])
@@ -123,48 +132,36 @@ class Walk:
             self.tracker.forget_times()
         watch = Stopwatch(taken.seconds)
         if panorama is None or query is None:
-            self.accept(taken, Frame(when, odometry=odometry))
+            self.tracker.accept(Frame(when, odometry=odometry))
         else:
             with watch.stage("track"):
                 self.tracker.add(panorama, query, when, odometry)
-            self.taken.append(taken)
+        self.pictures.append(picture)
+        self.taken.append(taken)
         return self._now(self.tracker.frames[-1], number)
 
-    def accept(self, taken: Taken, frame: Frame) -> None:
-        """Add a frame that was localized earlier, or that can't be read."""
-        self.taken.append(taken)
-        self.tracker.accept(frame)
-
     def last_to_json(self) -> str:
-        """Return the last frame and its poses on one line, for `restore`."""
-        taken = self.taken[-1]
-        frame = self.tracker.frames[-1]
-        alone = frame.alone and result_of(frame.alone, cloud="", pano="", seconds={}, settings={}).to_json()
-        document = {
-            "pano": taken.name,
-            "sha256": taken.photo.sha256 if taken.photo else taken.sha256,
-            "is_passing": taken.failure and taken.failure.is_passing,
-            "seconds": taken.seconds,
-            "warnings": taken.warnings,
-            "frame": frame.to_json(),
-            "alone": alone,
-        }
-        return json.dumps(document)
+        """Return what is known of the last frame on one line, for `restore`."""
+        from msgspec.json import encode  # noqa: PLC0415  # only walks with a file wait for it
 
-    def restore(self, line: str, picture: Path, time: float, name: str) -> bool:
-        """Take the next frame from a line of `last_to_json`, if it is of this picture, unchanged."""
-        document = json.loads(line)
-        rig = self.read_options.rig
-        found = document["pano"], document["frame"]["time"], document["sha256"]
-        if found != (name, time, sha256_of(picture, rig)) or document["is_passing"]:
+        return encode(Kept(self.taken[-1], self.tracker.frames[-1]), enc_hook=np.ndarray.tolist).decode()
+
+    def restore(self, line: bytes, picture: Path, time: float, name: str) -> bool:
+        """Take the next frame from a line of `last_to_json`, if it is of this picture, unchanged.
+
+        Raises ValueError if it is no such line.
+        """
+        from msgspec.json import decode  # noqa: PLC0415  # only walks with a file wait for it
+
+        kept = decode(line, type=Kept, dec_hook=lambda _, rows: np.array(rows))
+        taken = kept.taken
+        found = taken.name, kept.frame.time, taken.sha256
+        is_same = found == (name, time, sha256_of(picture, self.read_options.rig))
+        if not is_same or (taken.failure and taken.failure.is_passing):
             return False
-        if document["is_passing"] is None:
-            seconds, warnings = document["seconds"], tuple(document["warnings"])
-            taken = Taken(picture, name, photo_facts(picture, rig), seconds, warnings)
-        else:
-            taken = self.prepare(picture, name).taken
-        alone = document["alone"] and localization_in(Result.from_json(document["alone"]))
-        self.accept(taken, Frame.from_json(document["frame"], alone))
+        self.pictures.append(picture)
+        self.taken.append(taken)
+        self.tracker.accept(kept.frame)
         return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
@@ -183,10 +180,9 @@ class Walk:
         return self._result(self.taken[number], add_places(self.tracker.scan_map, found), walk)
 
     def _panorama(self, k: int) -> Panorama | None:
-        taken = self.taken[k]
-        if taken.failure is not None:
+        if self.taken[k].failure is not None:
             return None
-        return replace(read_photo(taken.picture, self.read_options), focal_prior=None)
+        return replace(read_photo(self.pictures[k], self.read_options), focal_prior=None)
 
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
         """Return the result of a frame; a frame that can't be read keeps its place in the walk."""
@@ -207,9 +203,3 @@ class Walk:
             source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
             walk=walk,
         )
-
-
-def localization_in(result: Result) -> Localization:
-    """Return the localization in a result."""
-    names = {f.name for f in fields(Localization)} - {"pose", "warnings", "cameras", "standings"}
-    return Localization(pose=result.best_pose, **{name: getattr(result, name) for name in names})

@@ -260,6 +260,19 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     assert len(added) == 2
 
 
+def test_frames_come_back_from_their_lines(scan, building):
+    walk, again = scan.track(gravity="known"), scan.track(gravity="known")
+    for k, query in enumerate(building[1][:3]):
+        path = query.image if k != 1 else building[0] / "cloud.ply"  # no picture
+        walk.add(path, query.time, "name", query.pose)
+        line = walk.last_to_json()
+        assert not again.restore(line.encode(), path, query.time, "another")
+        assert not again.restore(line.encode(), building[1][4].image, query.time, "name")
+        assert again.restore(line.encode(), path, query.time, "name")
+        assert again.last_to_json() == line
+    assert again.taken[1].failure == walk.taken[1].failure is not None
+
+
 def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys):
     folder, queries = building
     walk = ["--walk", "--pano", *(str(q.image) for q in queries[:2]), "--out", str(tmp_path / "a.jsonl")]

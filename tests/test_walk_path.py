@@ -249,14 +249,6 @@ def test_nobody_turns_round_at_once():
         assert (path.chosen == [0, 0] and path.gaps == [None, None]) == is_reached
 
 
-def test_frames_come_back_from_json():
-    frame = _key(3.5, ((1, 2, 3), 4.0))
-    frame.arrived, frame.key, frame.odometry = _pose(1, 1, 1), 2, _pose(5, 5, 5, yaw=0.3)
-    again = Frame.from_json(frame.to_json(), None)
-    assert again.to_json() == frame.to_json()
-    assert again.odometry.R_cam_from_world.tobytes() == frame.odometry.R_cam_from_world.tobytes()
-
-
 def test_refusals():
     with pytest.raises(InputError, match=r"^times: found 1.0 after 2.0 at frame 2, wanted them to rise$"):
         check_times([0.0, 2.0, 1.0])

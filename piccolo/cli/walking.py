@@ -247,8 +247,8 @@ def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, key: str, i
     kept = len(first)
     for frame, line in zip(frames, lines, strict=False):
         try:
-            is_same = walk.restore(line.decode(), frame.path, frame.time, frame.name)
-        except (ValueError, KeyError, TypeError) as error:
+            is_same = walk.restore(line, frame.path, frame.time, frame.name)
+        except ValueError as error:
             raise InputError(f"{path}: found a damaged line ({type(error).__name__}); {WAYS}") from error
         if not is_same:
             break

@@ -8,7 +8,7 @@ wherever the key frame was, they are as far from there.
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +19,6 @@ from ..confidence.localization import Localization
 from ..geometry.pose import MAX_DISTANCE, Array, Pose, pose_errors
 from ..scan_map.scan_map import ScanMap
 
-POSES = ("arrived", "departed", "odometry")  # of a Frame
 How = Literal["alone", "near", "tracked", "none"]
 SAME_PLACE = 2.0  # [m] poses nearer to each other: key frames are so far apart
 SAME_HEADING = math.radians(45.0)  # and this are of one place
@@ -70,21 +69,6 @@ class Frame:
         """Make the frame a key frame with these states."""
         self.states = states
         self.is_key = True
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the frame for JSON, without its result alone."""
-        plain = {name: getattr(self, name) for name in ("time", "how", "is_key", "key")}
-        poses = {name: _pose_json(getattr(self, name)) for name in POSES}
-        return {**plain, **poses, "states": [_state_json(state) for state in self.states]}
-
-    @classmethod
-    def from_json(cls, document: dict[str, Any], alone: Localization | None) -> "Frame":
-        """Make a frame from the output of `to_json` and its result alone."""
-        values: dict[str, Any] = {**document, "alone": alone}
-        values["states"] = [_state_from_json(state) for state in document["states"]]
-        for name in POSES:
-            values[name] = _pose_from_json(document[name])
-        return cls(**values)
 
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
@@ -144,28 +128,3 @@ def put_state(states: Sequence[State], state: State) -> list[State]:
 def state_centers(states: Sequence[State]) -> Array:
     """Return the positions (N, 3) [m] of states."""
     return np.array([state.pose.center_world for state in states]).reshape(-1, 3)
-
-
-def _pose_json(pose: Pose | None) -> Any:
-    return pose and [pose.R_cam_from_world.tolist(), pose.center_world.tolist()]
-
-
-def _pose_from_json(value: Any) -> Pose | None:
-    return None if value is None else Pose(np.array(value[0]), np.array(value[1]))
-
-
-def _state_json(state: State) -> dict[str, Any]:
-    covariance = state.covariance
-    return {
-        **vars(state),
-        "pose": _pose_json(state.pose),
-        "covariance": covariance and [covariance.matrix.tolist(), covariance.least_constrained_direction],
-    }
-
-
-def _state_from_json(document: dict[str, Any]) -> State:
-    """Make a state from the output of `_state_json`."""
-    pose = _pose_from_json(document["pose"])
-    given = document["covariance"]
-    covariance = None if given is None else PoseCovariance(np.array(given[0]), str(given[1]))
-    return State(**{**document, "pose": pose, "covariance": covariance})

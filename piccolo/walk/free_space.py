@@ -5,23 +5,19 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..geometry.pose import Array
-from ..geometry.sphere import find_cell
 from ..jobs.threads import Workers
-from ..scan_map.camera_positions import COARSE_SPACING, MIN_CLEARANCE
+from ..scan_map.camera_positions import CLEARANCE_VOXEL, COARSE_SPACING, MIN_CLEARANCE, nearest_distances
 from ..scan_map.scan_map import ScanMap
-from ..views.candidate_views import SEARCH_VIEW
-from ..views.view import BLOCK, ranges_around
 
 REACH = 1.6 * COARSE_SPACING  # [m] to neighbours in the grid: across edges, not all corners
-SLACK = 0.1  # [m] by which a surface may be nearer than a neighbour, as views are coarse
+TUBE_RADIUS = MIN_CLEARANCE / 2.0  # [m] of a free way
 DETOUR = 1.0 / math.cos(math.pi / 8.0)  # paths along edges and across squares are at most so much longer
 
 
 class FreeSpace:
-    """A map's candidates as a graph, with edges between neighbours that see each other."""
+    """A map's candidates as a graph, with edges between neighbours along free ways."""
 
     def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
         self.scan_map = scan_map
@@ -35,20 +31,30 @@ class FreeSpace:
 
     @cached_property
     def _graph(self) -> Any:
-        """Sparse matrix (candidates, candidates) of the edges' lengths [m]."""
-        from scipy.sparse import coo_matrix  # noqa: PLC0415
+        """Sparse matrix (candidates, candidates) of the edges' lengths [m].
 
-        m = self.scan_map
+        A way is free if a tube around it fits into the empty balls around its ends and its middle.
+        """
+        from scipy.sparse import coo_matrix  # noqa: PLC0415  # only walks wait for it
+        from scipy.spatial import cKDTree  # noqa: PLC0415
+
+        centers = self.scan_map.centers
+        points = self.scan_map.octree.level(CLEARANCE_VOXEL)[:, :3]
+        surfaces = cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+        def covered(places: Array) -> Array:
+            """Return half the length (N,) [m] of the longest tube in the ball around each place (N, 3)."""
+            distance = nearest_distances(surfaces, places, self.workers)
+            return np.sqrt(np.maximum(distance**2 - TUBE_RADIUS**2, 0.0))
+
         pairs = self._tree.query_pairs(REACH, output_type="ndarray")
-        both = np.concatenate([pairs, pairs[:, ::-1]])  # there and back
-        order = np.argsort(both[:, 0], kind="stable")
-        seen = np.empty(len(both), np.int64)
-        seen[order] = look_past(m, both[order, 0], both[order, 1], self.workers)
-        is_free = seen[: len(pairs)] + seen[len(pairs) :] > 0
-        first, second = pairs[is_free].T
-        length = np.linalg.norm(m.centers[second] - m.centers[first], axis=1)
-        ends = np.concatenate([first, second]), np.concatenate([second, first])
-        return coo_matrix((np.tile(length, 2), ends), (len(m.centers),) * 2).tocsr()
+        length = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
+        uncovered = length - covered(centers)[pairs].sum(axis=1)
+        some = uncovered > 0.0
+        uncovered[some] -= 2.0 * covered(centers[pairs[some]].mean(axis=1))
+        is_free = uncovered <= 0.0
+        one_way = coo_matrix((length[is_free], pairs[is_free].T), (len(centers), len(centers)))
+        return (one_way + one_way.T).tocsr()
 
     def distances(self, starts: Array, ends: Array, limit: float) -> Array:
         """Return distances (S, N) [m] from places (S, 3) to others (N, 3) in the map; inf beyond a limit."""
@@ -74,28 +80,3 @@ class FreeSpace:
         """Return the fraction of candidates within a radius [m] of a place (3,), counting at least one."""
         near = self._tree.query_ball_point(center, radius, return_length=True)
         return max(int(near), 1) / max(len(self.scan_map.centers), 1)
-
-
-def look_past(
-    scan_map: ScanMap, first: NDArray[Any], second: NDArray[Any], workers: Workers
-) -> NDArray[np.int64]:
-    """Return 1 (N,) if a candidate sees past its neighbour, 0 if it sees nothing, -2 if its view is blocked.
-
-    `first` (N,) and `second` (N,) are the pairs' candidates, `first` in ascending order. The way is free if
-    the sum of both directions is above 0: neither is blocked, and at least one sees past.
-    """
-    m = scan_map
-    toward = m.centers[second] - m.centers[first]
-    length = np.linalg.norm(toward, axis=1)
-    cell = find_cell((toward / length[:, None]).astype(np.float32), SEARCH_VIEW.num_rings)
-    nodes = np.unique(first)
-
-    def ranges_from(lo: int) -> NDArray[np.float32]:
-        some = nodes[lo : lo + BLOCK]
-        part = slice(*np.searchsorted(first, [some[0], some[-1] + 1]))
-        ranges = ranges_around(m.octree, m.centers[some], SEARCH_VIEW)
-        return ranges[np.searchsorted(some, first[part]), cell[part]]
-
-    parts = workers.map(ranges_from, range(0, len(nodes), BLOCK), "find ways")
-    ranges = np.concatenate([np.empty(0, np.float32), *parts])
-    return np.where(ranges > 0.0, np.where(ranges > length - SLACK, 1, -2), 0)
