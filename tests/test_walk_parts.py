@@ -13,7 +13,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.walk.frames import Frame
 from piccolo.walk.localize import PRIOR_FLOOR, smooth_positions
-from piccolo.walk.motion import MAX_STEP, NO_ACCELERATION, Motion
+from piccolo.walk.motion import MAX_STEP, Motion
 from piccolo.walk.second_look import estimate_motion
 
 MOTION = Motion(2.0, 0.5)
@@ -91,7 +91,7 @@ def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
         frame(900.0, "ambiguous"),
         Frame(0.0),
     ]
-    guess = Motion(MAX_STEP, NO_ACCELERATION, is_timed=False, is_guess=True)
+    guess = Motion(MAX_STEP, is_timed=False, is_guess=True)
 
     def longest(motion, frames):
         return estimate_motion(SimpleNamespace(motion=motion, frames=frames)).max_speed

@@ -11,7 +11,7 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker as tracker_module
 from piccolo.walk.frames import State
 from piccolo.walk.motion import Motion
-from piccolo.walk.places import find_places, is_mirror_image, is_mirrored
+from piccolo.walk.places import find_places, is_mirrored
 from piccolo.walk.tracker import (
     SURE_ODDS,
     Follower,
@@ -116,14 +116,14 @@ def test_the_places_that_look_like_a_photo(seen):
 def test_a_mirrored_photo_is_told_near_a_pose_and_anywhere(seen):
     query, true = seen
     assert not is_mirrored(query, true)
-    assert not is_mirror_image(query)
+    assert not is_mirrored(query)
     taken = rooms.query(SEED)
     rgb = np.ascontiguousarray(taken.rgb[:, ::-1])
     mirrored = prepare_query(
         rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(gravity="known"), Workers(2)
     )
     assert is_mirrored(mirrored, true)
-    assert is_mirror_image(mirrored)
+    assert is_mirrored(mirrored)
 
 
 def test_a_rough_place_is_refined_or_dropped(seen):

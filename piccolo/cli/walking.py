@@ -34,7 +34,7 @@ from ..panorama.video import frames_of
 from ..result import FAILED, Result, read_results
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from ..walk.motion import MAX_ACCELERATION, MAX_SPEED, MAX_STEP, NO_ACCELERATION, Motion
+from ..walk.motion import MAX_SPEED, MAX_STEP, Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY
@@ -92,8 +92,8 @@ def motion_of(max_speed: float | None, has_times: bool) -> Motion:
     if max_speed is not None and not 0.0 < max_speed < math.inf:
         raise UsageError(f"--max-speed: found {max_speed}, wanted a number above 0")
     if has_times:
-        return Motion(max_speed or MAX_SPEED, MAX_ACCELERATION, True, False)
-    return Motion(max_speed or MAX_STEP, NO_ACCELERATION, False, max_speed is None)
+        return Motion(max_speed or MAX_SPEED)
+    return Motion(max_speed or MAX_STEP, is_timed=False, is_guess=max_speed is None)
 
 
 def take_step(words: Sequence[Path | None]) -> tuple[Path | None, str]:

@@ -163,9 +163,9 @@ def is_whole(query: Query) -> bool:
     return query.settings.gravity != "unknown" and not query.photo.is_partial
 
 
-def brief_query(query: Query) -> Query:
-    """Return the query with fewer starts."""
-    settings = replace(query.settings, max_starts=min(FIRST_STARTS, query.settings.max_starts))
+def brief_query(query: Query, most: int = FIRST_STARTS) -> Query:
+    """Return the query with fewer starts, at most so many."""
+    settings = replace(query.settings, max_starts=min(most, FIRST_STARTS, query.settings.max_starts))
     return replace(query, settings=settings)
 
 

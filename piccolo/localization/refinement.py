@@ -132,6 +132,18 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
     return descend_around(cells, config.arrays.blocks, wide_image, narrow_image, pose, 1.0, query.workers)
 
 
+def refine_on_middle_cells(query: Query, pose: Pose) -> Fit:
+    """Descend from a pose, and from poses around the end for as long as the score on fine cells rises."""
+    fit = descend_fine(query, descend_middle(query, pose).pose)
+    for _ in range(MAX_PERTURBATIONS):
+        around = descend_fine(query, perturb_middle(query, fit.pose).pose)
+        gain = around.score - fit.score
+        fit = around if gain > 0.0 else fit
+        if gain < MIN_GAIN * around.score:
+            break
+    return fit
+
+
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:
     """Perturb and refine a pose for as long as its score rises.
 

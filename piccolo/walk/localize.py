@@ -116,7 +116,7 @@ def smooth_positions(located: Sequence[Located], times: Sequence[float], motion:
     from scipy.sparse import block_diag, eye, kron  # noqa: PLC0415  # only walks wait for it
     from scipy.sparse.linalg import splu  # noqa: PLC0415
 
-    if len(located) < 3:
+    if len(located) < 3 or not motion.is_timed:
         return list(located)
     rows = acceleration_rows(times, motion)
     smooth = kron(rows.T @ rows, eye(3))

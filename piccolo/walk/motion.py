@@ -13,7 +13,6 @@ MAX_ACCELERATION = 2.0  # [m/s^2]
 MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
 JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place that was not scanned
 UNTIMED_JUMP_LOG = -4.0  # between frames without times
-NO_ACCELERATION = 1e3  # [m] of frames without times: nothing is known of it
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class Motion:
     """The motion of a carried camera."""
 
     max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
-    max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis
+    max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis, of timed frames
     is_timed: bool = True  # False if only the order of the frames is known
     is_guess: bool = False  # True if no distance between frames was given: the poses found will give it
 

@@ -18,13 +18,14 @@ from numpy.typing import NDArray
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..geometry.pose import Array, Pose
+from ..scan_map.camera_positions import COARSE_SPACING
 from .frames import MOST_ODDS, Frame, State, state_centers
 from .free_space import FreeSpace
 from .motion import JUMP_LOG, Motion, carry
 
 COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
 MAX_TURN = math.pi  # [rad/s] of a person with a camera
-REACH_SLACK = 0.3  # [m] beyond what a person walks
+REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
 MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 NEGLIGIBLE = 20.0  # [log] below the best
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off

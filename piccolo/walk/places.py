@@ -4,6 +4,7 @@ Every candidate is scored in every heading, and the best start a short descent o
 they explain of the photo is compared with what the frame's own pose explains there.
 """
 
+import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -14,17 +15,12 @@ from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..confidence.confidence import MODELS, Standing, pose_features
 from ..geometry.pose import Array, Pose
 from ..geometry.rotations import uniform_yaws
-from ..geometry.sphere import wider_cells
 from ..geometry.suppression import non_maximum_suppression
-from ..localization.attempts import brief_query, is_whole, mirror_query, score_mirror, score_starts
-from ..localization.correlation import masked_correlation, weigh_by_area
-from ..localization.query import Query
+from ..localization.attempts import brief_query, mirror_query
+from ..localization.query import Cache, Query
 from ..localization.refinement import FIRST_ITERATIONS, descend_all
-from ..localization.search import Starts, best_poses, search_poses, turn_panorama, widen_samples
-from ..views.candidate_views import WIDE_RINGS
+from ..localization.search import Starts, search_poses
 
-NUM_STARTS = 16  # of these that begin a descent
-NUM_NEAR = 256  # candidates around a pose, about 3 m, at which a photo is compared with its mirror image
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 
 
@@ -35,24 +31,62 @@ class Place(NamedTuple):
     behind: float  # [log] of its odds to those of the frame's own pose
 
 
+class Ends(NamedTuple):
+    """Ends of short descents, best first."""
+
+    poses: Starts
+    scores: Array  # (N,)
+
+    @property
+    def best_score(self) -> float:
+        """Score of the best end; 0 if there is none."""
+        return float(self.scores.max(initial=0.0))
+
+
+def query_near(query: Query, pose: Pose, radius: float) -> Query:
+    """Return the query of whole views that searches within a radius [m] of a pose: its tilt, any heading."""
+    m = query.scan_map
+    distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
+    near = m if math.isinf(radius) else m.narrow(distances < radius)
+    level = pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
+    close = replace(query, scan_map=near, cache=Cache(query.cache.views), num_parts=0, rotations=level)
+    return brief_query(close, max(len(near.sparse), 1))
+
+
+def descend_briefly(query: Query) -> Ends:
+    """Search, and descend a few steps on the candidates' prepared views."""
+    starts = search_poses(query, "known")
+    image = query.photo.images.search()
+    return Ends(*descend_all(query.scan_map, image, starts, FIRST_ITERATIONS, query.workers))
+
+
+def is_mirrored(query: Query, ends: Ends) -> bool:
+    """Return True if the mirror image of a whole photo looks more like the map than the photo's ends."""
+    if query.photo.is_partial:
+        return False
+    across = np.diag([1.0, -1.0, 1.0])
+    mirror = replace(mirror_query(query), rotations=across @ query.rotations @ across)
+    return descend_briefly(mirror).best_score > ends.best_score
+
+
 def find_places(query: Query, own: Pose) -> list[Place]:
     """Find the distinct poses in the map that look like a photo, best first, beside its own pose.
 
     They have the tilt of that, and any heading.
     """
-    level = own.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
-    first = brief_query(replace(query, rotations=level))
-    starts = search_poses(first, "known")
     at_own = Starts(own.R_cam_from_world[None], own.center_world[None], nearest(query, own))
     image = query.photo.images.search()
     _, own_scores = descend_all(query.scan_map, image, at_own, FIRST_ITERATIONS, query.workers)
-    ends, scores = descend_all(query.scan_map, image, starts, FIRST_ITERATIONS, query.workers)
-    kept = non_maximum_suppression(ends.R_cam_from_map, ends.center_map, MOST_PLACES, MIN_DISTANCE, MIN_ANGLE)
-    ratios = scores[kept] / max(float(own_scores[0]), 1e-9)
-    return [
-        Place(pose, log_behind(query, float(ratio)))
-        for pose, ratio in zip(ends.take(kept).poses(), ratios, strict=True)
-    ]
+    return list_places(query, descend_briefly(query_near(query, own, math.inf)), float(own_scores[0]))
+
+
+def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
+    """List the distinct ends with their odds to a pose of a score."""
+    R, centers = ends.poses.R_cam_from_map, ends.poses.center_map
+    kept = non_maximum_suppression(R, centers, MOST_PLACES, MIN_DISTANCE, MIN_ANGLE)
+    ratios = ends.scores[kept] / max(own_score, 1e-9)
+    poses = ends.poses.take(kept).poses()
+    return [Place(p, log_behind(query, float(ratio))) for p, ratio in zip(poses, ratios, strict=True)]
 
 
 def log_behind(query: Query, ratio: float) -> float:
@@ -60,40 +94,6 @@ def log_behind(query: Query, ratio: float) -> float:
     standing = Standing(ratio, 1.0, None, is_shape=query.scan_map.has_shape)
     weight = MODELS[standing.kind].weights[0]
     return min(weight * float(pose_features(standing)[0]), 0.0)
-
-
-def is_mirrored(query: Query, pose: Pose) -> bool:
-    """Return True if the mirror image of a whole photo explains more near a pose than the photo."""
-    if query.photo.is_partial:
-        return False
-    across = np.diag([1.0, -1.0, 1.0])
-    R_mirrored = across @ pose.R_cam_from_world @ across
-    return score_near(mirror_query(query), pose, R_mirrored) > score_near(query, pose, pose.R_cam_from_world)
-
-
-def is_mirror_image(query: Query) -> bool:
-    """Return True if the mirror image of a whole upright photo looks more like any place of the map."""
-    if not is_whole(query):
-        return False
-    first = brief_query(query)
-    return score_mirror(query) > score_starts(first, search_poses(first, "known"))
-
-
-def score_near(query: Query, pose: Pose, R_cam_from_map: Array) -> float:
-    """Return the best score after short descents near a pose, in a rotation turned about the vertical."""
-    m = query.scan_map
-    rotations = R_cam_from_map @ uniform_yaws(query.settings.num_yaws)
-    samples, validity = turn_panorama(query.photo.images.search(), rotations)
-    wide = widen_samples(samples, validity, query.workers)
-    panorama = weigh_by_area(*wide, wider_cells(WIDE_RINGS)[1], 255)
-    distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
-    near = np.argsort(distances, kind="stable")[:NUM_NEAR]
-    scores = masked_correlation(m.wide_features[near], m.wide_seen[near], panorama, query.workers)
-    row, turn, _ = best_poses(scores, NUM_STARTS)
-    candidate = m.sparse[near[row]]
-    starts = Starts(rotations[turn], m.centers[candidate], candidate)
-    image = query.photo.images.search()
-    return float(descend_all(m, image, starts, FIRST_ITERATIONS, query.workers)[1].max())
 
 
 def nearest(query: Query, pose: Pose) -> NDArray[np.int64]:

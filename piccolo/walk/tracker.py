@@ -9,29 +9,20 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import posterior
 from ..geometry.pose import Pose, exp_so3, log_so3
-from ..geometry.rotations import uniform_yaws
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..localization.attempts import brief_query
+from ..localization.attempts import brief_query, is_whole
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
 from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
-from ..localization.query import Cache, Query, prepare_query
-from ..localization.refinement import (
-    descend,
-    descend_fine,
-    descend_middle,
-    perturb_middle,
-    refine,
-)
-from ..localization.search import search_poses
-from ..localization.selection import assess_poses, rank
-from ..localization.settings import Beam, CoarseToFineSettings
+from ..localization.query import Query, prepare_query
+from ..localization.refinement import descend, refine_on_middle_cells
+from ..localization.selection import assess_poses
+from ..localization.settings import CoarseToFineSettings
 from ..panorama import Panorama
-from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
 from .beliefs import EVEN
 from .frames import (
@@ -48,16 +39,12 @@ from .frames import (
     put_state,
 )
 from .free_space import FreeSpace
-from .motion import MAX_STEP, NO_ACCELERATION, Motion, carry
+from .motion import MAX_STEP, Motion, carry
 from .path import COPY_LOG_ODDS, MOST_EXPECTED, REACH_SLACK, Lattice
-from .places import MOST_PLACES, find_places, is_mirror_image, is_mirrored, log_behind
+from .places import MOST_PLACES, Place, descend_briefly, find_places, is_mirrored, list_places, query_near
 
-SURE_ODDS = 4.0  # [log] 98 %: of 580 wrong ends of descents near the pose two had more than 2.4, 3.1 at most
-NEAR_BEAM = Beam(25, 6, 3, 1)  # of a search near, whose best pose is tracked
+FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere; then after twice as many
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
-FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere
-LAST_SEARCH = 48  # and again, at the latest
-MOST_REFINED = 4  # places of a key frame, until one is as good as it looks
 
 
 class Follower(NamedTuple):
@@ -67,6 +54,19 @@ class Follower(NamedTuple):
     time: float
     earlier: Pose | None = None  # a pose before it
     earlier_time: float = 0.0
+
+
+class Expected(NamedTuple):
+    """Where the camera can be at a frame."""
+
+    last: Pose  # where it was
+    reach: float  # [m] from there, by its speed
+    start: Pose  # predicted
+    radius: float  # [m] from there, by its acceleration
+
+    def holds(self, pose: Pose) -> bool:
+        """Return True if a pose is where it was expected."""
+        return distance(pose, self.start) <= self.radius and distance(pose, self.last) <= self.reach
 
 
 class Found(NamedTuple):
@@ -107,7 +107,7 @@ class Tracker:
         Call it before the first frame.
         """
         step = MAX_STEP if self.motion.is_guess else self.motion.max_speed
-        self.motion = replace(self.motion, max_speed=step, max_acceleration=NO_ACCELERATION, is_timed=False)
+        self.motion = replace(self.motion, max_speed=step, is_timed=False)
         self.lattice = Lattice(self.lattice.space, self.motion)
 
     def prepare(self, panorama: Panorama) -> Query:
@@ -152,7 +152,7 @@ class Tracker:
             return
         self.num_lost += 1
         if frame.alone is not None:
-            self.next_search = self.num_lost + min(max(self.num_lost, FIRST_SEARCH), LAST_SEARCH)
+            self.next_search = max(2 * self.num_lost, FIRST_SEARCH)
 
     def _is_telling(self, frame: Frame) -> bool:
         """Return True if the camera has moved so far since the last key frame that it sees another place.
@@ -206,14 +206,15 @@ class Tracker:
         """Search the whole scan for a frame, which is then a key frame."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         is_sure = frame.is_localized_alone
-        is_wrong = not is_sure and is_mirror_image(query)
+        brief = brief_query(query)
+        is_wrong = not is_sure and is_whole(query) and is_mirrored(brief, descend_briefly(brief))
         if found := [] if is_wrong else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
             frame.make_key(list_key_states(query, found, is_sure))
 
     def _depart(self, query: Query, frame: Frame) -> None:
         """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it."""
-        for _ in range(MOST_REFINED):
+        while True:
             probabilities = self.lattice.filter_last()
             is_likely = probabilities >= EVEN * probabilities.max()
             odds = [state.log_odds for state in frame.states]
@@ -269,33 +270,56 @@ def move_on(pose: Pose, before: Frame, frame: Frame) -> Pose:
 
 
 def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
-    """Find a frame from the pose of another: by descents from there, or by a search around."""
-    state = follow(query, f, time, motion)
-    if state is not None and state.log_odds >= MOST_EXPECTED:
-        return Found(state, "tracked")
-    near = find_near(query, f, time, motion)
-    if state is None:
-        return near
-    if near is not None and near.state.log_odds > state.log_odds:
-        if is_same_place(near.state.pose, state.pose):
-            return Found(near.state, "tracked")
-        if near.is_alone:
-            return near
-    return Found(state, "tracked")
+    """Find a frame from the pose of another: where it is predicted, or where it looks best within reach.
+
+    None also if the photo is mirrored.
+    """
+    expected = expect(f, time, motion)
+    places: list[Place] = []
+    if expected.reach <= MAX_RADIUS:
+        near = query_near(query, f.pose, expected.reach)
+        ends = descend_briefly(near)
+        if is_mirrored(near, ends):
+            return None
+        places = list_places(query, ends, ends.best_score)
+    state = track(query, expected.start)
+    if state is not None and not expected.holds(state.pose):
+        state = None
+    if places and (state is None or state.log_odds < MOST_EXPECTED):
+        best = track(query, places[0].pose)
+        if best is not None and distance(best.pose, f.pose) <= expected.reach:
+            return choose(state, best, places, expected)
+    return None if state is None else Found(state, "tracked")
 
 
-def follow(query: Query, f: Follower, time: float, motion: Motion) -> State | None:
-    """Descend from a predicted pose; None if there is no end, or nobody reaches it."""
-    start = f.pose
-    reach = radius = motion.max_speed * abs(time - f.time) + REACH_SLACK
-    if f.earlier is not None and f.time != f.earlier_time:
-        start = predict(f.pose, f.earlier, (time - f.time) / (f.time - f.earlier_time), reach)
-        radius = min(reach, motion.max_acceleration * (time - f.time) ** 2 + REACH_SLACK)
-    end = track(query, start)
-    if end is None:
-        return None
-    moves = [float(np.linalg.norm(end.pose.center_world - at.center_world)) for at in (start, f.pose)]
-    return end if moves[0] <= radius and moves[1] <= reach else None
+def choose(state: State | None, best: State, places: Sequence[Place], expected: Expected) -> Found | None:
+    """Choose between the end of the descent from the predicted pose and that from the best place near.
+
+    What is not where it was predicted is to be sure, or within the motion and to look better than all around.
+    """
+    is_better = state is None or best.log_odds > state.log_odds
+    if state is not None and is_better and is_same_place(best.pose, state.pose):
+        return Found(best, "tracked")
+    is_alone = all(p.behind <= -COPY_LOG_ODDS or is_same(p.pose, best.pose) for p in places)
+    is_sure = state is None and best.log_odds >= MOST_EXPECTED
+    if is_better and (is_sure or (is_alone and expected.holds(best.pose))):
+        return Found(best, "near", is_alone)
+    return None if state is None else Found(state, "tracked")
+
+
+def distance(pose: Pose, other: Pose) -> float:
+    """Return the distance [m] of two poses."""
+    return float(np.linalg.norm(pose.center_world - other.center_world))
+
+
+def expect(f: Follower, time: float, motion: Motion) -> Expected:
+    """Predict where the camera is at a time, and how far from there it can be."""
+    reach = motion.max_speed * abs(time - f.time) + REACH_SLACK
+    if f.earlier is None or f.time == f.earlier_time:
+        return Expected(f.pose, reach, f.pose, reach)
+    start = predict(f.pose, f.earlier, (time - f.time) / (f.time - f.earlier_time), reach)
+    radius = motion.max_acceleration * (time - f.time) ** 2 + REACH_SLACK if motion.is_timed else reach
+    return Expected(f.pose, reach, start, radius)
 
 
 def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
@@ -312,17 +336,9 @@ def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> P
 
 
 def track(query: Query, start: Pose) -> State | None:
-    """Descend from a pose, and from poses around the end if it is not sure.
-
-    None if the end more likely is wrong than right, or the photo mirrored.
-    """
-    fit = descend_fine(query, descend_middle(query, start).pose)
-    end = descend_last(query, fit.pose)
-    if end.log_odds < SURE_ODDS:
-        around = descend_fine(query, perturb_middle(query, end.pose).pose)
-        if around.score > fit.score:
-            end = max(end, descend_last(query, around.pose), key=lambda state: state.log_odds)
-    return None if end.log_odds < 0.0 or is_mirrored(query, end.pose) else end
+    """Descend from a pose and around; None if the end more likely is wrong than right."""
+    end = descend_last(query, refine_on_middle_cells(query, start).pose)
+    return None if end.log_odds < 0.0 else end
 
 
 def descend_last(query: Query, start: Pose) -> State:
@@ -336,27 +352,3 @@ def descend_last(query: Query, start: Pose) -> State:
     standings = assess_poses(replace(query, num_parts=0), end, [])
     probability = float(posterior(standings, covariance)[0])
     return State(pose, log_odds_of_place(probability, probability, covariance), end.score, covariance)
-
-
-def find_near(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
-    """Search by whole views within walking distance of a pose.
-
-    None if no pose is sure, or the distance is too great: then the whole scan is to be searched.
-    """
-    radius = motion.max_speed * abs(time - f.time) + REACH_SLACK
-    if radius > MAX_RADIUS:
-        return None
-    x, y, z = (float(value) for value in query.scan_map.to_world(f.pose).center_world)
-    some = apply_prior(query.scan_map, Prior(near_world=(x, y, z), radius=radius))
-    if len(some.sparse) == 0:
-        return None
-    level = f.pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
-    close = replace(query, scan_map=some, cache=Cache(query.cache.views), num_parts=0, rotations=level)
-    first = brief_query(close)
-    ends = refine(first, search_poses(first, "known"), NEAR_BEAM)
-    found = rank([h for h in ends if np.linalg.norm(h.pose.center_world - f.pose.center_world) <= radius])
-    state = track(query, found.best.pose)
-    if state is None or state.log_odds < MOST_EXPECTED:  # it is not where it was to be expected
-        return None
-    behind = [log_behind(query, h.score / max(found.best.score, 1e-9)) for h in found.alternatives]
-    return Found(state, "near", max(behind, default=-np.inf) <= -COPY_LOG_ODDS)
