@@ -111,7 +111,7 @@ def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
     """Return where a frame was tracked to from key frame `m`, by way of later ones; None if it was not."""
     key = frames[k].key
     arrived = frames[k].arrived
-    if key is None or arrived is None or key <= m:
+    if key is None or arrived is None or not m < key < k:
         return arrived if key == m else None
     at_key = track_back(frames, m, key)
     departed = frames[key].departed

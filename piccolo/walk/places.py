@@ -74,10 +74,15 @@ def find_places(query: Query, own: Pose) -> list[Place]:
 
     They have the tilt of that, and any heading.
     """
-    at_own = Starts(own.R_cam_from_world[None], own.center_world[None], nearest(query, own))
+    ends = descend_briefly(query_near(query, own, math.inf))
+    return list_places(query, ends, score_briefly(query, own))
+
+
+def score_briefly(query: Query, pose: Pose) -> float:
+    """Return the score after a descent of a few steps from a pose."""
+    start = Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest(query, pose))
     image = query.photo.images.search()
-    _, own_scores = descend_all(query.scan_map, image, at_own, FIRST_ITERATIONS, query.workers)
-    return list_places(query, descend_briefly(query_near(query, own, math.inf)), float(own_scores[0]))
+    return float(descend_all(query.scan_map, image, start, FIRST_ITERATIONS, query.workers)[1][0])
 
 
 def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:

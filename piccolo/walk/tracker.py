@@ -41,7 +41,15 @@ from .frames import (
 from .free_space import FreeSpace
 from .motion import MAX_STEP, Motion, carry
 from .path import COPY_LOG_ODDS, MOST_EXPECTED, REACH_SLACK, Lattice
-from .places import MOST_PLACES, Place, descend_briefly, find_places, is_mirrored, list_places, query_near
+from .places import (
+    MOST_PLACES,
+    Place,
+    descend_briefly,
+    find_places,
+    is_mirrored,
+    list_places,
+    query_near,
+)
 
 FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere; then after twice as many
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
@@ -174,7 +182,7 @@ class Tracker:
             return
         frame.states = [found.state]
         frame.how = found.how
-        if found.is_alone:
+        if found.how == "tracked":
             frame.arrived = found.state.pose
             frame.key = self._last_key()
 
@@ -295,16 +303,19 @@ def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found |
 def choose(state: State | None, best: State, places: Sequence[Place], expected: Expected) -> Found | None:
     """Choose between the end of the descent from the predicted pose and that from the best place near.
 
-    What is not where it was predicted is to be sure, or within the motion and to look better than all around.
+    What is not where it was predicted is to be sure, or within the motion and to look better than all near.
     """
-    is_better = state is None or best.log_odds > state.log_odds
-    if state is not None and is_better and is_same_place(best.pose, state.pose):
+    if state is not None and best.log_odds <= state.log_odds:
+        return Found(state, "tracked")
+    if state is not None and is_same_place(best.pose, state.pose):
         return Found(best, "tracked")
     is_alone = all(p.behind <= -COPY_LOG_ODDS or is_same(p.pose, best.pose) for p in places)
-    is_sure = state is None and best.log_odds >= MOST_EXPECTED
-    if is_better and (is_sure or (is_alone and expected.holds(best.pose))):
-        return Found(best, "near", is_alone)
-    return None if state is None else Found(state, "tracked")
+    is_sure = best.log_odds >= MOST_EXPECTED
+    if is_alone and (is_sure or expected.holds(best.pose)):
+        return Found(best, "near", is_sure)
+    if state is None:
+        return Found(best, "near", False) if is_sure else None
+    return Found(state, "tracked")
 
 
 def distance(pose: Pose, other: Pose) -> float:
