@@ -6,19 +6,21 @@ import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
+from piccolo.localization import refinement
+from piccolo.localization.attempts import brief_query
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.walk import tracker as tracker_module
 from piccolo.walk.frames import State
 from piccolo.walk.motion import Motion
-from piccolo.walk.places import find_places, is_mirrored
+from piccolo.walk.path import MOST_EXPECTED
+from piccolo.walk.places import Place, descend_briefly, find_places, is_mirrored, query_near
 from piccolo.walk.tracker import (
-    SURE_ODDS,
+    Expected,
     Follower,
     Found,
+    choose,
+    expect,
     find_from,
-    find_near,
-    follow,
     predict,
     refine_state,
     track,
@@ -41,65 +43,64 @@ def _off(pose, metres, degrees):
     return Pose(turn @ pose.R_cam_from_world, pose.center_world + metres * np.array([0.8, 0.6, 0.0]))
 
 
-def test_a_descent_goes_on_around_an_end_that_is_not_sure(seen, monkeypatch):
+def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
     query, true = seen
     asked = []
-    perturb = tracker_module.perturb_middle
+    perturb = refinement.perturb_middle
     monkeypatch.setattr(
-        tracker_module, "perturb_middle", lambda query, pose: asked.append(pose) or perturb(query, pose)
+        refinement, "perturb_middle", lambda query, pose: asked.append(pose) or perturb(query, pose)
     )
     end = track(query, true)
     assert pose_errors(end.pose, true)[0] < 0.02
-    assert end.log_odds > SURE_ODDS
-    assert not asked
-    assert track(query, _off(true, 2.0, 90.0)) is None
+    assert end.log_odds > MOST_EXPECTED
     assert len(asked) == 1
+    far = track(query, _off(true, 0.6, 20.0))
+    assert pose_errors(far.pose, true)[0] < 0.02
+    assert track(query, _off(true, 2.0, 90.0)) is None
+    assert 3 < len(asked) <= 1 + 2 * refinement.MAX_PERTURBATIONS
 
 
-def test_a_frame_is_followed_no_farther_than_its_motion_allows(seen):
+def test_a_camera_is_expected_no_farther_than_its_motion_allows(seen):
+    _, true = seen
+    ahead = _off(true, 0.5, 0.0)
+    assert expect(Follower(true, 0.0), 1.0, Motion()).holds(ahead)
+    assert not expect(Follower(true, 0.0), 1.0, Motion(max_speed=1e-3)).holds(ahead)
+    stands = Follower(true, 0.5, _off(true, -0.35, 0.0), 0.0)  # walked at 0.7 m/s
+    assert expect(stands, 1.0, Motion(max_acceleration=2.0)).holds(true)
+    assert not expect(stands, 1.0, Motion(max_acceleration=0.1)).holds(true)
+    assert expect(stands, 1.0, Motion(max_acceleration=0.1, is_timed=False)).holds(true)
+
+
+def test_a_frame_is_found_where_it_is_predicted_or_near(seen):
     query, true = seen
-    behind = Follower(_off(true, -0.3, 0.0), 0.0)
-    assert follow(query, behind, 1.0, Motion()).pose.center_world == pytest.approx(
-        true.center_world, abs=0.02
-    )
-    assert follow(query, Follower(_off(true, -0.2, 0.0), 0.0), 1.0, Motion(max_speed=1e-3)) is not None
-    assert follow(query, Follower(_off(true, -0.4, 0.0), 0.0), 1.0, Motion(max_speed=1e-3)) is None
-    turned = Follower(true, 0.5, _off(true, -0.35, 0.0), 0.0)  # walked at 0.7 m/s, and stands
-    assert follow(query, turned, 1.0, Motion(max_acceleration=2.0)) is not None
-    assert follow(query, turned, 1.0, Motion(max_acceleration=0.1)) is None
+    for off, how in ((_off(true, 0.1, 5.0), "tracked"), (_off(true, 1.6, 120.0), "near")):
+        found = find_from(query, Follower(off, 0.0), 1.0, Motion())
+        assert (found.how, found.is_alone) == (how, True)
+        assert pose_errors(found.state.pose, true)[0] < 0.02
+    assert find_from(query, Follower(off, 0.0), 10.0, Motion()) is None, "too far to look around"
+    assert find_from(query, Follower(_off(true, 50.0, 0.0), 0.0), 1.0, Motion()) is None
+    rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
+    mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
+    assert find_from(mirrored, Follower(true, 0.0), 1.0, Motion()) is None
 
 
-def test_a_frame_is_found_near_a_pose(seen):
-    query, true = seen
-    near = Follower(_off(true, 0.8, 40.0), 0.0)
-    found = find_near(query, near, 1.0, Motion())
-    assert (found.how, found.is_alone) == ("near", True)
-    assert pose_errors(found.state.pose, true)[0] < 0.02
-    assert find_near(query, near, 10.0, Motion()) is None, "too far to look around"
-    assert find_near(query, Follower(_off(true, 50.0, 0.0), 0.0), 1.0, Motion()) is None
-
-
-def test_a_better_pose_near_replaces_one_that_is_not_sure(seen, monkeypatch):
-    """It counts as tracked at the same place; elsewhere it must be the only one of its kind."""
-    query, true = seen
-    follower = Follower(true, 0.0)
-    own = State(true, 1.0, 0.5)
-    beside, elsewhere = _off(true, 0.2, 0.0), _off(true, 5.0, 0.0)
-    cases = (
-        (None, own, "tracked"),
-        (Found(State(beside, 0.5, 0.5), "near"), own, "tracked"),  # no better
-        (Found(State(beside, 3.5, 0.5), "near", is_alone=False), beside, "tracked"),
-        (Found(State(elsewhere, 3.5, 0.5), "near", is_alone=False), own, "tracked"),
-        (Found(State(elsewhere, 3.5, 0.5), "near"), elsewhere, "near"),
-    )
-    monkeypatch.setattr(tracker_module, "follow", lambda *_: own)
-    for near, wanted, how in cases:
-        monkeypatch.setattr(tracker_module, "find_near", lambda *_, near=near: near)
-        found = find_from(query, follower, 1.0, Motion())
-        assert (found.state if wanted is own else found.state.pose) is wanted
-        assert found.how == how
-    monkeypatch.setattr(tracker_module, "follow", lambda *_: None)
-    assert find_from(query, follower, 1.0, Motion()) is near
+def test_a_pose_near_replaces_the_predicted_one_if_it_is_surer(seen):
+    """At the same place it counts as tracked; elsewhere it must be the only one of its kind, or sure."""
+    _, true = seen
+    own, weak = State(true, 1.0, 0.5), State(true, 0.5, 0.5)
+    beside, elsewhere = State(_off(true, 0.2, 0.0), 3.5, 0.5), State(_off(true, 5.0, 0.0), 3.5, 0.5)
+    doubtful = State(elsewhere.pose, 2.0, 0.5)
+    near, far = Expected(true, 9.0, true, 9.0), Expected(true, 9.0, true, 1.0)
+    only, alike = [Place(elsewhere.pose, 0.0)], [Place(elsewhere.pose, 0.0), Place(true, -1.0)]
+    assert choose(own, weak, only, near) == Found(own, "tracked")
+    assert choose(own, beside, alike, near) == Found(beside, "tracked")
+    assert choose(own, elsewhere, alike, near) == Found(own, "tracked")
+    assert choose(own, elsewhere, only, near) == Found(elsewhere, "near")
+    assert choose(own, elsewhere, only, far) == Found(own, "tracked")
+    assert choose(None, elsewhere, alike, far) == Found(elsewhere, "near", is_alone=False)
+    assert choose(None, doubtful, only, near) == Found(doubtful, "near")
+    assert choose(None, doubtful, only, far) is None
+    assert choose(None, doubtful, alike, near) is None
 
 
 def test_the_places_that_look_like_a_photo(seen):
@@ -115,15 +116,11 @@ def test_the_places_that_look_like_a_photo(seen):
 
 def test_a_mirrored_photo_is_told_near_a_pose_and_anywhere(seen):
     query, true = seen
-    assert not is_mirrored(query, true)
-    assert not is_mirrored(query)
-    taken = rooms.query(SEED)
-    rgb = np.ascontiguousarray(taken.rgb[:, ::-1])
-    mirrored = prepare_query(
-        rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(gravity="known"), Workers(2)
-    )
-    assert is_mirrored(mirrored, true)
-    assert is_mirrored(mirrored)
+    rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
+    mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
+    for taken, wanted in ((query, False), (mirrored, True)):
+        for some in (query_near(taken, true, 2.0), brief_query(taken)):
+            assert is_mirrored(some, descend_briefly(some)) == wanted
 
 
 def test_a_rough_place_is_refined_or_dropped(seen):

@@ -23,7 +23,7 @@ from .frames import MOST_ODDS, Frame, State, state_centers
 from .free_space import FreeSpace
 from .motion import JUMP_LOG, Motion, carry
 
-COPY_LOG_ODDS = 4.0  # copies of a place differ by up to this if one of them was scanned better
+COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 MAX_TURN = math.pi  # [rad/s] of a person with a camera
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
 MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected

@@ -310,12 +310,10 @@ def choose(state: State | None, best: State, places: Sequence[Place], expected: 
     if state is not None and is_same_place(best.pose, state.pose):
         return Found(best, "tracked")
     is_alone = all(p.behind <= -COPY_LOG_ODDS or is_same(p.pose, best.pose) for p in places)
-    is_sure = best.log_odds >= MOST_EXPECTED
-    if is_alone and (is_sure or expected.holds(best.pose)):
-        return Found(best, "near", is_sure)
-    if state is None:
-        return Found(best, "near", False) if is_sure else None
-    return Found(state, "tracked")
+    is_sure = state is None and best.log_odds >= MOST_EXPECTED
+    if is_sure or (is_alone and expected.holds(best.pose)):
+        return Found(best, "near", is_alone)
+    return None if state is None else Found(state, "tracked")
 
 
 def distance(pose: Pose, other: Pose) -> float:
