@@ -40,7 +40,7 @@ class WalkAbout:
 
 @dataclass(frozen=True)
 class Taken:
-    """What is known of a frame besides its poses."""
+    """Facts of a frame besides its poses."""
 
     name: str
     photo: PhotoFacts | None  # None of one that can't be read

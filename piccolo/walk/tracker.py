@@ -65,7 +65,7 @@ class Follower(NamedTuple):
 
 
 class Expected(NamedTuple):
-    """Where the camera can be at a frame."""
+    """Limits of a camera's position at a frame, from its motion before."""
 
     last: Pose  # where it was
     reach: float  # [m] from there, by its speed
