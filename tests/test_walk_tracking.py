@@ -77,7 +77,6 @@ def test_a_frame_is_found_where_it_is_predicted_or_near(seen):
         found = find_from(query, Follower(off, 0.0), 1.0, Motion())
         assert (found.how, found.is_alone) == (how, True)
         assert pose_errors(found.state.pose, true)[0] < 0.02
-    assert find_from(query, Follower(off, 0.0), 10.0, Motion()) is None, "too far to look around"
     assert find_from(query, Follower(_off(true, 50.0, 0.0), 0.0), 1.0, Motion()) is None
     rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
     mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))

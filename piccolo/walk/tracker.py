@@ -283,13 +283,11 @@ def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found |
     None also if the photo is mirrored.
     """
     expected = expect(f, time, motion)
-    places: list[Place] = []
-    if expected.reach <= MAX_RADIUS:
-        near = query_near(query, f.pose, expected.reach)
-        ends = descend_briefly(near)
-        if is_mirrored(near, ends):
-            return None
-        places = list_places(query, ends, ends.best_score)
+    near = query_near(query, f.pose, min(expected.reach, MAX_RADIUS))
+    ends = descend_briefly(near)
+    if is_mirrored(near, ends):
+        return None
+    places = list_places(query, ends, ends.best_score)
     state = track(query, expected.start)
     if state is not None and not expected.holds(state.pose):
         state = None
