@@ -228,7 +228,7 @@ def _times(folder, queries):
     return str(folder / "times.csv")
 
 
-def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monkeypatch):
+def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monkeypatch, capsys):
     folder, queries = building
     walk = ["--walk", "--pano", str(folder / "images"), "--times", _times(folder, queries), "--out"]
     whole, stopped = tmp_path / "whole.jsonl", tmp_path / "stopped.jsonl"
@@ -245,6 +245,9 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     kept = walk_command.frames_file(stopped)
     lines = kept.read_bytes().splitlines(keepends=True)
     assert len(lines) == 1 + len(queries)
+    kept.write_bytes(lines[0] + b'{"taken": 3}\n')
+    assert _command(folder, *walk, str(stopped)) == 3
+    assert f"{kept}: found a damaged line (ValidationError)" in capsys.readouterr().err
     kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])
     added = []
     prepare = Walk.prepare
