@@ -183,6 +183,19 @@ def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, bui
     assert all(r.walk.alone is None for r in results[1:])
 
 
+def test_a_key_frame_that_nobody_departs_from_is_followed_from_where_it_was_tracked_to(scan, building):
+    """As narrow photos in a corridor: a frame was tracked, then compared with the map, and not believed."""
+    _, queries = building
+    walk = scan.track(gravity="known")
+    for query in queries[:3]:
+        walk.add(query.image, query.time)
+    last = walk.tracker.frames[-1]
+    last.is_key, last.departed = True, None
+    result = walk.add(queries[3].image, queries[3].time)
+    assert result.walk.how == "tracked"
+    assert pose_errors(result.pose, queries[3].pose)[0] < 0.03
+
+
 def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_path):
     """The camera goes too far between frames to be tracked without; on the command line, too."""
     folder, queries = building

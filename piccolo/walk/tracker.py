@@ -204,8 +204,7 @@ class Tracker:
         return Follower(pose, last.time, self._pose_since(since[-2]), self.frames[since[-2]].time)
 
     def _pose_since(self, k: int) -> Pose:
-        frame = self.frames[k]
-        pose = frame.departed if frame.is_key else frame.arrived
+        pose = self.frames[k].departed or self.frames[k].arrived
         if pose is None:
             raise ValueError("a frame that was not found")
         return pose
