@@ -1,5 +1,6 @@
 """A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
+import json
 from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
@@ -142,18 +143,19 @@ class Walk:
 
     def last_to_json(self) -> str:
         """Return what is known of the last frame on one line, for `restore`."""
-        from msgspec.json import encode  # noqa: PLC0415  # only walks with a file wait for it
+        from msgspec import to_builtins  # noqa: PLC0415  # only walks with a file wait for it
 
-        return encode(Kept(self.taken[-1], self.tracker.frames[-1]), enc_hook=np.ndarray.tolist).decode()
+        kept = Kept(self.taken[-1], self.tracker.frames[-1])
+        return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
 
     def restore(self, line: bytes, picture: Path, time: float, name: str) -> bool:
         """Take the next frame from a line of `last_to_json`, if it is of this picture, unchanged.
 
         Raises ValueError if it is no such line.
         """
-        from msgspec.json import decode  # noqa: PLC0415  # only walks with a file wait for it
+        from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = decode(line, type=Kept, dec_hook=lambda _, rows: np.array(rows))
+        kept = convert(json.loads(line), Kept, dec_hook=lambda _, rows: np.array(rows))
         taken = kept.taken
         found = taken.name, kept.frame.time, taken.sha256
         is_same = found == (name, time, sha256_of(picture, self.read_options.rig))
