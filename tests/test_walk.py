@@ -190,7 +190,8 @@ def test_a_key_frame_that_nobody_departs_from_is_followed_from_where_it_was_trac
     for query in queries[:3]:
         walk.add(query.image, query.time)
     last = walk.tracker.frames[-1]
-    last.is_key, last.departed = True, None
+    last.is_key = True
+    last.departed = None
     result = walk.add(queries[3].image, queries[3].time)
     assert result.walk.how == "tracked"
     assert pose_errors(result.pose, queries[3].pose)[0] < 0.03
@@ -277,7 +278,8 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
 
 
 def test_frames_come_back_from_their_lines(scan, building):
-    walk, again = scan.track(gravity="known"), scan.track(gravity="known")
+    walk = scan.track(gravity="known")
+    again = scan.track(gravity="known")
     for k, query in enumerate(building[1][:3]):
         path = query.image if k != 1 else building[0] / "cloud.ply"  # no picture
         walk.add(path, query.time, "name", query.pose)

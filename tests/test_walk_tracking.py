@@ -12,7 +12,6 @@ from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk.frames import State
 from piccolo.walk.motion import Motion
-from piccolo.walk.path import MOST_EXPECTED
 from piccolo.walk.places import Place, descend_briefly, find_places, is_mirrored, query_near
 from piccolo.walk.tracker import (
     Expected,
@@ -52,7 +51,7 @@ def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
     )
     end = track(query, true)
     assert pose_errors(end.pose, true)[0] < 0.02
-    assert end.log_odds > MOST_EXPECTED
+    assert end.log_odds > 4.0
     assert len(asked) == 1
     far = track(query, _off(true, 0.6, 20.0))
     assert pose_errors(far.pose, true)[0] < 0.02
@@ -77,7 +76,10 @@ def test_a_frame_is_found_where_it_is_predicted_or_near(seen):
         found = find_from(query, Follower(off, 0.0), 1.0, Motion())
         assert (found.how, found.is_alone) == (how, True)
         assert pose_errors(found.state.pose, true)[0] < 0.02
-    assert find_from(query, Follower(_off(true, 50.0, 0.0), 0.0), 1.0, Motion()) is None
+    late = find_from(query, Follower(off, 0.0), 10.0, Motion())  # 20 m, of which 12 m are searched
+    assert pose_errors(late.state.pose, true)[0] < 0.02
+    for seconds in (1.0, 10.0):
+        assert find_from(query, Follower(_off(true, 50.0, 0.0), 0.0), seconds, Motion()) is None
     rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
     mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
     assert find_from(mirrored, Follower(true, 0.0), 1.0, Motion()) is None
@@ -86,11 +88,15 @@ def test_a_frame_is_found_where_it_is_predicted_or_near(seen):
 def test_a_pose_near_replaces_the_predicted_one_if_it_is_surer(seen):
     """At the same place it counts as tracked; elsewhere it must be the only one of its kind, or sure."""
     _, true = seen
-    own, weak = State(true, 1.0, 0.5), State(true, 0.5, 0.5)
-    beside, elsewhere = State(_off(true, 0.2, 0.0), 3.5, 0.5), State(_off(true, 5.0, 0.0), 3.5, 0.5)
+    own = State(true, 1.0, 0.5)
+    weak = State(true, 0.5, 0.5)
+    beside = State(_off(true, 0.2, 0.0), 3.5, 0.5)
+    elsewhere = State(_off(true, 5.0, 0.0), 3.5, 0.5)
     doubtful = State(elsewhere.pose, 2.0, 0.5)
-    near, far = Expected(true, 9.0, true, 9.0), Expected(true, 9.0, true, 1.0)
-    only, alike = [Place(elsewhere.pose, 0.0)], [Place(elsewhere.pose, 0.0), Place(true, -1.0)]
+    near = Expected(true, 9.0, true, 9.0)
+    far = Expected(true, 9.0, true, 1.0)
+    only = [Place(elsewhere.pose, 0.0)]
+    alike = [*only, Place(true, -1.0)]
     assert choose(own, weak, only, near) == Found(own, "tracked")
     assert choose(own, beside, alike, near) == Found(beside, "tracked")
     assert choose(own, elsewhere, alike, near) == Found(own, "tracked")

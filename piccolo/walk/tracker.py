@@ -165,7 +165,7 @@ class Tracker:
     def _is_telling(self, frame: Frame) -> bool:
         """Return True if the camera has moved so far since the last key frame that it sees another place.
 
-        A frame that was found near it, at one of several places, tells too.
+        A frame that was found near it, not where it was predicted, tells too.
         """
         if frame.key is None or frame.arrived is None:
             return True
@@ -173,7 +173,7 @@ class Tracker:
         return float(np.linalg.norm(move)) >= SAME_PLACE
 
     def _follow(self, query: Query, frame: Frame) -> None:
-        """Descend from the pose predicted by the last ones; search near it if that fails."""
+        """Find a frame from the last ones; it has moved as measured only if it is where they predict it."""
         follower = self._follower_to(frame)
         if follower is None:
             return
