@@ -1,15 +1,19 @@
 """One frame, when it is known about where the camera was."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rooms
 
+from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization import refinement
 from piccolo.localization.attempts import brief_query
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.walk import tracker
 from piccolo.walk.frames import State
 from piccolo.walk.motion import Motion
 from piccolo.walk.places import Place, descend_briefly, find_places, is_mirrored, query_near
@@ -150,3 +154,25 @@ def test_a_camera_goes_on_as_it_went_but_no_farther_than_it_can(seen):
     assert np.linalg.norm(
         predict(true, _off(true, -4.0, 0.0), 1.0, 0.5).center_world - true.center_world
     ) == (pytest.approx(0.5))
+
+
+def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkeypatch):
+    query, true = seen
+    panorama = rooms.as_panorama(rooms.query(SEED).rgb)
+    columns = np.linspace(-0.5, 0.5, panorama.is_valid.shape[1])
+    narrow = replace(panorama, is_valid=panorama.is_valid & (np.abs(columns) < 0.15))
+    taken = prepare_query(narrow, query.scan_map, CoarseToFineSettings(), Workers(2))
+    starts = []
+
+    def stay(query, start):
+        """End where it began, as in a minimum."""
+        starts.append(start)
+        return Hypothesis(start, 0.5)
+
+    monkeypatch.setattr(tracker, "refine_on_middle_cells", stay)
+    end = tracker.track(taken, _off(true, 0.25, 4.0))
+    assert pose_errors(starts[1], true)[0] < 0.1
+    assert pose_errors(end.pose, true)[0] < 0.05
+    assert end.gain == 0.0
+    assert tracker.track(query, true).gain > 0.0
+    assert len(starts) == 3

@@ -9,7 +9,7 @@ import numpy as np
 from ..geometry.pose import Array, Pose
 from .frames import Frame, State, is_same
 from .motion import carry
-from .path import MOST_EXPECTED, Path
+from .path import Path
 
 EVEN = 0.5  # less is not sure
 
@@ -52,7 +52,7 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
         return NOTHING
     at_key = believe_key(frames[key].states, path.probabilities[key], path.chosen[key])
     own = frame.states[0]
-    credible = 1.0 / (1.0 + math.exp(-own.log_odds - MOST_EXPECTED))
+    credible = 1.0 / (1.0 + math.exp(-own.log_odds - own.gain))
     share = credible * share_of_next(frames, path, k, at_key)
     departed = frames[key].departed or at_key.states[0].pose
     carried = [carry(frame.arrived, departed, state.pose) for state in at_key.states]

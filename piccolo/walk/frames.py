@@ -22,6 +22,7 @@ from ..scan_map.scan_map import ScanMap
 How = Literal["alone", "near", "tracked", "none"]
 SAME_PLACE = 2.0  # [m] poses nearer to each other: key frames are so far apart
 SAME_HEADING = math.radians(45.0)  # and this are of one place
+MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 
 
@@ -33,7 +34,7 @@ class State:
     log_odds: float  # against none of the frame's poses being right
     score: float | None = None  # as of Evidence; None of a pose that was not refined
     covariance: PoseCovariance | None = None  # in the world
-    num_matches: int | None = None  # local features that agree with it
+    gain: float = MOST_EXPECTED  # [log] if it is where the frame was expected
 
     @property
     def is_refined(self) -> bool:
@@ -72,19 +73,21 @@ class Frame:
 
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
-    """List a frame's poses from its own localization, with the probabilities of that."""
+    """List a frame's poses from its own localization, with the probabilities of that.
+
+    Alternatives are as rough as other places: their covariance is not known.
+    """
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     total = 1.0 - found.probability_none
-    evidence = found.evidence
-    odds = log_odds_of_place(found.confidence, total, found.covariance)
+
+    def odds(probability: float) -> float:
+        return log_odds_of_place(probability, total, found.covariance)
+
     best = State(
-        scan_map.from_world(found.pose), odds, evidence.score, found.covariance, evidence.num_matches
+        scan_map.from_world(found.pose), odds(found.confidence), found.evidence.score, found.covariance
     )
-    others = []
-    for a in found.alternatives:
-        odds = log_odds_of_place(a.probability or 0.0, total, found.covariance)
-        others.append(State(scan_map.from_world(a.pose), odds, a.score, None, a.num_matches))
+    others = (State(scan_map.from_world(a.pose), odds(a.probability or 0.0)) for a in found.alternatives)
     return [best, *others]
 
 

@@ -91,8 +91,7 @@ def make_localization(tracker: Tracker, frame: Frame, belief: Belief) -> Localiz
     is_own = frame.alone and frame.states and best is frame.states[0]
     own = frame.alone if is_own and frame.alone else Localization()
     found = [
-        Alternative(to_world(s.pose), s.score or 0.0, s.num_matches, p)
-        for s, p in zip(others, rest, strict=True)
+        Alternative(to_world(s.pose), s.score or 0.0, None, p) for s, p in zip(others, rest, strict=True)
     ]
     return Localization(
         classify(np.array([confidence, *rest, none]), tracker.settings.min_confidence),

@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..geometry.pose import Array, Pose
 from ..scan_map.camera_positions import COARSE_SPACING
-from .frames import MOST_ODDS, Frame, State, state_centers
+from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
 from .free_space import FreeSpace
 from .motion import JUMP_LOG, Motion, carry
 
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 MAX_TURN = math.pi  # [rad/s] of a person with a camera
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
-MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 NEGLIGIBLE = 20.0  # [log] below the best
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
 
@@ -121,12 +120,18 @@ def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
 def is_moved(
     moved: tuple[Pose, Pose, float], starts: Sequence[State], ends: Sequence[State]
 ) -> NDArray[np.bool_]:
-    """Return True (S, N) for the steps that are as a known motion."""
+    """Return True (S, N) for the steps that are as a known motion, or as rough states let it look."""
     begin, end, error = moved
     carried = [carry(end, begin, state.pose) for state in starts]
     centers = np.array([pose.center_world for pose in carried])
     distances = np.linalg.norm(centers[:, None] - state_centers(ends)[None], axis=2)
-    return np.asarray((distances < error) & is_turned(carried, ends, MIN_ANGLE))
+    errors = error + np.add.outer(roughness(starts), roughness(ends))
+    return np.asarray((distances < errors) & is_turned(carried, ends, MIN_ANGLE))
+
+
+def roughness(states: Sequence[State]) -> Array:
+    """Return the error (S,) [m] of states that were not refined."""
+    return np.array([0.0 if state.is_refined else REACH_SLACK for state in states])
 
 
 def is_turned(starts: Sequence[Pose], ends: Sequence[State], angle: float) -> NDArray[np.bool_]:

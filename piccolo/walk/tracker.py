@@ -22,10 +22,12 @@ from ..localization.query import Query, prepare_query
 from ..localization.refinement import descend, refine_on_middle_cells
 from ..localization.selection import assess_poses
 from ..localization.settings import CoarseToFineSettings
+from ..localization.verification import verify
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .beliefs import EVEN
 from .frames import (
+    MOST_EXPECTED,
     MOST_ODDS,
     SAME_PLACE,
     Frame,
@@ -40,7 +42,7 @@ from .frames import (
 )
 from .free_space import FreeSpace
 from .motion import MAX_STEP, Motion, carry
-from .path import COPY_LOG_ODDS, MOST_EXPECTED, REACH_SLACK, Lattice
+from .path import COPY_LOG_ODDS, REACH_SLACK, Lattice
 from .places import (
     MOST_PLACES,
     Place,
@@ -342,19 +344,32 @@ def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> P
 
 
 def track(query: Query, start: Pose) -> State | None:
-    """Descend from a pose and around; None if the end more likely is wrong than right."""
+    """Descend from a pose and around; None if the end more likely is wrong than right.
+
+    A narrow photo is tracked again from where its matches with the scan drawn there put it.
+    """
     end = descend_last(query, refine_on_middle_cells(query, start).pose)
+    if query.photo.is_partial:
+        again = refine_on_middle_cells(query, verify(query, end.pose).pose).pose
+        end = max(end, descend_last(query, again), key=lambda state: state.log_odds)
     return None if end.log_odds < 0.0 else end
 
 
 def descend_last(query: Query, start: Pose) -> State:
-    """Descend on the points themselves; return the end, with its odds by whole views."""
+    """Descend on the points themselves; return the end, with its odds by whole views.
+
+    Those of a narrow photo are by its matches there too, and it gains nothing by being where it was expected:
+    it may look alike from two poses near each other.
+    """
     pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
     end = score_pose(query, pose)
     is_near = np.linalg.norm(pose.center_world - start.center_world) < NEARLY
     covariance = None
     if end.score >= HOPELESS_SCORE:
         covariance = estimate_covariance(query, pose, seen_from=start if is_near else None)
-    standings = assess_poses(replace(query, num_parts=0), end, [])
+    asked = query if query.photo.is_partial else replace(query, num_parts=0)
+    standings = assess_poses(asked, end, [])
     probability = float(posterior(standings, covariance)[0])
-    return State(pose, log_odds_of_place(probability, probability, covariance), end.score, covariance)
+    log_odds = log_odds_of_place(probability, probability, covariance)
+    gain = 0.0 if query.photo.is_partial else MOST_EXPECTED
+    return State(pose, log_odds, end.score, covariance, gain)
