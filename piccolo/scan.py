@@ -23,7 +23,7 @@ from .scan_map.open_map import write_map
 from .scan_map.prior import Prior
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk
-from .walk.motion import MAX_ACCELERATION, MAX_SPEED, Motion
+from .walk.motion import MAX_ACCELERATION, Motion
 
 Image = NDArray[np.uint8]  # (H, W, 3) RGB
 Mask = NDArray[np.bool_]  # (H, W)
@@ -255,7 +255,7 @@ class Scan:
         ----------
         max_speed
             Largest speed of the camera [m/s], 2 by default. If frames have no times, it is the largest
-            distance [m] between consecutive frames, by default estimated from their poses.
+            distance [m] between consecutive frames, 5 by default.
         max_acceleration
             Standard deviation of the acceleration along each axis [m/s^2]: less smooths the path more.
         mask
@@ -373,9 +373,7 @@ class Scan:
         return self._opened.occlusion_mask(panorama, pose, read_options, is_masked)
 
     def _track(self, given: dict[str, Any]) -> Walk:
-        speed = given.pop("max_speed", None)
-        acceleration = given.pop("max_acceleration")
-        motion = Motion(MAX_SPEED if speed is None else speed, acceleration, is_guess=speed is None)
+        motion = Motion(given.pop("max_speed", None), given.pop("max_acceleration"))
         read_options, settings, _ = self._parse(given)
         return self._opened.walk(read_options, settings, motion)
 

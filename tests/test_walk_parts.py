@@ -1,20 +1,14 @@
-"""Parts of a walk: its longest step, positions smoothed together, times from names, tables and EXIF."""
-
-from dataclasses import replace
-from types import SimpleNamespace
+"""Parts of a walk: positions smoothed together, times from names, tables and EXIF."""
 
 import numpy as np
 import pytest
 
 from piccolo.batch.frame_times import times_of
 from piccolo.confidence.covariance import PoseCovariance
-from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.walk.frames import Frame
-from piccolo.walk.localize import PRIOR_FLOOR, smooth_positions
-from piccolo.walk.motion import MAX_STEP, Motion
-from piccolo.walk.second_look import estimate_motion
+from piccolo.walk.localize import smooth_positions
+from piccolo.walk.motion import Motion
 
 MOTION = Motion(2.0, 0.5)
 TURN = exp_so3(np.array([0.1, -0.3, 1.0]))
@@ -39,7 +33,7 @@ def _dense(located, times, s):
         A[k, k : k + 3] = (
             2.0 / (before + after) * np.array([1 / before, -1 / before - 1 / after, 1 / after]) / s
         )
-    own = np.diag([1.0 / (c.matrix[3, 3] + PRIOR_FLOOR) for _, c in located])
+    own = np.diag([1.0 / (c.matrix[3, 3]) for _, c in located])
     centers = np.array([pose.center_world for pose, _ in located])
     covariance = np.linalg.inv(own + A.T @ A)
     return covariance @ own @ centers, covariance
@@ -79,28 +73,6 @@ def test_frames_far_apart_say_nothing_of_each_other():
     located = _located([[0, 0, 0], [0, 1, 0], [0, 0, 0]], [0.1] * 3)
     found = smooth_positions(located, [0.0, 10.0, 20.0], MOTION)
     np.testing.assert_allclose([pose.center_world[1] for pose, _ in found], [0, 1, 0], atol=1e-12)
-
-
-def test_the_longest_step_is_told_by_the_frames_that_are_localized_alone():
-    def frame(x, status="localized"):
-        return Frame(0.0, alone=Localization(status=status, pose=Pose(np.eye(3), np.array([x, 0.0, 0.0]))))
-
-    frames = [
-        *(frame(6.0 * (k // 2)) for k in range(40)),
-        frame(500.0),
-        frame(900.0, "ambiguous"),
-        Frame(0.0),
-    ]
-    guess = Motion(MAX_STEP, is_timed=False, is_guess=True)
-
-    def longest(motion, frames):
-        return estimate_motion(SimpleNamespace(motion=motion, frames=frames)).max_speed
-
-    assert longest(guess, frames) == pytest.approx(9.0)
-    assert longest(guess, [frame(0.0), frame(1.0)]) == MAX_STEP
-    assert longest(guess, [Frame(0.0)]) == MAX_STEP
-    assert longest(replace(guess, is_guess=False), frames) == MAX_STEP
-    assert longest(replace(guess, is_timed=True), frames) == MAX_STEP
 
 
 def test_times_by_names_tables_and_exif(tmp_path):

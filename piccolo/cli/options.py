@@ -20,7 +20,7 @@ from ..panorama.model import Projection
 from ..paper.settings import PaperSettings
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.prior import Prior
-from ..walk.motion import MAX_SPEED
+from ..walk.motion import MAX_SPEED, MAX_STEP
 from .command import check_least, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
@@ -193,7 +193,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     text += f"the columns name and time [s] (default {EXIF} if its times differ, else {ORDER})"
     option(group, "--times SOURCE", text)
     text = f"maximum speed of the camera [m/s] (default {MAX_SPEED:g}); if only the order is known, "
-    option(group, "--max-speed X", text + "maximum distance between frames [m] (default: estimated)")
+    option(group, "--max-speed X", text + f"maximum distance between frames [m] (default {MAX_STEP:g})")
     text = (
         "odometry of the camera [m], by which a walk tells identical places apart: TUM or KITTI trajectory, "
     )

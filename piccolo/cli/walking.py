@@ -34,7 +34,7 @@ from ..panorama.video import frames_of
 from ..result import FAILED, Result, read_results
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from ..walk.motion import MAX_SPEED, MAX_STEP, Motion
+from ..walk.motion import Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY
@@ -75,7 +75,10 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
             if getattr(arguments, name) is not None:
                 raise UsageError(f"--{name.replace('_', '-')}: only with --walk or --video")
         return
+    speed = arguments.max_speed
     wrong = {
+        f"--max-speed: found {speed}, wanted a number above 0": speed is not None
+        and not 0.0 < speed < math.inf,
         "--walk, --video: wanted --walk with --pano, or --video alone": is_video == bool(arguments.pano),
         "--walk: found names on stdin, wanted files or folders": is_from_stdin(arguments.pano),
         "--times: not with --video, which contains its times": is_video and arguments.times is not None,
@@ -85,15 +88,6 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
     for text, is_so in wrong.items():
         if is_so:
             raise UsageError(text)
-
-
-def motion_of(max_speed: float | None, has_times: bool) -> Motion:
-    """Return how the camera is carried."""
-    if max_speed is not None and not 0.0 < max_speed < math.inf:
-        raise UsageError(f"--max-speed: found {max_speed}, wanted a number above 0")
-    if has_times:
-        return Motion(max_speed or MAX_SPEED)
-    return Motion(max_speed or MAX_STEP, is_timed=False, is_guess=max_speed is None)
 
 
 def take_step(words: Sequence[Path | None]) -> tuple[Path | None, str]:
@@ -120,11 +114,11 @@ def walk_inputs(arguments: argparse.Namespace, panoramas: Sequence[Path]) -> Ite
         times = times_of(panoramas, arguments.times)
         numbers = times or [float(k) for k in range(len(panoramas))]
         frames = [WalkInput(p, t, str(p)) for p, t in zip(panoramas, numbers, strict=True)]
-        motion = motion_of(arguments.max_speed, times is not None)
+        motion = Motion(arguments.max_speed, is_timed=times is not None)
         yield WalkInputs(add_odometry(frames, arguments.odometry), motion, 0.0)
         return
-    motion = motion_of(arguments.max_speed, True)
-    seconds, metres = measure_step(arguments.step, motion.max_speed)
+    motion = Motion(arguments.max_speed)
+    seconds, metres = measure_step(arguments.step, motion.speed)
     with temporary_folder() as folder:
         found = frames_of(arguments.video, seconds, folder)
         bar = {"desc": "read the video", "unit": " frames", "leave": False}

@@ -18,9 +18,6 @@ from .motion import Motion
 from .path import Path
 from .tracker import Tracker
 
-PRIOR_FLOOR = 1e-6  # [m^2] least variance of a position
-LONGEST_STEP = 3.0  # [s] frames farther apart do not limit the acceleration
-
 # A frame's pose and covariance, both in the world
 Located = tuple[Pose, PoseCovariance]
 
@@ -119,7 +116,7 @@ def smooth_positions(located: Sequence[Located], times: Sequence[float], motion:
         return list(located)
     rows = acceleration_rows(times, motion)
     smooth = kron(rows.T @ rows, eye(3))
-    own = [np.linalg.inv(c.matrix[3:, 3:] + PRIOR_FLOOR * np.eye(3)) for _, c in located]
+    own = [np.linalg.inv(c.matrix[3:, 3:]) for _, c in located]
     factor = splu((block_diag(own) + smooth).tocsc())
     centers = np.concatenate([pose.center_world for pose, _ in located])
     moves = factor.solve(-(smooth @ centers)).reshape(-1, 3)
@@ -139,7 +136,8 @@ def acceleration_rows(times: Sequence[float], motion: Motion) -> Any:
     before, after = steps[:-1], steps[1:]
     factors = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after])
     factors *= 2.0 / (before + after) / motion.max_acceleration
-    factors[:, np.maximum(before, after) > LONGEST_STEP] = 0.0
+    # in more time a person stops and turns back
+    factors[:, np.maximum(before, after) > 2.0 * motion.speed / motion.max_acceleration] = 0.0
     row, offset = np.indices((len(before), 3))
     return csr_matrix((factors.T.ravel(), (row.ravel(), (row + offset).ravel())), (len(before), len(times)))
 
@@ -150,7 +148,7 @@ def move_pose(pose: Pose, covariance: PoseCovariance, move: Array, variance: Arr
     Rotation and position are jointly Gaussian: the rotation follows by C_wd C_dd^-1.
     """
     C = covariance.matrix
-    gain = C[:3, 3:] @ np.linalg.inv(C[3:, 3:] + PRIOR_FLOOR * np.eye(3))
+    gain = C[:3, 3:] @ np.linalg.inv(C[3:, 3:])
     matrix = C.copy()
     matrix[:3, :3] -= gain @ (C[3:, 3:] - variance) @ gain.T
     matrix[:3, 3:] = gain @ variance

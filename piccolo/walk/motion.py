@@ -10,31 +10,34 @@ from ..geometry.pose import Pose
 
 MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
 MAX_ACCELERATION = 2.0  # [m/s^2]
-MAX_STEP = 5.0  # [m] from one frame to the next, if nothing is known
+MAX_STEP = 5.0  # [m] from one frame without time to the next
 JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place that was not scanned
-UNTIMED_JUMP_LOG = -4.0  # between frames without times
 
 
 @dataclass(frozen=True)
 class Motion:
     """The motion of a carried camera."""
 
-    max_speed: float = MAX_SPEED  # [m/s]; of frames without times [m] from one to the next
+    max_speed: float | None = None  # given [m/s]; of frames without times [m] from one to the next
     max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis, of timed frames
     is_timed: bool = True  # False if only the order of the frames is known
-    is_guess: bool = False  # True if no distance between frames was given: the poses found will give it
 
     def __post_init__(self) -> None:
         """Refuse speeds and accelerations that are not above 0."""
         for name in ("max_speed", "max_acceleration"):
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
+            if value is not None and not 0.0 < value < math.inf:
                 raise InputError(f"{name}: found {value}, wanted a number above 0")
 
     @property
+    def speed(self) -> float:
+        """Largest speed [m/s]; of frames without times largest step [m]."""
+        return self.max_speed or (MAX_SPEED if self.is_timed else MAX_STEP)
+
+    @property
     def jump_log(self) -> float:
-        """Log odds of a jump, from a frame to a later one."""
-        return JUMP_LOG if self.is_timed else UNTIMED_JUMP_LOG
+        """Log odds of a jump, from a frame to a later one; frames without times may be anywhere."""
+        return JUMP_LOG if self.is_timed else 0.0
 
 
 def check_times(times: Sequence[float]) -> None:

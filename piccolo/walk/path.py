@@ -26,7 +26,7 @@ from .motion import JUMP_LOG, Motion, carry
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 MAX_TURN = math.pi  # [rad/s] of a person with a camera
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
-NEGLIGIBLE = 20.0  # [log] below the best
+NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] to and from a place: no way passes over more evidence than that costs
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
 
 
@@ -85,7 +85,7 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
 
     `expected` is the gain of a place within reach; a place out of reach has the odds of a jump.
     """
-    excess = np.maximum(distance - motion.max_speed * seconds - REACH_SLACK, 0.0)
+    excess = np.maximum(distance - motion.speed * seconds - REACH_SLACK, 0.0)
     return np.maximum(expected - 0.5 * (excess / REACH_SLACK) ** 2, motion.jump_log)
 
 
@@ -219,7 +219,7 @@ class Lattice:
         centers = np.array([pose.center_world for pose in begins])
         seconds = self.frames[k].time - self.frames[last].time
         least_jump = math.sqrt(2.0 * (most_expected - self.motion.jump_log))  # [deviations] beyond reach
-        limit = self.motion.max_speed * seconds + REACH_SLACK * (1.0 + least_jump)
+        limit = self.motion.speed * seconds + REACH_SLACK * (1.0 + least_jump)
         distances = self.space.distances(centers, state_centers(ends), limit)
         fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
         expected = np.minimum(-np.log(fractions), most_expected)
@@ -284,7 +284,7 @@ class Lattice:
             at = column.back[j]
             if at is not None:
                 log = next(s.log[at[1], j] for s in column.steps if s.begin == at[0])
-                if log <= self.motion.jump_log:
+                if self.motion.is_timed and log <= self.motion.jump_log:
                     path.gaps[column.number] = self._gap(self.columns[at[0]].number, at[1], column.number, j)
 
     def _gap(self, m: int, i: int, k: int, j: int) -> tuple[float, float]:

@@ -2,23 +2,16 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import pairwise
 
-import numpy as np
-
-from ..confidence.alternatives import MIN_DISTANCE
-from ..confidence.confidence import LOCALIZED, MIN_CONFIDENCE
+from ..confidence.confidence import MIN_CONFIDENCE
 from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
 from ..panorama import Panorama
 from .beliefs import Belief, believe
 from .frames import Frame, State
-from .motion import MAX_STEP, Motion, carry
+from .motion import carry
 from .path import Path, build_lattice
 from .tracker import MAX_RADIUS, Follower, Tracker, find_from, move_on, refine_state
-
-MOST_STEPS = 0.9  # of photos without times: the longest step is LONGER than so many of them
-LONGER = 1.5
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
@@ -31,7 +24,6 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
     lost ones are looked for from sure ones.
     """
     num = len(tracker.frames)
-    tracker.motion = estimate_motion(tracker)
     path = _refine_likely(tracker, read, show)
     for k in show(iter(range(num)[::-1]), num, "look for lost frames"):
         _find_lost(tracker, path, k, read)
@@ -50,18 +42,6 @@ def _refine_likely(tracker: Tracker, read: Read, show: Progress) -> Path:
         lattice = build_lattice(tracker.frames, space, tracker.motion, lattice)
         path = lattice.smooth()
     return path
-
-
-def estimate_motion(tracker: Tracker) -> Motion:
-    """Estimate the motion of the camera, if it is not given, from the frames that are localized alone."""
-    motion = tracker.motion
-    if motion.is_timed or not motion.is_guess:
-        return motion
-    alone = [f.alone.pose if f.alone and f.alone.status == LOCALIZED else None for f in tracker.frames]
-    pairs = [(a.center_world, b.center_world) for a, b in pairwise(alone) if a is not None and b is not None]
-    steps = [step for a, b in pairs if (step := float(np.linalg.norm(b - a))) >= MIN_DISTANCE]
-    longest = LONGER * float(np.quantile(steps, MOST_STEPS, method="higher")) if steps else 0.0
-    return replace(motion, max_speed=max(MAX_STEP, longest), is_guess=False)
 
 
 def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
@@ -127,7 +107,7 @@ def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
     frames = tracker.frames
     sure: list[int] = []
     for m in range(k + step, len(frames) if step > 0 else -1, step):
-        reach = tracker.motion.max_speed * abs(frames[k].time - frames[m].time)
+        reach = tracker.motion.speed * abs(frames[k].time - frames[m].time)
         if reach > MAX_RADIUS or len(sure) == 2:
             break
         if believe(frames, path, m).is_sure:

@@ -1,5 +1,6 @@
 """Tracking of a camera through a scan, frame by frame, from past frames only."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -41,7 +42,7 @@ from .frames import (
     put_state,
 )
 from .free_space import FreeSpace
-from .motion import MAX_STEP, Motion, carry
+from .motion import Motion, carry
 from .path import COPY_LOG_ODDS, REACH_SLACK, Lattice
 from .places import (
     MOST_PLACES,
@@ -53,7 +54,7 @@ from .places import (
     query_near,
 )
 
-FIRST_SEARCH = 3  # frames after which a lost camera is searched everywhere; then after twice as many
+ELSEWHERE = SAME_PLACE + REACH_SLACK  # [m] from where it was, a camera is at another place
 MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 
 
@@ -103,8 +104,8 @@ class Tracker:
         self.workers = workers
         self.motion: Motion = motion
         self.lattice: Lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
-        self.num_lost: int = 0
-        self.next_search: int = 1
+        self.found_at: float = -math.inf  # time when the camera was found last
+        self.next_search: float = 0.0  # [m] that it may have gone since, when it is searched everywhere
 
     @property
     def frames(self) -> list[Frame]:
@@ -116,8 +117,7 @@ class Tracker:
 
         Call it before the first frame.
         """
-        step = MAX_STEP if self.motion.is_guess else self.motion.max_speed
-        self.motion = replace(self.motion, max_speed=step, is_timed=False)
+        self.motion = replace(self.motion, is_timed=False)
         self.lattice = Lattice(self.lattice.space, self.motion)
 
     def prepare(self, panorama: Panorama) -> Query:
@@ -133,36 +133,35 @@ class Tracker:
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_known = odometry is not None or not self.frames
-            is_far = (
-                not is_known
-                and self.motion.max_speed * (time - self.frames[-1].time) > SAME_PLACE + REACH_SLACK
-            )
+            is_far = not is_known and self.motion.speed * (time - self.frames[-1].time) > ELSEWHERE
             if not is_far:
                 self._follow(query, frame)
-            if is_far or (not frame.states and self.num_lost + 1 >= self.next_search):
+            if is_far or (not frame.states and self._reach(time) >= self.next_search):
                 self._search(query, panorama, frame)
             elif frame.states and self._is_telling(frame):
                 frame.make_key(list_key_states(query, frame.states))
         self.lattice.add(frame)
         if frame.is_key:
             self._depart(query, frame)
-        self._count(frame)
+        self._note(frame)
         return frame
 
     def accept(self, frame: Frame) -> None:
         """Add a frame that was localized earlier."""
         self.lattice.add(frame)
-        self._count(frame)
+        self._note(frame)
 
-    def _count(self, frame: Frame) -> None:
-        """Count the frames for which the camera is lost."""
-        if frame.arrived is not None or frame.departed is not None:
-            self.num_lost = 0
-            self.next_search = FIRST_SEARCH
-            return
-        self.num_lost += 1
-        if frame.alone is not None:
-            self.next_search = max(2 * self.num_lost, FIRST_SEARCH)
+    def _reach(self, time: float) -> float:
+        """Return how far [m] the camera can have gone since it was found."""
+        return self.motion.speed * (time - self.found_at)
+
+    def _note(self, frame: Frame) -> None:
+        """Note when the camera was found, or when it is to be searched everywhere again."""
+        if frame.arrived is not None or frame.departed is not None or len(self.frames) == 1:
+            self.found_at = frame.time
+            self.next_search = ELSEWHERE
+        elif frame.alone is not None:
+            self.next_search = 2.0 * self._reach(frame.time)
 
     def _is_telling(self, frame: Frame) -> bool:
         """Return True if the camera has moved so far since the last key frame that it sees another place.
@@ -219,7 +218,7 @@ class Tracker:
         is_wrong = not is_sure and is_whole(query) and is_mirrored(brief, descend_briefly(brief))
         if found := [] if is_wrong else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
-            frame.make_key(list_key_states(query, found, is_sure))
+            frame.make_key(list_key_states(query, found[:1] if is_sure else found, is_sure))
 
     def _depart(self, query: Query, frame: Frame) -> None:
         """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it."""
@@ -237,20 +236,20 @@ class Tracker:
         self.lattice.change_last()
 
 
-def list_key_states(query: Query, refined: Sequence[State], is_sure: bool = False) -> list[State]:
-    """List the states of a key frame: the poses that were refined for it, best first, and all other places.
+def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -> list[State]:
+    """List the states of a key frame: the poses that were found for it, best first, and all other places.
 
     If the photo is sure by itself, the others have all of one frame's evidence against them.
     """
-    best = refined[0]
+    best = own[0]
     limit = -MOST_ODDS - COPY_LOG_ODDS if is_sure else 0.0
     rough = [
         State(p.pose, best.log_odds + min(p.behind, limit))
         for p in find_places(query, best.pose)
-        if not any(is_same_place(p.pose, state.pose) for state in refined)
+        if not any(is_same_place(p.pose, state.pose) for state in own)
     ]
     states: list[State] = []
-    for state in (*refined, *rough):
+    for state in (*own, *rough):
         if not any(is_same(state.pose, other.pose) for other in states):
             states.append(state)
     return states[:MOST_PLACES]
@@ -322,7 +321,7 @@ def distance(pose: Pose, other: Pose) -> float:
 
 def expect(f: Follower, time: float, motion: Motion) -> Expected:
     """Predict where the camera is at a time, and how far from there it can be."""
-    reach = motion.max_speed * abs(time - f.time) + REACH_SLACK
+    reach = motion.speed * abs(time - f.time) + REACH_SLACK
     if f.earlier is None or f.time == f.earlier_time:
         return Expected(f.pose, reach, f.pose, reach)
     start = predict(f.pose, f.earlier, (time - f.time) / (f.time - f.earlier_time), reach)
