@@ -120,18 +120,12 @@ def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
 def is_moved(
     moved: tuple[Pose, Pose, float], starts: Sequence[State], ends: Sequence[State]
 ) -> NDArray[np.bool_]:
-    """Return True (S, N) for the steps that are as a known motion, or as rough states let it look."""
+    """Return True (S, N) for the steps that are as a known motion."""
     begin, end, error = moved
     carried = [carry(end, begin, state.pose) for state in starts]
     centers = np.array([pose.center_world for pose in carried])
     distances = np.linalg.norm(centers[:, None] - state_centers(ends)[None], axis=2)
-    errors = error + np.add.outer(roughness(starts), roughness(ends))
-    return np.asarray((distances < errors) & is_turned(carried, ends, MIN_ANGLE))
-
-
-def roughness(states: Sequence[State]) -> Array:
-    """Return the error (S,) [m] of states that were not refined."""
-    return np.array([0.0 if state.is_refined else REACH_SLACK for state in states])
+    return np.asarray((distances < error) & is_turned(carried, ends, MIN_ANGLE))
 
 
 def is_turned(starts: Sequence[Pose], ends: Sequence[State], angle: float) -> NDArray[np.bool_]:

@@ -18,7 +18,7 @@ from ..geometry.rotations import uniform_yaws
 from ..geometry.suppression import non_maximum_suppression
 from ..localization.attempts import brief_query, mirror_query
 from ..localization.query import Cache, Query
-from ..localization.refinement import FIRST_ITERATIONS, descend_all
+from ..localization.refinement import FIRST_ITERATIONS, SECOND_ITERATIONS, descend_all
 from ..localization.search import Starts, search_poses
 
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
@@ -55,9 +55,13 @@ def query_near(query: Query, pose: Pose, radius: float) -> Query:
 
 def descend_briefly(query: Query) -> Ends:
     """Search, and descend a few steps on the candidates' prepared views."""
-    starts = search_poses(query, "known")
-    image = query.photo.images.search()
-    return Ends(*descend_all(query.scan_map, image, starts, FIRST_ITERATIONS, query.workers))
+    return descend_from(query, search_poses(query, "known"))
+
+
+def descend_from(query: Query, starts: Starts) -> Ends:
+    """Descend a few steps from starts on their candidates' prepared views; of a narrow photo more."""
+    num = SECOND_ITERATIONS if query.photo.is_partial else FIRST_ITERATIONS
+    return Ends(*descend_all(query.scan_map, query.photo.images.search(), starts, num, query.workers))
 
 
 def is_mirrored(query: Query, ends: Ends) -> bool:
@@ -75,14 +79,8 @@ def find_places(query: Query, own: Pose) -> list[Place]:
     They have the tilt of that, and any heading.
     """
     ends = descend_briefly(query_near(query, own, math.inf))
-    return list_places(query, ends, score_briefly(query, own))
-
-
-def score_briefly(query: Query, pose: Pose) -> float:
-    """Return the score after a descent of a few steps from a pose."""
-    start = Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest(query, pose))
-    image = query.photo.images.search()
-    return float(descend_all(query.scan_map, image, start, FIRST_ITERATIONS, query.workers)[1][0])
+    start = Starts(own.R_cam_from_world[None], own.center_world[None], nearest(query, own))
+    return list_places(query, ends, descend_from(query, start).best_score)
 
 
 def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
