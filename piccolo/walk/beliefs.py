@@ -9,9 +9,7 @@ import numpy as np
 from ..geometry.pose import Array, Pose
 from .frames import Frame, State, is_same
 from .motion import carry
-from .path import Path
-
-EVEN = 0.5  # less is not sure
+from .path import EVEN, Path
 
 
 class Belief(NamedTuple):
@@ -34,13 +32,13 @@ def believe(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     """Return what a path says of a frame: a key frame's places, or where it was tracked to from one."""
     frame = frames[k]
     if frame.is_key:
-        return believe_key(frame.states, path.probabilities[k], path.chosen[k])
+        return believe_key(frame.states, path.probabilities[k])
     return NOTHING if frame.key is None else believe_tracked(frames, path, k)
 
 
-def believe_key(states: Sequence[State], probabilities: Array, chosen: int | None) -> Belief:
-    """Return the states of a key frame, the chosen first and then by probability."""
-    order = sorted(range(len(states)), key=lambda j: (j != chosen, -probabilities[j]))
+def believe_key(states: Sequence[State], probabilities: Array) -> Belief:
+    """Return the states of a key frame, the likeliest first."""
+    order = np.argsort(-probabilities, kind="stable")
     return Belief([states[j] for j in order], probabilities[order])
 
 
@@ -48,9 +46,9 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     """Return the poses to which a frame was tracked, from each place where its key frame may be."""
     frame = frames[k]
     key = frame.key
-    if key is None or frame.arrived is None or not frames[key].is_key or path.chosen[key] is None:
+    if key is None or frame.arrived is None or not frames[key].is_key or path.chosen(key) is None:
         return NOTHING
-    at_key = believe_key(frames[key].states, path.probabilities[key], path.chosen[key])
+    at_key = believe_key(frames[key].states, path.probabilities[key])
     own = frame.states[0]
     credible = 1.0 / (1.0 + math.exp(-own.log_odds - own.gain))
     share = credible * share_of_next(frames, path, k, at_key)
@@ -72,7 +70,7 @@ def share_of_next(frames: Sequence[Frame], path: Path, k: int, at_key: Belief) -
     n = next(after, None)
     if n is None or frames[n].key != key:
         return 1.0
-    chosen = path.chosen[n]
+    chosen = path.chosen(n)
     if chosen is None or path.gaps[n] is not None:
         return EVEN
     return min(float(path.probabilities[n][chosen] / max(at_key.probabilities[0], 1e-9)), 1.0)

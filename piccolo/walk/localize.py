@@ -12,10 +12,10 @@ from ..confidence.confidence import classify
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Array, Pose, exp_so3
-from .beliefs import EVEN, Belief
+from .beliefs import Belief
 from .frames import Frame, probability_within
 from .motion import Motion
-from .path import Path
+from .path import EVEN, Path
 from .tracker import Tracker
 
 # A frame's pose and covariance, both in the world

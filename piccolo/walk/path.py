@@ -2,8 +2,8 @@
 
 Each key frame has a likelihood over the whole map, kept where it is not negligible. The camera walks from
 place to place through free space, or as tracking or an odometry says; anything else is a jump at a price.
-A frame may also have none of its places, and the path goes on from an earlier one. Viterbi (1967) finds the
-likeliest path, forward-backward (Rabiner 1989) the probability of each place.
+A frame may also have none of its places, and the path goes on from an earlier one. Forward-backward (Rabiner
+1989) finds the probability of each place.
 
 Frames of one place have correlated errors: key frames are some distance apart, and they tell places apart
 only beyond the differences between exact copies of a room.
@@ -11,6 +11,7 @@ only beyond the differences between exact copies of a room.
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
 from .free_space import FreeSpace
 from .motion import JUMP_LOG, Motion, carry
 
+EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 MAX_TURN = math.pi  # [rad/s] of a person with a camera
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
@@ -31,20 +33,19 @@ DRIFT = 0.05  # of the path that an odometry measures, that it may be off
 
 
 class Path(NamedTuple):
-    """The likeliest path through a walk's frames; of frames that are no key frames there is nothing."""
+    """The probabilities of the places of a walk's key frames; of other frames there is nothing."""
 
-    chosen: list[int | None]  # the state of each frame on the likeliest way; None for no pose
     probabilities: list[Array]  # (S,) of each frame's states
     gaps: list[tuple[float, float] | None]  # [m], [s] before a frame that no walking person reaches
+
+    def chosen(self, k: int) -> int | None:
+        """Return the likeliest state of a frame; None if more likely it has none of them."""
+        found = self.probabilities[k]
+        return int(found.argmax()) if found.sum() > EVEN else None
 
 
 # states of two frames, those that are walked from, and the log odds of the steps
 _Known = tuple[list[State], list[State], NDArray[np.bool_], NDArray[np.float64]]
-
-
-def empty_path(count: int) -> Path:
-    """Return a path of frames without poses."""
-    return Path([None] * count, [np.empty(0)] * count, [None] * count)
 
 
 class _Steps(NamedTuple):
@@ -55,15 +56,12 @@ class _Steps(NamedTuple):
 
 
 class _Column(NamedTuple):
-    """A key frame, with the logs of all paths that lead to each state."""
+    """A key frame, with the log of the sum over all ways that lead to each state."""
 
     number: int  # of the frame
     emitted: Array  # (S,)
-    log_alike: float  # of the number of places that look like the photo
     steps: list[_Steps]
-    forward: Array  # (S,) sums over ways, emissions included
-    best: Array  # (S,) of the best way
-    back: list[tuple[int, int] | None]  # column and state before
+    forward: Array  # (S,) emissions included
 
 
 def emissions(frame: Frame, tracked: float = -math.inf) -> tuple[Array, float]:
@@ -162,18 +160,10 @@ class Lattice:
         frame = self.frames[k]
         emitted, log_alike = emissions(frame, tracked)
         steps = self._steps_to(k, log_alike)
-        sums = np.zeros(len(emitted))
-        best = np.zeros(len(emitted))
-        back: list[tuple[int, int] | None] = [None] * len(emitted)
-        for s in steps:
-            column = self.columns[s.begin]
-            sums = np.logaddexp(sums, np.logaddexp.reduce(column.forward[:, None] + s.log, axis=0))
-            ways = column.best[:, None] + s.log
-            for j, i in enumerate(ways.argmax(axis=0)):
-                if ways[i, j] > best[j]:
-                    best[j] = ways[i, j]
-                    back[j] = (s.begin, int(i))
-        self.columns.append(_Column(k, emitted, log_alike, steps, sums + emitted, best + emitted, back))
+        begins = (self.columns[s.begin].forward for s in steps)
+        ways = [np.logaddexp.reduce(f[:, None] + s.log, axis=0) for f, s in zip(begins, steps, strict=True)]
+        forward = emitted + np.logaddexp.reduce([np.zeros(len(emitted)), *ways])
+        self.columns.append(_Column(k, emitted, steps, forward))
         total = np.logaddexp.reduce(self.columns[-1].forward)
         self.ended.append(float(np.logaddexp(self.ended[-1], total)))
 
@@ -238,23 +228,20 @@ class Lattice:
         return np.asarray(np.exp(self.columns[-1].forward - self.ended[-1])) if self.columns else np.empty(0)
 
     def filter_path(self) -> Path:
-        """Return the likeliest states of the last key frames, back to one from which frames are tracked.
+        """Return the path of the last key frames, back to one from which frames are tracked.
 
         Their probabilities are those of the time when each was the last.
         """
-        path = empty_path(len(self.frames))
+        path = self._empty_path()
         for column, ended in zip(self.columns[::-1], self.ended[::-1], strict=False):
-            is_tracked = self.frames[column.number].departed is not None
-            probabilities = np.exp(column.forward - ended)
-            path.probabilities[column.number] = probabilities
-            path.chosen[column.number] = 0 if is_tracked else int(probabilities.argmax())
-            if is_tracked:
+            path.probabilities[column.number] = np.exp(column.forward - ended)
+            if self.frames[column.number].departed is not None:
                 break
         return path
 
     def smooth(self) -> Path:
-        """Return the likeliest path, and the probability of each state given all frames."""
-        path = empty_path(len(self.frames))
+        """Return the probability of each state given all frames."""
+        path = self._empty_path()
         backward = [np.zeros(len(column.emitted)) for column in self.columns]
         for n in range(len(self.columns) - 1, -1, -1):
             column = self.columns[n]
@@ -263,23 +250,20 @@ class Lattice:
                 backward[s.begin] = np.logaddexp(backward[s.begin], np.logaddexp.reduce(ways, axis=1))
         for column, onward in zip(self.columns, backward, strict=True):
             path.probabilities[column.number] = np.exp(column.forward + onward - self.ended[-1])
-        self._trace(path)
+        self._note_gaps(path)
         return path
 
-    def _trace(self, path: Path) -> None:
-        """Write the likeliest way, and its gaps."""
-        ends = [(float(c.best.max()), n) for n, c in enumerate(self.columns)]
-        score, n = max(ends, default=(0.0, 0))
-        at = (n, int(self.columns[n].best.argmax())) if score > 0.0 else None
-        while at is not None:
-            n, j = at
+    def _empty_path(self) -> Path:
+        return Path([np.empty(0)] * len(self.frames), [None] * len(self.frames))
+
+    def _note_gaps(self, path: Path) -> None:
+        """Write the gaps between the likeliest states."""
+        found = [(n, j) for n, c in enumerate(self.columns) if (j := path.chosen(c.number)) is not None]
+        for (m, i), (n, j) in pairwise(found):
             column = self.columns[n]
-            path.chosen[column.number] = j
-            at = column.back[j]
-            if at is not None:
-                log = next(s.log[at[1], j] for s in column.steps if s.begin == at[0])
-                if self.motion.is_timed and log <= self.motion.jump_log:
-                    path.gaps[column.number] = self._gap(self.columns[at[0]].number, at[1], column.number, j)
+            log = next((s.log[i, j] for s in column.steps if s.begin == m), 0.0)
+            if self.motion.is_timed and log <= self.motion.jump_log:
+                path.gaps[column.number] = self._gap(self.columns[m].number, i, column.number, j)
 
     def _gap(self, m: int, i: int, k: int, j: int) -> tuple[float, float]:
         begin, end = self.frames[m].states[i].pose, self.frames[k].states[j].pose

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import posterior
-from ..geometry.pose import Pose, exp_so3, log_so3
+from ..geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -26,7 +26,6 @@ from ..localization.settings import CoarseToFineSettings
 from ..localization.verification import verify
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
-from .beliefs import EVEN
 from .frames import (
     MOST_EXPECTED,
     MOST_ODDS,
@@ -43,7 +42,7 @@ from .frames import (
 )
 from .free_space import FreeSpace
 from .motion import Motion, carry
-from .path import COPY_LOG_ODDS, REACH_SLACK, Lattice
+from .path import COPY_LOG_ODDS, EVEN, REACH_SLACK, Lattice
 from .places import (
     MOST_PLACES,
     Place,
@@ -224,9 +223,7 @@ class Tracker:
         """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it."""
         while True:
             probabilities = self.lattice.filter_last()
-            is_likely = probabilities >= EVEN * probabilities.max()
-            odds = [state.log_odds for state in frame.states]
-            likeliest = frame.states[int(np.where(is_likely, odds, -np.inf).argmax())]
+            likeliest = frame.states[int(probabilities.argmax())]
             if likeliest.is_refined:
                 frame.states = put_state(frame.states, likeliest)
                 frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
@@ -366,7 +363,8 @@ def descend_last(query: Query, start: Pose) -> State:
     covariance = None
     if end.score >= HOPELESS_SCORE:
         covariance = estimate_covariance(query, pose, seen_from=start if is_near else None)
-    asked = query if query.photo.is_partial else replace(query, num_parts=0)
+    is_matched = query.photo.is_partial and distance(verify(query, pose).pose, pose) < MAX_DISTANCE
+    asked = query if is_matched else replace(query, num_parts=0)
     standings = assess_poses(asked, end, [])
     probability = float(posterior(standings, covariance)[0])
     log_odds = log_odds_of_place(probability, probability, covariance)
