@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import posterior
+from ..confidence.confidence import Standing, posterior
 from ..geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
@@ -354,8 +354,8 @@ def track(query: Query, start: Pose) -> State | None:
 def descend_last(query: Query, start: Pose) -> State:
     """Descend on the points themselves; return the end, with its odds by whole views.
 
-    Those of a narrow photo are by its matches there too, and it gains nothing by being where it was expected:
-    it may look alike from two poses near each other.
+    A narrow photo gains nothing by being where it was expected: it may look alike from two poses near each
+    other.
     """
     pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
     end = score_pose(query, pose)
@@ -363,10 +363,19 @@ def descend_last(query: Query, start: Pose) -> State:
     covariance = None
     if end.score >= HOPELESS_SCORE:
         covariance = estimate_covariance(query, pose, seen_from=start if is_near else None)
-    is_matched = query.photo.is_partial and distance(verify(query, pose).pose, pose) < MAX_DISTANCE
-    asked = query if is_matched else replace(query, num_parts=0)
-    standings = assess_poses(asked, end, [])
-    probability = float(posterior(standings, covariance)[0])
+    probability = float(posterior([assess_end(query, end)], covariance)[0])
     log_odds = log_odds_of_place(probability, probability, covariance)
     gain = 0.0 if query.photo.is_partial else MOST_EXPECTED
     return State(pose, log_odds, end.score, covariance, gain)
+
+
+def assess_end(query: Query, end: Hypothesis) -> Standing:
+    """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
+
+    Matches that put the photo elsewhere do not count.
+    """
+    if not query.photo.is_partial:
+        return assess_poses(replace(query, num_parts=0), end, [])[0]
+    standing = assess_poses(query, end, [])[0]
+    is_here = distance(verify(query, end.pose).pose, end.pose) < MAX_DISTANCE
+    return standing if is_here else standing._replace(num_matches=0)
