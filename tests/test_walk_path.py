@@ -254,15 +254,6 @@ def test_frames_that_name_each_other_as_key_frames_measure_nothing():
     assert motion_between(frames, 0, 1) is None
 
 
-def test_nobody_turns_round_at_once():
-    """The same place seen the other way round is out of reach in half a second, not in two."""
-    for seconds, is_reached in ((0.5, False), (2.0, True)):
-        frames = [_key(0, ((0, 0, 0), 5.0)), _key(seconds, ((0, 0, 0), 5.0))]
-        frames[1].states = [State(_pose(0, 0, 0, yaw=math.pi), 5.0, 0.5)]
-        path = build_lattice(frames, Open(), MOTION).smooth()
-        assert (_chosen(path) == [0, 0] and path.gaps == [None, None]) == is_reached
-
-
 def test_refusals():
     with pytest.raises(InputError, match=r"^times: found 1.0 after 2.0 at frame 2, wanted them to rise$"):
         check_times([0.0, 2.0, 1.0])

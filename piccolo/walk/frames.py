@@ -21,7 +21,7 @@ from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
 SAME_PLACE = 2.0  # [m] poses nearer to each other: key frames are so far apart
-SAME_HEADING = math.radians(45.0)  # and this are of one place
+SAME_HEADING = math.pi / 4.0  # and this are of one place: square rooms look alike turned by twice that
 MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 

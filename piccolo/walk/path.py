@@ -26,7 +26,6 @@ from .motion import JUMP_LOG, Motion, carry
 
 EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
-MAX_TURN = math.pi  # [rad/s] of a person with a camera
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
 NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] to and from a place: no way passes over more evidence than that costs
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
@@ -123,14 +122,10 @@ def is_moved(
     carried = [carry(end, begin, state.pose) for state in starts]
     centers = np.array([pose.center_world for pose in carried])
     distances = np.linalg.norm(centers[:, None] - state_centers(ends)[None], axis=2)
-    return np.asarray((distances < error) & is_turned(carried, ends, MIN_ANGLE))
-
-
-def is_turned(starts: Sequence[Pose], ends: Sequence[State], angle: float) -> NDArray[np.bool_]:
-    """Return True (S, N) for the pairs of poses that are turned against each other by less than an angle."""
-    R_starts = np.array([pose.R_cam_from_world for pose in starts]).reshape(len(starts), 9)
-    R_ends = np.array([state.pose.R_cam_from_world for state in ends]).reshape(len(ends), 9)
-    return np.asarray(R_starts @ R_ends.T >= 1.0 + 2.0 * math.cos(min(angle, math.pi)) - 1e-9)
+    R_carried = np.array([pose.R_cam_from_world for pose in carried]).reshape(-1, 9)
+    R_ends = np.array([state.pose.R_cam_from_world for state in ends]).reshape(-1, 9)
+    is_turned_so = R_carried @ R_ends.T >= 1.0 + 2.0 * math.cos(MIN_ANGLE)  # the trace of R is 1 + 2 cos
+    return np.asarray((distances < error) & is_turned_so)
 
 
 class Lattice:
@@ -207,8 +202,6 @@ class Lattice:
         distances = self.space.distances(centers, state_centers(ends), limit)
         fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
         expected = np.minimum(-np.log(fractions), most_expected)
-        if self.motion.is_timed:
-            distances[~is_turned(begins, ends, MAX_TURN * seconds)] = np.inf
         log = np.full((len(starts), len(ends)), self.motion.jump_log)
         log[is_likely] = log_transition(distances, seconds, self.motion, expected)
         return log

@@ -54,7 +54,6 @@ from .places import (
 )
 
 ELSEWHERE = SAME_PLACE + REACH_SLACK  # [m] from where it was, a camera is at another place
-MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 
 
 class Follower(NamedTuple):
@@ -280,7 +279,7 @@ def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found |
     None also if the photo is mirrored.
     """
     expected = expect(f, time, motion)
-    near = query_near(query, f.pose, min(expected.reach, MAX_RADIUS))
+    near = query_near(query, f.pose, expected.reach)
     ends = descend_briefly(near)
     if is_mirrored(near, ends):
         return None
