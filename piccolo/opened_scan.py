@@ -84,7 +84,7 @@ class OpenedScan:
         quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
         tracker = Tracker(self.prepared, settings, quiet, motion)
         repeated = settings_json(settings, self.cloud_settings, read_options)
-        about = WalkAbout(self.name, self.warnings, {**repeated, "walk": asdict(motion)})
+        about = WalkAbout(self.name, self.warnings, {**repeated, "walk": motion.to_settings()})
         return Walk(tracker, read_options, about)
 
     def occlusion_mask(

@@ -131,6 +131,7 @@ class Walk:
             check_times([self.tracker.frames[-1].time, when])
         elif time is None:
             self.tracker.forget_times()
+            self.about.settings["walk"] = self.tracker.motion.to_settings()
         watch = Stopwatch(taken.seconds)
         if panorama is None or query is None:
             self.tracker.accept(Frame(when, odometry=odometry))

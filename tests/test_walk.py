@@ -167,6 +167,19 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building)
     results = scan.localize_walk([q.image for q in some], gravity="known")
     _assert_right(results, some)
     assert [(r.walk.how, r.walk.alone.status) for r in results] == [("alone", "localized")] * 4
+    motion = results[0].settings["walk"]
+    assert (motion["max_speed"], motion["is_timed"]) == (5.0, False)
+
+
+def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, building, tmp_path):
+    """The first frame can't be read; the second is searched. The camera stays lost: searched 2.3 m on, then 6 m."""
+    _, queries = building
+    walk = scan.track(max_speed=1.0, gravity="known")
+    walk.add(tmp_path / "missing.jpg", 0.0)
+    noise = np.random.default_rng(1).integers(0, 255, (256, 512, 3), dtype=np.uint8)
+    searched = [walk.add(noise, time).walk.alone is not None for time in range(1, 10)]
+    assert searched == [k in (1, 4, 7) for k in range(1, 10)]
+    assert walk.add(queries[0].image, 14.0).status == "localized"
 
 
 def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, building, monkeypatch):

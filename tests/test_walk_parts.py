@@ -33,7 +33,7 @@ def _dense(located, times, s):
         A[k, k : k + 3] = (
             2.0 / (before + after) * np.array([1 / before, -1 / before - 1 / after, 1 / after]) / s
         )
-    own = np.diag([1.0 / (c.matrix[3, 3]) for _, c in located])
+    own = np.diag([1.0 / c.matrix[3, 3] for _, c in located])
     centers = np.array([pose.center_world for pose, _ in located])
     covariance = np.linalg.inv(own + A.T @ A)
     return covariance @ own @ centers, covariance

@@ -182,6 +182,26 @@ def test_a_jump_has_a_price_and_is_reported():
     assert log_transition(np.array([50.0]), 1.0, MOTION)[0] == JUMP_LOG
 
 
+def test_frames_without_times_may_be_anywhere_and_report_no_gap():
+    assert (Motion().speed, Motion(is_timed=False).speed, Motion(3.0, is_timed=False).speed) == (
+        2.0,
+        5.0,
+        3.0,
+    )
+    frames = [_key(k, ((50.0 * k, 0, 0), 1.0)) for k in range(4)]
+    path = build_lattice(frames, Open(), Motion(is_timed=False)).smooth()
+    assert _chosen(path) == [0] * 4
+    assert path.gaps == [None] * 4
+    assert _chosen(build_lattice(frames, Open(), Motion()).smooth()) == [None] * 4
+
+
+def test_twins_that_are_as_likely_are_no_gap():
+    frames = [_key(3.0 * k, ((k % 2 * 40, 0, 0), 5.0), ((40 - k % 2 * 40, 0, 0), 5.0)) for k in range(5)]
+    path = build_lattice(frames, Open(), MOTION).smooth()
+    np.testing.assert_allclose([p.max() for p in path.probabilities], 0.5, atol=0.01)
+    assert path.gaps == [None] * 5
+
+
 def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there():
     frames = [_key(0, ((0, 0, 0), 5.0), ((20, 0, 0), 5.0)), _followed(1, 0, (1, 0, 0)), Frame(2.0)]
     here = build_lattice([*frames, _key(3, ((2, 0, 0), 6.0))], Open(), MOTION)

@@ -7,10 +7,11 @@ import pytest
 import rooms
 
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization import refinement
-from piccolo.localization.attempts import brief_query
+from piccolo.localization.attempts import CHANCE_MATCHES, brief_query
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker
@@ -44,6 +45,14 @@ def _off(pose, metres, degrees):
     """A pose so far from another."""
     turn = exp_so3(np.radians(degrees) * np.array([0.0, 0.0, 1.0]))
     return Pose(turn @ pose.R_cam_from_world, pose.center_world + metres * np.array([0.8, 0.6, 0.0]))
+
+
+def _narrow(query):
+    """The query of a part of the same photo."""
+    panorama = rooms.as_panorama(rooms.query(SEED).rgb)
+    columns = np.linspace(-0.5, 0.5, panorama.is_valid.shape[1])
+    narrow = replace(panorama, is_valid=panorama.is_valid & (np.abs(columns) < 0.15))
+    return prepare_query(narrow, query.scan_map, CoarseToFineSettings(), Workers(2))
 
 
 def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
@@ -158,10 +167,7 @@ def test_a_camera_goes_on_as_it_went_but_no_farther_than_it_can(seen):
 
 def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkeypatch):
     query, true = seen
-    panorama = rooms.as_panorama(rooms.query(SEED).rgb)
-    columns = np.linspace(-0.5, 0.5, panorama.is_valid.shape[1])
-    narrow = replace(panorama, is_valid=panorama.is_valid & (np.abs(columns) < 0.15))
-    taken = prepare_query(narrow, query.scan_map, CoarseToFineSettings(), Workers(2))
+    taken = _narrow(query)
     starts = []
 
     def stay(query, start):
@@ -176,3 +182,15 @@ def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkey
     assert end.gain == 0.0
     assert tracker.track(query, true).gain > 0.0
     assert len(starts) == 3
+
+
+def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
+    taken = _narrow(seen[0])
+    true = seen[1]
+    here = tracker.assess_end(taken, Hypothesis(true, 0.5))
+    assert here.num_matches > CHANCE_MATCHES
+    beside = tracker.assess_end(taken, Hypothesis(_off(true, 0.25, 0.0), 0.5))
+    assert beside.num_matches == 0
+    assert log_odds(here) > log_odds(beside)
+    assert tracker.assess_end(seen[0], Hypothesis(true, 0.5)).num_matches is None
+    assert tracker.assess_end(replace(taken, num_parts=0), Hypothesis(true, 0.5)).num_matches is None

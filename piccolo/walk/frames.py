@@ -75,7 +75,7 @@ class Frame:
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
     """List a frame's poses from its own localization, with the probabilities of that.
 
-    Alternatives are as rough as other places: their covariance is not known.
+    Alternatives count as not refined, as their covariance is not known.
     """
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []

@@ -47,7 +47,7 @@ class WalkFrame:
     frame: int  # from 0
     how: str  # where its pose comes from: "alone", "tracked", "near", or "none"
     alone: Alone | None  # if it was searched without regard to the others
-    gap: Gap | None  # before it
+    gap: Gap | None  # before it; None without times
 
 
 def make_localizations(
@@ -136,7 +136,7 @@ def acceleration_rows(times: Sequence[float], motion: Motion) -> Any:
     before, after = steps[:-1], steps[1:]
     factors = np.array([1.0 / before, -1.0 / before - 1.0 / after, 1.0 / after])
     factors *= 2.0 / (before + after) / motion.max_acceleration
-    # in more time a person stops and turns back
+    # in a longer time a person can stop and walk back
     factors[:, np.maximum(before, after) > 2.0 * motion.speed / motion.max_acceleration] = 0.0
     row, offset = np.indices((len(before), 3))
     return csr_matrix((factors.T.ravel(), (row.ravel(), (row + offset).ravel())), (len(before), len(times)))

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import pairwise
 
 from ..errors import InputError
@@ -33,6 +33,10 @@ class Motion:
     def speed(self) -> float:
         """Largest speed [m/s]; of frames without times largest step [m]."""
         return self.max_speed or (MAX_SPEED if self.is_timed else MAX_STEP)
+
+    def to_settings(self) -> dict[str, object]:
+        """Return the motion as results repeat it."""
+        return {**asdict(self), "max_speed": self.speed}
 
     @property
     def jump_log(self) -> float:

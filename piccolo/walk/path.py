@@ -1,9 +1,9 @@
 """The path through the places of a walk's key frames: Markov localization (Fox, Burgard and Thrun, 1999).
 
 Each key frame has a likelihood over the whole map, kept where it is not negligible. The camera walks from
-place to place through free space, or as tracking or an odometry says; anything else is a jump at a price.
-A frame may also have none of its places, and the path goes on from an earlier one. Forward-backward (Rabiner
-1989) finds the probability of each place.
+place to place through free space, or as tracking or an odometry says; anything else is a jump, at a price if
+the frames have times. A frame may also have none of its places, and the path goes on from an earlier one.
+Forward-backward (Rabiner 1989) finds the probability of each place.
 
 Frames of one place have correlated errors: key frames are some distance apart, and they tell places apart
 only beyond the differences between exact copies of a room.
@@ -27,7 +27,7 @@ from .motion import JUMP_LOG, Motion, carry
 EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
-NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] to and from a place: no way passes over more evidence than that costs
+NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] a way that leaves out more evidence is worse than two jumps
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
 
 
@@ -35,7 +35,7 @@ class Path(NamedTuple):
     """The probabilities of the places of a walk's key frames; of other frames there is nothing."""
 
     probabilities: list[Array]  # (S,) of each frame's states
-    gaps: list[tuple[float, float] | None]  # [m], [s] before a frame that no walking person reaches
+    gaps: list[tuple[float, float] | None]  # [m], [s] before a frame with time that no walking person reaches
 
     def chosen(self, k: int) -> int | None:
         """Return the likeliest state of a frame; None if more likely it has none of them."""
@@ -188,7 +188,7 @@ class Lattice:
     def _step(self, m: int, k: int, is_likely: NDArray[np.bool_], most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another.
 
-        Nobody walks from a place that is less likely (S before,) than a jump from the best.
+        Nobody walks from a place that is far less likely (S before,) than the best.
         """
         starts, ends = self.frames[m].states, self.frames[k].states
         if moved := motion_between(self.frames, m, k):
@@ -250,8 +250,9 @@ class Lattice:
         return Path([np.empty(0)] * len(self.frames), [None] * len(self.frames))
 
     def _note_gaps(self, path: Path) -> None:
-        """Write the gaps between the likeliest states."""
-        found = [(n, j) for n, c in enumerate(self.columns) if (j := path.chosen(c.number)) is not None]
+        """Write the gaps between likely states."""
+        likely = [path.probabilities[column.number] > EVEN for column in self.columns]
+        found = [(n, int(is_likely.argmax())) for n, is_likely in enumerate(likely) if is_likely.any()]
         for (m, i), (n, j) in pairwise(found):
             column = self.columns[n]
             log = next((s.log[i, j] for s in column.steps if s.begin == m), 0.0)

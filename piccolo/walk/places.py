@@ -59,7 +59,7 @@ def descend_briefly(query: Query) -> Ends:
 
 
 def descend_from(query: Query, starts: Starts) -> Ends:
-    """Descend a few steps from starts on their candidates' prepared views; of a narrow photo more."""
+    """Descend a few steps from starts on their candidates' prepared views; more steps for a narrow photo."""
     num = SECOND_ITERATIONS if query.photo.is_partial else FIRST_ITERATIONS
     return Ends(*descend_all(query.scan_map, query.photo.images.search(), starts, num, query.workers))
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice
+from itertools import islice, takewhile
 
 from ..confidence.confidence import MIN_CONFIDENCE
 from ..jobs.blas import one_blas_thread
@@ -12,7 +12,7 @@ from .beliefs import Belief, believe
 from .frames import Frame, State
 from .motion import carry
 from .path import Path, build_lattice
-from .tracker import Follower, Tracker, find_from, move_on, refine_state
+from .tracker import MAX_RADIUS, Follower, Tracker, find_from, move_on, refine_state
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
@@ -104,10 +104,12 @@ def _list_ways(tracker: Tracker, path: Path, k: int) -> list[tuple[int, Follower
 
 
 def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
-    """List the nearest two sure frames in one direction."""
+    """List the nearest two sure frames in one direction from which a frame can be found."""
     frames = tracker.frames
+    farthest = MAX_RADIUS / tracker.motion.speed
     numbers = range(k + step, len(frames) if step > 0 else -1, step)
-    return list(islice((m for m in numbers if believe(frames, path, m).is_sure), 2))
+    near = takewhile(lambda m: abs(frames[k].time - frames[m].time) <= farthest, numbers)
+    return list(islice((m for m in near if believe(frames, path, m).is_sure), 2))
 
 
 def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> None:

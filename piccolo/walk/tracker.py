@@ -53,6 +53,7 @@ from .places import (
     query_near,
 )
 
+MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 ELSEWHERE = SAME_PLACE + REACH_SLACK  # [m] from where it was, a camera is at another place
 
 
@@ -102,7 +103,7 @@ class Tracker:
         self.workers = workers
         self.motion: Motion = motion
         self.lattice: Lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
-        self.found_at: float = -math.inf  # time when the camera was found last
+        self.found_at: float = -math.inf  # time when the camera was found last, or searched first
         self.next_search: float = 0.0  # [m] that it may have gone since, when it is searched everywhere
 
     @property
@@ -155,7 +156,8 @@ class Tracker:
 
     def _note(self, frame: Frame) -> None:
         """Note when the camera was found, or when it is to be searched everywhere again."""
-        if frame.arrived is not None or frame.departed is not None or len(self.frames) == 1:
+        is_found = frame.arrived is not None or frame.departed is not None
+        if is_found or (frame.alone is not None and math.isinf(self.found_at)):
             self.found_at = frame.time
             self.next_search = ELSEWHERE
         elif frame.alone is not None:
@@ -252,7 +254,7 @@ def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -
 
 
 def refine_state(query: Query, states: Sequence[State], rough: State) -> list[State]:
-    """Refine a rough state; its odds are then relative to those of the best refined one.
+    """Refine a rough state; its odds are then relative to those of the best refined one, by whole views.
 
     It is dropped if a frame would not be tracked there, or has that pose already.
     """
@@ -279,7 +281,7 @@ def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found |
     None also if the photo is mirrored.
     """
     expected = expect(f, time, motion)
-    near = query_near(query, f.pose, expected.reach)
+    near = query_near(query, f.pose, min(expected.reach, MAX_RADIUS))
     ends = descend_briefly(near)
     if is_mirrored(near, ends):
         return None
@@ -344,7 +346,7 @@ def track(query: Query, start: Pose) -> State | None:
     A narrow photo is tracked again from where its matches with the scan drawn there put it.
     """
     end = descend_last(query, refine_on_middle_cells(query, start).pose)
-    if query.photo.is_partial:
+    if has_own_matches(query):
         again = refine_on_middle_cells(query, verify(query, end.pose).pose).pose
         end = max(end, descend_last(query, again), key=lambda state: state.log_odds)
     return None if end.log_odds < 0.0 else end
@@ -353,7 +355,7 @@ def track(query: Query, start: Pose) -> State | None:
 def descend_last(query: Query, start: Pose) -> State:
     """Descend on the points themselves; return the end, with its odds by whole views.
 
-    A narrow photo gains nothing by being where it was expected: it may look alike from two poses near each
+    A narrow photo gains nothing by being where it was expected: it may look the same at two poses near each
     other.
     """
     pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
@@ -368,12 +370,17 @@ def descend_last(query: Query, start: Pose) -> State:
     return State(pose, log_odds, end.score, covariance, gain)
 
 
+def has_own_matches(query: Query) -> bool:
+    """Return True for a narrow photo whose features can be matched with the scan drawn at a pose."""
+    return query.photo.is_partial and query.num_parts > 0
+
+
 def assess_end(query: Query, end: Hypothesis) -> Standing:
     """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
 
     Matches that put the photo elsewhere do not count.
     """
-    if not query.photo.is_partial:
+    if not has_own_matches(query):
         return assess_poses(replace(query, num_parts=0), end, [])[0]
     standing = assess_poses(query, end, [])[0]
     is_here = distance(verify(query, end.pose).pose, end.pose) < MAX_DISTANCE
