@@ -87,7 +87,7 @@ def _naive(frames, share):
 
 def _chosen(path):
     """The likeliest state of each frame."""
-    return [path.chosen(k) for k in range(len(path.probabilities))]
+    return [path.choose(k) for k in range(len(path.probabilities))]
 
 
 @pytest.mark.parametrize("seed", range(12))

@@ -46,7 +46,7 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     """Return the poses to which a frame was tracked, from each place where its key frame may be."""
     frame = frames[k]
     key = frame.key
-    if key is None or frame.arrived is None or not frames[key].is_key or path.chosen(key) is None:
+    if key is None or frame.arrived is None or not frames[key].is_key or path.choose(key) is None:
         return NOTHING
     at_key = believe_key(frames[key].states, path.probabilities[key])
     own = frame.states[0]
@@ -70,7 +70,7 @@ def share_of_next(frames: Sequence[Frame], path: Path, k: int, at_key: Belief) -
     n = next(after, None)
     if n is None or frames[n].key != key:
         return 1.0
-    chosen = path.chosen(n)
+    chosen = path.choose(n)
     if chosen is None or path.gaps[n] is not None:
         return EVEN
     return min(float(path.probabilities[n][chosen] / max(at_key.probabilities[0], 1e-9)), 1.0)

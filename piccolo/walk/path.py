@@ -37,7 +37,7 @@ class Path(NamedTuple):
     probabilities: list[Array]  # (S,) of each frame's states
     gaps: list[tuple[float, float] | None]  # [m], [s] before a frame with time that no walking person reaches
 
-    def chosen(self, k: int) -> int | None:
+    def choose(self, k: int) -> int | None:
         """Return the likeliest state of a frame; None if more likely it has none of them."""
         found = self.probabilities[k]
         return int(found.argmax()) if found.sum() > EVEN else None

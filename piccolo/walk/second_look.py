@@ -51,7 +51,7 @@ def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
     return [
         j
         for j, state in enumerate(tracker.frames[k].states)
-        if not state.is_refined and len(is_likely) and (is_likely[j] or j == path.chosen(k))
+        if not state.is_refined and len(is_likely) and (is_likely[j] or j == path.choose(k))
     ]
 
 
@@ -115,7 +115,7 @@ def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
 def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> None:
     """Give a frame a pose beside a sure one, whose key frame is then its key frame too."""
     key = sure if frames[sure].is_key else frames[sure].key
-    chosen = None if key is None else path.chosen(key)
+    chosen = None if key is None else path.choose(key)
     if key is None or chosen is None:
         return
     at_key = frames[key].states[chosen].pose

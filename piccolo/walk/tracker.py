@@ -21,7 +21,7 @@ from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Query, prepare_query
 from ..localization.refinement import descend, refine_on_middle_cells
-from ..localization.selection import assess_poses
+from ..localization.selection import SURE_SCORE, assess_poses
 from ..localization.settings import CoarseToFineSettings
 from ..localization.verification import verify
 from ..panorama import Panorama
@@ -341,7 +341,7 @@ def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> P
 
 
 def track(query: Query, start: Pose) -> State | None:
-    """Descend from a pose and around; None if the end more likely is wrong than right.
+    """Descend from a pose and around; None if the end more likely is wrong than right, or explains nothing.
 
     A narrow photo is tracked again from where its matches with the scan drawn there put it.
     """
@@ -349,7 +349,8 @@ def track(query: Query, start: Pose) -> State | None:
     if has_own_matches(query):
         again = refine_on_middle_cells(query, verify(query, end.pose).pose).pose
         end = max(end, descend_last(query, again), key=lambda state: state.log_odds)
-    return None if end.log_odds < 0.0 else end
+    is_wrong = end.log_odds < 0.0 or end.score is None or end.score < SURE_SCORE
+    return None if is_wrong else end
 
 
 def descend_last(query: Query, start: Pose) -> State:
