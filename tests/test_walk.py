@@ -172,7 +172,7 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building)
 
 
 def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, building, tmp_path):
-    """The first frame can't be read; the second is searched, and as it is lost again after 2.3 m, then 6 m."""
+    """The first frame can't be read; the second is searched, and as it is lost, again 2.3 m and 6 m on."""
     _, queries = building
     walk = scan.track(max_speed=1.0, gravity="known")
     walk.add(tmp_path / "missing.jpg", 0.0)

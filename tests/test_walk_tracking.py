@@ -194,3 +194,12 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
     assert log_odds(here) > log_odds(beside)
     assert tracker.assess_end(seen[0], Hypothesis(true, 0.5)).num_matches is None
     assert tracker.assess_end(replace(taken, num_parts=0), Hypothesis(true, 0.5)).num_matches is None
+
+
+@pytest.mark.parametrize(
+    ("odds", "score", "is_found"), [(2.0, 0.2, True), (2.0, 0.02, False), (-0.1, 0.2, False)]
+)
+def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, odds, score, is_found):
+    query, true = seen
+    monkeypatch.setattr(tracker, "descend_last", lambda query, start: State(start, odds, score))
+    assert (track(query, true) is not None) == is_found
