@@ -75,8 +75,7 @@ FINE_LIMITS = Limits(FINE_LOSS, 12, 1e-4)
 def refine(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     """Refine the starts by successive halving to a few distinct poses on fine cells, best first."""
     workers = query.workers
-    first = SECOND_ITERATIONS if query.photo.is_partial else FIRST_ITERATIONS
-    coarse = descend_prepared(query, starts, first, beam.num_coarse)
+    coarse = descend_prepared(query, starts, count_first_iterations(query), beam.num_coarse)
     coarse = descend_prepared(query, coarse, SECOND_ITERATIONS, beam.num_middle)
     middle = workers.map(partial(descend_middle, query), coarse.poses(), "descend")
     narrowed = narrow(middle, beam.num_fine)
@@ -98,6 +97,11 @@ def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
         return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
 
     return sort_by_score(query.workers.map(refine_match, poses, "descend"))
+
+
+def count_first_iterations(query: Query) -> int:
+    """Return the iterations of the first descents; a narrow photo needs more."""
+    return SECOND_ITERATIONS if query.photo.is_partial else FIRST_ITERATIONS
 
 
 def descend_prepared(query: Query, starts: Starts, num_iterations: int, count: int) -> Starts:

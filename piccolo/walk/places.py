@@ -18,7 +18,7 @@ from ..geometry.rotations import uniform_yaws
 from ..geometry.suppression import non_maximum_suppression
 from ..localization.attempts import brief_query, mirror_query
 from ..localization.query import Cache, Query
-from ..localization.refinement import FIRST_ITERATIONS, SECOND_ITERATIONS, descend_all
+from ..localization.refinement import count_first_iterations, descend_all
 from ..localization.search import Starts, search_poses
 
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
@@ -59,8 +59,8 @@ def descend_briefly(query: Query) -> Ends:
 
 
 def descend_from(query: Query, starts: Starts) -> Ends:
-    """Descend a few steps from starts on their candidates' prepared views; more steps for a narrow photo."""
-    num = SECOND_ITERATIONS if query.photo.is_partial else FIRST_ITERATIONS
+    """Descend a few steps from starts on their candidates' prepared views."""
+    num = count_first_iterations(query)
     return Ends(*descend_all(query.scan_map, query.photo.images.search(), starts, num, query.workers))
 
 
