@@ -28,7 +28,8 @@ if TYPE_CHECKING:
     from .scan import Scan
     from .scan_map.prior import GpsPrior
     from .scan_walk import Walk
-    from .walk.localize import Alone, Gap, WalkFrame
+    from .walk.localize import Alone, WalkFrame
+    from .walk.path import Gap
 
 MODULES = {
     "Alone": ".walk.localize",
@@ -36,7 +37,7 @@ MODULES = {
     "CoarseToFineSettings": ".localization.settings",
     "Evidence": ".confidence.localization",
     "FocalLength": ".confidence.localization",
-    "Gap": ".walk.localize",
+    "Gap": ".walk.path",
     "GpsPrior": ".scan_map.prior",
     "PaperSettings": ".paper.settings",
     "Pose": ".geometry.pose",

@@ -23,7 +23,8 @@ from .geometry.pose import Pose, check_rotation
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .scan_map.prior import GpsPrior
-from .walk.localize import Alone, Gap, WalkFrame
+from .walk.localize import Alone, WalkFrame
+from .walk.path import Gap
 
 FORMAT = "piccolo-pose/9"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")

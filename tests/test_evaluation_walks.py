@@ -22,18 +22,18 @@ from piccolo.scenes.evaluation.walks import (
     walk_table,
 )
 from piccolo.scenes.scene import Query, Scene
-from piccolo.walk.localize import Alone
+from piccolo.walk.localize import Alone, WalkFrame
 
 RATE = 2.0
 
 
-def walk_of(tmp_path, name="w", count=8, seed=0):
-    """Frames along a tilted path, in a shuffled order; the third has no answer."""
+def walk_of(tmp_path, name="w", count=8, seed=0, bad=2):
+    """Frames along a tilted path, in a shuffled order; the third, unless told otherwise, has no answer."""
     rng = np.random.default_rng(seed)
     queries = []
     for k in range(count):
         pose = Pose(exp_so3(rng.normal(size=3)), np.array([0.6 * k, 0.2 * k, 1.6]) + 0.1 * rng.normal(size=3))
-        queries.append(Query(tmp_path / f"{name}_{k}.jpg", "clean", pose, None, (), name, k / RATE, k != 2))
+        queries.append(Query(tmp_path / f"{name}_{k}.jpg", "clean", pose, None, (), name, k / RATE, k != bad))
     return [queries[k] for k in rng.permutation(count)]
 
 
@@ -46,26 +46,26 @@ def found(query, distance=0.02, angle_deg=1.0, status="localized"):
     return result(query.image, None if status == "unreadable" else pose, status)
 
 
-def frames_of(tmp_path, changes, **more):
-    """The frames of a walk whose results are changed by number."""
+def frames_of(tmp_path, changes, alone=None, **more):
+    """The frames of a walk whose results are changed by number; some have one alone too."""
     queries = walk_of(tmp_path, **more)
     scene = Scene("hall", tmp_path, tmp_path / "cloud.ply", tuple(queries))
-    rows = [
-        make_query_result(scene, query, found(query, **changes.get(int(RATE * query.time), {})), None)
-        for query in queries
-    ]
+    rows = []
+    for query in queries:
+        number = int(RATE * query.time)
+        walk = WalkFrame(query.time, number, "tracked", (alone or {}).get(number), None)
+        together = dataclasses.replace(found(query, **changes.get(number, {})), walk=walk)
+        rows.append(make_query_result(scene, query, together, None))
     return group_walks([scene], rows)
 
 
 def test_path_errors_equal_evo(tmp_path):
-    ((_, frames),) = frames_of(
-        tmp_path, {0: {"status": "ambiguous"}, 5: {"distance": 0.3, "angle_deg": 20.0}}
-    ).items()
-    frames = [frame._replace(query=dataclasses.replace(frame.query, is_answerable=True)) for frame in frames]
+    changes = {0: {"status": "ambiguous"}, 5: {"distance": 0.3, "angle_deg": 20.0}}
+    ((_, frames),) = frames_of(tmp_path, changes, bad=None).items()
     summary = summarize_walks([frames])
     paths = [
         PosePath3D(poses_se3=[pose.T_world_from_cam for pose in poses])
-        for poses in ([f.query.pose for f in frames[1:]], [f.pose for f in frames[1:]])
+        for poses in ([f.query.pose for f in frames[1:]], [f.row.result.best_pose for f in frames[1:]])
     ]
     ate = metrics.APE(metrics.PoseRelation.translation_part)
     ate.process_data(tuple(paths))
@@ -155,14 +155,13 @@ def test_a_photo_without_an_answer_has_no_errors_and_is_read_back_without(tmp_pa
 
 def test_frames_alone_and_together_are_counted_side_by_side(tmp_path):
     """Of three searched alone, one was sure and wrong, and is right with the others."""
-    ((name, frames),) = frames_of(tmp_path, {}).items()
-    wrong = frames[0].query.pose
+    poses = {query.time * RATE: query.pose for query in walk_of(tmp_path)}
     alone = {
-        0: Alone("localized", 0.95, frames[0].query.pose),
-        1: Alone("localized", 0.93, wrong),
-        3: Alone("ambiguous", 0.5, frames[3].query.pose),
+        0: Alone("localized", 0.95, poses[0]),
+        1: Alone("localized", 0.93, poses[0]),
+        3: Alone("ambiguous", 0.5, poses[3]),
     }
-    frames = [frame._replace(alone=alone.get(k)) for k, frame in enumerate(frames)]
+    ((name, frames),) = frames_of(tmp_path, {}, alone).items()
     table = alone_table({name: frames}, PAPER_THRESHOLDS)
     assert table.columns[2:5] == ("correct alone", "localized alone", "wrong alone")
     assert table.rows == (("hall w", "3", "2", "2", "1", "3", "3", "0"),)

@@ -13,6 +13,7 @@ from piccolo.walk.frames import MOST_EXPECTED, Frame, State
 from piccolo.walk.motion import JUMP_LOG, Motion, carry, check_times
 from piccolo.walk.path import (
     COPY_LOG_ODDS,
+    Gap,
     build_lattice,
     emissions,
     is_moved,
@@ -174,7 +175,7 @@ def test_a_jump_has_a_price_and_is_reported():
     ]
     path = build_lattice(frames, Open(), MOTION).smooth()
     assert _chosen(path) == [0] * 8
-    assert path.gaps == [None] * 4 + [(51.0, 1.0)] + [None] * 3
+    assert path.gaps == [None] * 4 + [Gap(51.0, 1.0)] + [None] * 3
     lonely = [*frames[:4], _key(4, ((54, 0, 0), 2.0)), _key(5, ((5, 0, 0), 5.0))]
     path = build_lattice(lonely, Open(), MOTION).smooth()
     assert _chosen(path) == [0, 0, 0, 0, None, 0]

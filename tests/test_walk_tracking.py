@@ -15,20 +15,10 @@ from piccolo.localization.attempts import CHANCE_MATCHES, brief_query
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker
-from piccolo.walk.frames import State
+from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
 from piccolo.walk.places import Place, descend_briefly, find_places, is_mirrored, query_near
-from piccolo.walk.tracker import (
-    Expected,
-    Follower,
-    Found,
-    choose,
-    expect,
-    find_from,
-    predict,
-    refine_state,
-    track,
-)
+from piccolo.walk.tracker import Expected, expect, find_near, predict, refine_state, track
 
 SEED = 1
 
@@ -72,53 +62,82 @@ def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
     assert 3 < len(asked) <= 1 + 2 * refinement.MAX_PERTURBATIONS
 
 
-def test_a_camera_is_expected_no_farther_than_its_motion_allows(seen):
+def test_a_camera_is_expected_by_its_motion_before_or_by_an_odometry(seen):
     _, true = seen
-    ahead = _off(true, 0.5, 0.0)
-    assert expect(Follower(true, 0.0), 1.0, Motion()).holds(ahead)
-    assert not expect(Follower(true, 0.0), 1.0, Motion(max_speed=1e-3)).holds(ahead)
-    stands = Follower(true, 0.5, _off(true, -0.35, 0.0), 0.0)  # walked at 0.7 m/s
-    assert expect(stands, 1.0, Motion(max_acceleration=2.0)).holds(true)
-    assert not expect(stands, 1.0, Motion(max_acceleration=0.1)).holds(true)
-    assert expect(stands, 1.0, Motion(max_acceleration=0.1, is_timed=False)).holds(true)
+    before = _off(true, -0.35, 0.0)
+    frame = Frame(1.0)
+    assert expect(frame, [(Frame(0.5), true)], Motion()) == Expected(true, Motion().reach(0.5), true)
+    walked = expect(frame, [(Frame(0.5), true), (Frame(0.0), before)], Motion())
+    assert (walked.last, walked.reach) == (true, Motion().reach(0.5))
+    assert pose_errors(walked.pose, _off(true, 0.35, 0.0))[0] == pytest.approx(0.0, abs=1e-9)
+    slow = expect(frame, [(Frame(0.5), true), (Frame(0.0), before)], Motion(max_speed=0.01))
+    assert pose_errors(slow.pose, true)[0] == pytest.approx(slow.reach)
+    measured = [Frame(time, odometry=_off(true, time, 0.0)) for time in (0.5, 1.0)]
+    moved = expect(measured[1], [(measured[0], true), (Frame(0.0), before)], Motion())
+    assert moved.last is moved.pose
+    assert pose_errors(moved.pose, _off(true, 0.5, 0.0))[0] == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_frame_is_found_where_it_is_predicted_or_near(seen):
+def _expected(last, seconds, pose=None):
+    return Expected(last, Motion().reach(seconds), pose or last)
+
+
+def test_a_frame_is_found_where_it_is_expected_or_near(seen):
     query, true = seen
     for off, how in ((_off(true, 0.1, 5.0), "tracked"), (_off(true, 1.6, 120.0), "near")):
-        found = find_from(query, Follower(off, 0.0), 1.0, Motion())
+        found = find_near(query, _expected(off, 1.0))
         assert (found.how, found.is_alone) == (how, True)
         assert pose_errors(found.state.pose, true)[0] < 0.02
-    late = find_from(query, Follower(off, 0.0), 10.0, Motion())  # 20 m, of which 12 m are searched
-    assert pose_errors(late.state.pose, true)[0] < 0.02
+    assert find_near(query, _expected(off, 1.0, _off(true, 0.3, 5.0))).how == "tracked"
+    assert pose_errors(find_near(query, _expected(off, 10.0)).state.pose, true)[0] < 0.02
     for seconds in (1.0, 10.0):
-        assert find_from(query, Follower(_off(true, 50.0, 0.0), 0.0), seconds, Motion()) is None
+        assert find_near(query, _expected(_off(true, 50.0, 0.0), seconds)) is None
     rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
     mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
-    assert find_from(mirrored, Follower(true, 0.0), 1.0, Motion()) is None
+    assert find_near(mirrored, _expected(true, 1.0)) is None
 
 
-def test_a_pose_near_replaces_the_predicted_one_if_it_is_surer(seen):
-    """At the same place it counts as tracked; elsewhere it must be the only one of its kind, or sure."""
-    _, true = seen
-    own = State(true, 1.0, 0.5)
-    weak = State(true, 0.5, 0.5)
-    beside = State(_off(true, 0.2, 0.0), 3.5, 0.5)
-    elsewhere = State(_off(true, 5.0, 0.0), 3.5, 0.5)
-    doubtful = State(elsewhere.pose, 2.0, 0.5)
-    near = Expected(true, 9.0, true, 9.0)
-    far = Expected(true, 9.0, true, 1.0)
-    only = [Place(elsewhere.pose, 0.0)]
-    alike = [*only, Place(true, -1.0)]
-    assert choose(own, weak, only, near) == Found(own, "tracked")
-    assert choose(own, beside, alike, near) == Found(beside, "tracked")
-    assert choose(own, elsewhere, alike, near) == Found(own, "tracked")
-    assert choose(own, elsewhere, only, near) == Found(elsewhere, "near")
-    assert choose(own, elsewhere, only, far) == Found(own, "tracked")
-    assert choose(None, elsewhere, alike, far) == Found(elsewhere, "near", is_alone=False)
-    assert choose(None, doubtful, only, near) == Found(doubtful, "near")
-    assert choose(None, doubtful, only, far) is None
-    assert choose(None, doubtful, alike, near) is None
+@pytest.mark.parametrize(
+    ("behind", "at", "how", "is_alone"),
+    [
+        (-1.0, "expected", "tracked", False),  # it looks as a copy does: what was expected is taken
+        (-9.0, "expected", "tracked", True),
+        (1.0, "expected", "tracked", False),
+        (9.0, "elsewhere", "near", True),  # it looks better than a copy can
+    ],
+)
+def test_another_place_is_taken_if_it_looks_better_than_a_copy(seen, monkeypatch, behind, at, how, is_alone):
+    query, true = seen
+    elsewhere = _off(true, 3.0, 0.0)
+
+    def places(query, ends, best_score):
+        is_other = len(ends.scores) > 1  # of the search
+        own = behind if is_other else -behind
+        return [Place(elsewhere if is_other else true, min(own, 0.0))]
+
+    monkeypatch.setattr(tracker, "list_places", places)
+    monkeypatch.setattr(tracker, "track", lambda query, start: State(start, 3.5, 0.5))
+    found = find_near(query, _expected(true, 2.0))
+    assert found.state.pose is {"expected": true, "elsewhere": elsewhere}[at]
+    assert (found.how, found.is_alone) == (how, is_alone)
+
+
+def test_the_best_place_near_is_tried_if_nothing_is_found_where_it_was_expected(seen, monkeypatch):
+    query, true = seen
+    elsewhere = _off(true, 3.0, 0.0)
+    monkeypatch.setattr(
+        tracker,
+        "list_places",
+        lambda query, ends, best_score: [Place(elsewhere if len(ends.scores) > 1 else true, 0.0)],
+    )
+    monkeypatch.setattr(
+        tracker, "track", lambda query, start: None if start is true else State(start, odds, 0.5)
+    )
+    odds = 3.5
+    assert find_near(query, _expected(true, 2.0)).state.pose is elsewhere
+    assert find_near(query, _expected(true, 1.0)) is None, "it is out of reach"
+    odds = 2.0
+    assert find_near(query, _expected(true, 2.0)) is None, "it is not sure"
 
 
 def test_the_places_that_look_like_a_photo(seen):

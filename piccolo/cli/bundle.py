@@ -7,15 +7,14 @@ from pathlib import Path
 
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import read_relative_poses
-from ..batch.results_file import WAYS
-from ..files.atomic import is_stream
 from ..jobs.stopwatch import Stopwatch
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
-from .walking import write_all
+from .options import check_alone
+from .outputs import check_new_results, write_results
 
 NOT_WITH = ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 
@@ -24,20 +23,6 @@ def check_bundle_options(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go with --relative."""
     if arguments.relative:
         check_alone(arguments, "--relative", NOT_WITH)
-
-
-def check_alone(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
-    """Refuse the others of an option that does not go with them."""
-    for name in others:
-        if getattr(arguments, name) not in (None, False):
-            raise UsageError(f"--{name.replace('_', '-')}: not with {option}")
-
-
-def check_new_results(arguments: argparse.Namespace) -> None:
-    """Refuse a file of --out that has results, without --overwrite: all are written at once."""
-    out = arguments.out
-    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
-        raise UsageError(f"--out: {out} has results already; {WAYS}")
 
 
 def run_bundle(
@@ -56,7 +41,7 @@ def run_bundle(
     with watch.stage("all"):
         scan = open_scan()
         results = scan.localize_bundle(photos, poses, localizer.read_options, localizer.settings)
-    write_all(arguments.out, results)
+    write_results(arguments.out, results)
     for result in results:
         print_result(result, result.warnings[len(scan.warnings) :])
     counts = Counter(result.status for result in results)

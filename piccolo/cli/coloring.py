@@ -14,11 +14,11 @@ from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
 from ..scan_map.scan_map import ScanMap
-from .bundle import check_alone, check_new_results
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
+from .options import check_alone
+from .outputs import check_new_results, write_results
 from .progress import progress_bar
-from .walking import write_all
 
 NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
 NOT_WITH = ("walk", "video", "relative", "jobs", "dask", "overlay", "occlusion_mask", "labels")
@@ -66,7 +66,7 @@ def run_coloring(
         colored = write_colored_scan(scan, results, arguments.color_scan)
         counts = Counter(result.status for result in results)
         note = f"{100.0 * colored.num_colored / max(colored.num_points, 1):.0f} % of the points coloured"
-    write_all(arguments.out, results)
+    write_results(arguments.out, results)
     for result in results:
         print_result(result, result.warnings[len(scan.warnings) :])
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())

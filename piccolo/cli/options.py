@@ -322,6 +322,13 @@ def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
     return given
 
 
+def check_alone(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
+    """Refuse the others of an option that does not go with them."""
+    for name in others:
+        if getattr(arguments, name) not in (None, False):
+            raise InputError(f"--{name.replace('_', '-')}: not with {option}")
+
+
 def check_arguments(arguments: argparse.Namespace) -> None:
     """Refuse values that are wrong whatever the files hold."""
     check_least(arguments, threads=1, jobs=1)

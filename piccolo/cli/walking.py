@@ -4,7 +4,6 @@ import argparse
 import json
 import math
 import re
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,7 +18,7 @@ from ..batch.relative_poses import read_odometry
 from ..batch.results_file import WAYS, Records
 from ..camera import Calibration
 from ..errors import InputError
-from ..files.atomic import STDOUT, check_output, is_stream, write_atomically
+from ..files.atomic import check_output, is_stream
 from ..files.line_file import LineFile, open_locked, whole_lines, whole_size
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
@@ -37,8 +36,8 @@ from ..scan_walk import Walk
 from ..walk.motion import Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
-from .options import DEFAULT_EVERY
-from .outputs import check_suffix
+from .options import DEFAULT_EVERY, check_alone
+from .outputs import check_suffix, write_results
 from .progress import progress_bar, show_progress
 
 STEP = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
@@ -83,11 +82,10 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
         "--walk: found names on stdin, wanted files or folders": is_from_stdin(arguments.pano),
         "--times: not with --video, which contains its times": is_video and arguments.times is not None,
     }
-    for name in NOT_WITH:
-        wrong[f"--{name.replace('_', '-')}: not with a walk"] = getattr(arguments, name) not in (None, False)
     for text, is_so in wrong.items():
         if is_so:
             raise UsageError(text)
+    check_alone(arguments, "a walk", NOT_WITH)
 
 
 def take_step(words: Sequence[Path | None]) -> tuple[Path | None, str]:
@@ -161,7 +159,7 @@ def run_walk(
             )
             return interruption.stop(arguments, f"{len(walk.taken)} frames", how)
         results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
-    write_all(arguments.out, results)
+    write_results(arguments.out, results)
     write_plan(arguments.plan, scan, results)
     counts = Counter(result.status for result in results)
     if (path := frames_file(arguments.out)) and not counts[FAILED]:
@@ -281,13 +279,3 @@ def count_finished(
     names = [name for name in paths if name in records.names or not inputs.min_distance]
     left = list(records.remaining(names, lambda name: sha256_of(paths[name], rig)))
     return None if left or not records.is_in_order else records.counts
-
-
-def write_all(out: Path | None, results: Sequence[Result]) -> None:
-    """Write the results, whole or not at all."""
-    text = "".join(f"{result.to_json()}\n" for result in results)
-    if out is None or out == STDOUT:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    else:
-        write_atomically(out, text.encode())

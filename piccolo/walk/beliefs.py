@@ -51,10 +51,9 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     at_key = believe_key(frames[key].states, path.probabilities[key])
     own = frame.states[0]
     credible = 1.0 / (1.0 + math.exp(-own.log_odds - own.gain))
-    share = credible * share_of_next(frames, path, k, at_key)
+    probabilities = credible * np.minimum(at_key.probabilities, probability_of_next(frames, path, k))
     departed = frames[key].departed or at_key.states[0].pose
     carried = [carry(frame.arrived, departed, state.pose) for state in at_key.states]
-    probabilities = share * at_key.probabilities
     states = [State(pose, own.log_odds) for pose in carried]
     if is_same(carried[0], own.pose):
         return Belief([own, *states[1:]], probabilities)
@@ -63,14 +62,12 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     return Belief(states, probabilities, expected)
 
 
-def share_of_next(frames: Sequence[Frame], path: Path, k: int, at_key: Belief) -> float:
-    """Return the share of the belief in a key frame that the next one, tracked from it, leaves to a frame."""
-    key = frames[k].key
-    after = (n for n in range(k + 1, len(frames)) if frames[n].is_key)
-    n = next(after, None)
-    if n is None or frames[n].key != key:
+def probability_of_next(frames: Sequence[Frame], path: Path, k: int) -> float:
+    """Return the probability of the place of the next key frame, if it was tracked from a frame's own.
+
+    It is 1 if it was not, and even if there is a gap between the two.
+    """
+    after = next((n for n in range(k + 1, len(frames)) if frames[n].is_key), None)
+    if after is None or frames[after].key != frames[k].key:
         return 1.0
-    chosen = path.choose(n)
-    if chosen is None or path.gaps[n] is not None:
-        return EVEN
-    return min(float(path.probabilities[n][chosen] / max(at_key.probabilities[0], 1e-9)), 1.0)
+    return EVEN if path.gaps[after] else float(path.probabilities[after].max(initial=0.0))

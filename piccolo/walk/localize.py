@@ -15,19 +15,11 @@ from ..geometry.pose import Array, Pose, exp_so3
 from .beliefs import Belief
 from .frames import Frame, probability_within
 from .motion import Motion
-from .path import EVEN, Path
+from .path import EVEN, Gap, Path
 from .tracker import Tracker
 
 # A frame's pose and covariance, both in the world
 Located = tuple[Pose, PoseCovariance]
-
-
-@dataclass(frozen=True)
-class Gap:
-    """A part of a walk that nobody can have walked: a lift, a cut, a camera in a pocket."""
-
-    distance: float  # [m]
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -65,7 +57,7 @@ def make_localizations(
         for k, (pose, covariance) in zip(sure[lo:hi], parts, strict=True):
             found[k] = replace(found[k], pose=pose, covariance=covariance)
     return [
-        (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), gap and Gap(gap[0], gap[1])))
+        (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), gap))
         for k, (f, frame, gap) in enumerate(zip(found, frames, path.gaps, strict=True))
     ]
 

@@ -7,10 +7,12 @@ from itertools import pairwise
 
 from ..errors import InputError
 from ..geometry.pose import Pose
+from ..scan_map.camera_positions import COARSE_SPACING
 
 MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
 MAX_ACCELERATION = 2.0  # [m/s^2]
 MAX_STEP = 5.0  # [m] from one frame without time to the next
+REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
 JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place that was not scanned
 
 
@@ -33,6 +35,10 @@ class Motion:
     def speed(self) -> float:
         """Largest speed [m/s]; of frames without times largest step [m]."""
         return self.max_speed or (MAX_SPEED if self.is_timed else MAX_STEP)
+
+    def reach(self, seconds: float) -> float:
+        """Return how far [m] the camera may be from where it was so long ago, or later."""
+        return self.speed * abs(seconds) + REACH_SLACK
 
     def to_settings(self) -> dict[str, object]:
         """Return the motion as results repeat it."""

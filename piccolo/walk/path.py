@@ -11,6 +11,7 @@ only beyond the differences between exact copies of a room.
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -19,32 +20,34 @@ from numpy.typing import NDArray
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..geometry.pose import Array, Pose
-from ..scan_map.camera_positions import COARSE_SPACING
 from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
 from .free_space import FreeSpace
-from .motion import JUMP_LOG, Motion, carry
+from .motion import JUMP_LOG, REACH_SLACK, Motion, carry
 
 EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better
-REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
 NEGLIGIBLE = -2.0 * JUMP_LOG  # [log] a way that leaves out more evidence is worse than two jumps
 DRIFT = 0.05  # of the path that an odometry measures, that it may be off
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A part of a walk that nobody can have walked: a lift, a cut, a camera in a pocket."""
+
+    distance: float  # [m]
+    seconds: float
 
 
 class Path(NamedTuple):
     """The probabilities of the places of a walk's key frames; of other frames there is nothing."""
 
     probabilities: list[Array]  # (S,) of each frame's states
-    gaps: list[tuple[float, float] | None]  # [m], [s] before a frame with time that no walking person reaches
+    gaps: list[Gap | None]  # before each frame, if the frames have times
 
     def choose(self, k: int) -> int | None:
         """Return the likeliest state of a frame; None if more likely it has none of them."""
         found = self.probabilities[k]
         return int(found.argmax()) if found.sum() > EVEN else None
-
-
-# states of two frames, those that are walked from, and the log odds of the steps
-_Known = tuple[list[State], list[State], NDArray[np.bool_], NDArray[np.float64]]
 
 
 class _Steps(NamedTuple):
@@ -82,7 +85,7 @@ def log_transition(distance: Array, seconds: float, motion: Motion, expected: Ar
 
     `expected` is the gain of a place within reach; a place out of reach has the odds of a jump.
     """
-    excess = np.maximum(distance - motion.speed * seconds - REACH_SLACK, 0.0)
+    excess = np.maximum(distance - motion.reach(seconds), 0.0)
     return np.maximum(expected - 0.5 * (excess / REACH_SLACK) ** 2, motion.jump_log)
 
 
@@ -135,7 +138,8 @@ class Lattice:
         self.space = space
         self.motion = motion
         self.frames: list[Frame] = []
-        self.known: dict[tuple[int, int], _Known] = {}  # steps taken before
+        # steps taken before, by the states of both frames (kept) and which of the first are likely
+        self.known: dict[tuple[int, int, bytes], tuple[list[State], list[State], Array]] = {}
         self.columns: list[_Column] = []
         self.ended: list[float] = [0.0]  # log of the sum over ways that end before each column
 
@@ -179,11 +183,10 @@ class Lattice:
         m = column.number
         states = self.frames[m].states, self.frames[k].states
         is_likely = column.forward >= column.forward.max() + JUMP_LOG
-        known = self.known.get((m, k))
-        is_same = known is not None and known[0] is states[0] and known[1] is states[1]
-        if known is None or not is_same or (known[2] != is_likely).any():
-            known = self.known[m, k] = (*states, is_likely, self._step(m, k, is_likely, most_expected))
-        return known[3]
+        key = id(states[0]), id(states[1]), is_likely.tobytes()
+        if key not in self.known:
+            self.known[key] = (*states, self._step(m, k, is_likely, most_expected))
+        return self.known[key][2]
 
     def _step(self, m: int, k: int, is_likely: NDArray[np.bool_], most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another.
@@ -198,7 +201,7 @@ class Lattice:
         centers = np.array([pose.center_world for pose in begins])
         seconds = self.frames[k].time - self.frames[last].time
         least_jump = math.sqrt(2.0 * (most_expected - self.motion.jump_log))  # [deviations] beyond reach
-        limit = self.motion.speed * seconds + REACH_SLACK * (1.0 + least_jump)
+        limit = self.motion.reach(seconds) + REACH_SLACK * least_jump
         distances = self.space.distances(centers, state_centers(ends), limit)
         fractions = np.array([[self.space.fraction_within(start, limit)] for start in centers])
         expected = np.minimum(-np.log(fractions), most_expected)
@@ -259,10 +262,10 @@ class Lattice:
             if self.motion.is_timed and log <= self.motion.jump_log:
                 path.gaps[column.number] = self._gap(self.columns[m].number, i, column.number, j)
 
-    def _gap(self, m: int, i: int, k: int, j: int) -> tuple[float, float]:
+    def _gap(self, m: int, i: int, k: int, j: int) -> Gap:
         begin, end = self.frames[m].states[i].pose, self.frames[k].states[j].pose
         metres = float(np.linalg.norm(end.center_world - begin.center_world))
-        return metres, self.frames[k].time - self.frames[m].time
+        return Gap(metres, self.frames[k].time - self.frames[m].time)
 
 
 def build_lattice(

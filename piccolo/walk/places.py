@@ -47,7 +47,7 @@ def query_near(query: Query, pose: Pose, radius: float) -> Query:
     """Return the query of whole views that searches within a radius [m] of a pose: its tilt, any heading."""
     m = query.scan_map
     distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
-    near = m if math.isinf(radius) else m.narrow(distances < radius)
+    near = m if math.isinf(radius) else m.narrow(distances <= max(radius, float(distances.min())))
     level = pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
     close = replace(query, scan_map=near, cache=Cache(query.cache.views), num_parts=0, rotations=level)
     return brief_query(close, max(len(near.sparse), 1))
@@ -79,8 +79,13 @@ def find_places(query: Query, own: Pose) -> list[Place]:
     They have the tilt of that, and any heading.
     """
     ends = descend_briefly(query_near(query, own, math.inf))
-    start = Starts(own.R_cam_from_world[None], own.center_world[None], nearest(query, own))
-    return list_places(query, ends, descend_from(query, start).best_score)
+    return list_places(query, ends, descend_near(query, own).best_score)
+
+
+def descend_near(query: Query, pose: Pose) -> Ends:
+    """Descend a few steps from a pose on the prepared view of the candidate nearest to it."""
+    start = Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest(query, pose))
+    return descend_from(query, start)
 
 
 def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:

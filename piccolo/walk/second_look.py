@@ -2,17 +2,18 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from itertools import islice, takewhile
+from itertools import islice
 
 from ..confidence.confidence import MIN_CONFIDENCE
+from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
 from ..panorama import Panorama
 from .beliefs import Belief, believe
-from .frames import Frame, State
+from .frames import Frame
 from .motion import carry
 from .path import Path, build_lattice
-from .tracker import MAX_RADIUS, Follower, Tracker, find_from, move_on, refine_state
+from .tracker import Expected, Found, Tracker, expect, find_near, refine_state
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
@@ -66,53 +67,37 @@ def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
 
 
 def _find_lost(tracker: Tracker, path: Path, k: int, read: Read) -> None:
-    """Track a frame that is not sure from where it is to be expected, or look for it near a sure one."""
-    frames = tracker.frames
-    belief = believe(frames, path, k)
-    ways = [] if belief.is_sure else _list_ways(tracker, path, k)
-    key = frames[k].key
-    if key is not None and belief.expected is not None:
-        ways.insert(0, (key, Follower(belief.expected, frames[k].time)))
+    """Track a frame that is not sure from where it is to be expected, or look for it near sure ones.
+
+    These are later ones if possible, as the tracker came from earlier ones.
+    """
+    frame = tracker.frames[k]
+    belief = believe(tracker.frames, path, k)
+    ways: list[tuple[int, Expected]] = []
+    if frame.key is not None and belief.expected is not None:
+        reach = tracker.motion.reach(0.0)
+        ways = [(frame.key, Expected(belief.expected, reach, belief.expected))]
+    if not belief.is_sure and (near := _list_sure(tracker, path, k, 1) or _list_sure(tracker, path, k, -1)):
+        poses = [(tracker.frames[m], pose) for m, pose in near]
+        ways.append((near[0][0], expect(frame, poses, tracker.motion)))
     panorama = read(k) if ways else None
     if panorama is None or not panorama.is_valid.any():
         return
     query = tracker.prepare(panorama)
-    for begin, follower in ways:
-        found = find_from(query, follower, frames[k].time, tracker.motion)
-        if found is not None and found.is_alone:
-            _hang(frames, path, k, begin, found.state)
-            frames[k].how = found.how
-            return
+    found = ((begin, find_near(query, expected)) for begin, expected in ways)
+    begin, end = next(((b, f) for b, f in found if f is not None and f.is_alone), (k, None))
+    if end is not None:
+        _hang(tracker.frames, path, k, begin, end)
 
 
-def _list_ways(tracker: Tracker, path: Path, k: int) -> list[tuple[int, Follower]]:
-    """List the sure frame from which a frame can be found, if there is one, with its pose.
-
-    It is a later one if possible, as the tracker came from earlier ones.
-    """
-    frames = tracker.frames
-    sure = _list_sure(tracker, path, k, 1) or _list_sure(tracker, path, k, -1)
-    if not sure:
-        return []
-    poses = [believe(frames, path, m).states[0].pose for m in sure]
-    times = [frames[m].time for m in sure]
-    if frames[k].odometry or len(sure) == 1:
-        follower = Follower(move_on(poses[0], frames[sure[0]], frames[k]), times[0])
-    else:
-        follower = Follower(poses[0], times[0], poses[1], times[1])
-    return [(sure[0], follower)]
+def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[tuple[int, Pose]]:
+    """List the nearest two sure frames in one direction, with their poses."""
+    numbers = range(k + step, len(tracker.frames) if step > 0 else -1, step)
+    beliefs = ((m, believe(tracker.frames, path, m)) for m in numbers)
+    return list(islice(((m, belief.states[0].pose) for m, belief in beliefs if belief.is_sure), 2))
 
 
-def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[int]:
-    """List the nearest two sure frames in one direction from which a frame can be found."""
-    frames = tracker.frames
-    farthest = MAX_RADIUS / tracker.motion.speed
-    numbers = range(k + step, len(frames) if step > 0 else -1, step)
-    near = takewhile(lambda m: abs(frames[k].time - frames[m].time) <= farthest, numbers)
-    return list(islice((m for m in near if believe(frames, path, m).is_sure), 2))
-
-
-def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> None:
+def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Found) -> None:
     """Give a frame a pose beside a sure one, whose key frame is then its key frame too."""
     key = sure if frames[sure].is_key else frames[sure].key
     chosen = None if key is None else path.choose(key)
@@ -120,5 +105,7 @@ def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: State) -> N
         return
     at_key = frames[key].states[chosen].pose
     departed = frames[key].departed = frames[key].departed or at_key
-    arrived = carry(found.pose, at_key, departed)
-    frames[k] = replace(frames[k], states=[found], is_key=False, key=key, arrived=arrived, departed=None)
+    arrived = carry(found.state.pose, at_key, departed)
+    frames[k] = replace(
+        frames[k], states=[found.state], how="tracked", is_key=False, key=key, arrived=arrived, departed=None
+    )

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
@@ -41,42 +42,27 @@ from .frames import (
     put_state,
 )
 from .free_space import FreeSpace
-from .motion import Motion, carry
-from .path import COPY_LOG_ODDS, EVEN, REACH_SLACK, Lattice
+from .motion import REACH_SLACK, Motion, carry
+from .path import COPY_LOG_ODDS, EVEN, Lattice
 from .places import (
     MOST_PLACES,
-    Place,
     descend_briefly,
+    descend_near,
     find_places,
     is_mirrored,
     list_places,
     query_near,
 )
 
-MAX_RADIUS = 12.0  # [m] around its last pose in which a lost camera is looked for
 ELSEWHERE = SAME_PLACE + REACH_SLACK  # [m] from where it was, a camera is at another place
 
 
-class Follower(NamedTuple):
-    """A pose from which the next frame is predicted."""
-
-    pose: Pose
-    time: float
-    earlier: Pose | None = None  # a pose before it
-    earlier_time: float = 0.0
-
-
 class Expected(NamedTuple):
-    """Limits of a camera's position at a frame, from its motion before."""
+    """Where a frame is to be expected, from the pose of another."""
 
-    last: Pose  # where it was
-    reach: float  # [m] from there, by its speed
-    start: Pose  # predicted
-    radius: float  # [m] from there, by its acceleration
-
-    def holds(self, pose: Pose) -> bool:
-        """Return True if a pose is where it was expected."""
-        return distance(pose, self.start) <= self.radius and distance(pose, self.last) <= self.reach
+    last: Pose  # of the other frame
+    reach: float  # [m] from there
+    pose: Pose  # predicted
 
 
 class Found(NamedTuple):
@@ -84,7 +70,7 @@ class Found(NamedTuple):
 
     state: State
     how: How
-    is_alone: bool = True  # False if other poses near look like it
+    is_alone: bool  # False if it may be at another place within reach
 
 
 class Tracker:
@@ -132,10 +118,10 @@ class Tracker:
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_known = odometry is not None or not self.frames
-            is_far = not is_known and self.motion.speed * (time - self.frames[-1].time) > ELSEWHERE
+            is_far = not is_known and self.motion.reach(time - self.frames[-1].time) > ELSEWHERE
             if not is_far:
                 self._follow(query, frame)
-            if is_far or (not frame.states and self._reach(time) >= self.next_search):
+            if is_far or (not frame.states and self.motion.reach(time - self.found_at) >= self.next_search):
                 self._search(query, panorama, frame)
             elif frame.states and self._is_telling(frame):
                 frame.make_key(list_key_states(query, frame.states))
@@ -150,10 +136,6 @@ class Tracker:
         self.lattice.add(frame)
         self._note(frame)
 
-    def _reach(self, time: float) -> float:
-        """Return how far [m] the camera can have gone since it was found."""
-        return self.motion.speed * (time - self.found_at)
-
     def _note(self, frame: Frame) -> None:
         """Note when the camera was found, or when it is to be searched everywhere again."""
         is_found = frame.arrived is not None or frame.departed is not None
@@ -161,48 +143,34 @@ class Tracker:
             self.found_at = frame.time
             self.next_search = ELSEWHERE
         elif frame.alone is not None:
-            self.next_search = 2.0 * self._reach(frame.time)
+            self.next_search = 2.0 * self.motion.reach(frame.time - self.found_at)
 
     def _is_telling(self, frame: Frame) -> bool:
-        """Return True if the camera has moved so far since the last key frame that it sees another place.
-
-        A frame that was found near it, not where it was predicted, tells too.
-        """
+        """Return True if the camera has moved so far since the last key frame that it sees another place."""
         if frame.key is None or frame.arrived is None:
             return True
-        move = frame.arrived.center_world - self._pose_since(frame.key).center_world
-        return float(np.linalg.norm(move)) >= SAME_PLACE
+        return distance(frame.arrived, self._pose_since(frame.key)) >= SAME_PLACE
 
     def _follow(self, query: Query, frame: Frame) -> None:
-        """Find a frame from the last ones; it has moved as measured only if it is where they predict it."""
-        follower = self._follower_to(frame)
-        if follower is None:
+        """Find a frame from the last one that was found."""
+        key = self._last_key()
+        if key is None:
             return
-        found = find_from(query, follower, frame.time, self.motion)
+        since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
+        near = [(self.frames[k], self._pose_since(k)) for k in since[:-3:-1]]
+        found = find_near(query, expect(frame, near, self.motion))
         if found is None:
             return
         frame.states = [found.state]
         frame.how = found.how
         if found.how == "tracked":
             frame.arrived = found.state.pose
-            frame.key = self._last_key()
+            frame.key = key
 
     def _last_key(self) -> int | None:
         """Return the number of the last key frame that can be tracked from."""
         numbers = (column.number for column in reversed(self.lattice.columns))
         return next((k for k in numbers if self.frames[k].departed is not None), None)
-
-    def _follower_to(self, frame: Frame) -> Follower | None:
-        """Return the pose to track a frame from: that of the last frame that was found."""
-        key = self._last_key()
-        if key is None:
-            return None
-        since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
-        last = self.frames[since[-1]]
-        pose = self._pose_since(since[-1])
-        if frame.odometry is not None or len(since) == 1:
-            return Follower(move_on(pose, last, frame), last.time)
-        return Follower(pose, last.time, self._pose_since(since[-2]), self.frames[since[-2]].time)
 
     def _pose_since(self, k: int) -> Pose:
         pose = self.frames[k].departed or self.frames[k].arrived
@@ -221,10 +189,14 @@ class Tracker:
             frame.make_key(list_key_states(query, found[:1] if is_sure else found, is_sure))
 
     def _depart(self, query: Query, frame: Frame) -> None:
-        """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it."""
+        """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it.
+
+        Of places about as likely, as copies are, it is the one that looks best.
+        """
         while True:
             probabilities = self.lattice.filter_last()
-            likeliest = frame.states[int(probabilities.argmax())]
+            is_likely = probabilities > EVEN * probabilities.max()
+            likeliest = max(compress(frame.states, is_likely), key=lambda state: state.log_odds)
             if likeliest.is_refined:
                 frame.states = put_state(frame.states, likeliest)
                 frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
@@ -268,76 +240,58 @@ def refine_state(query: Query, states: Sequence[State], rough: State) -> list[St
     return put_state(others, replace(end, log_odds=best.log_odds + log_ratio(float(second), float(first))))
 
 
-def move_on(pose: Pose, before: Frame, frame: Frame) -> Pose:
-    """Return where the camera is at a frame by the odometry, if there is one, from its pose at another."""
-    if frame.odometry is None or before.odometry is None:
-        return pose
-    return carry(frame.odometry, before.odometry, pose)
+def expect(frame: Frame, near: Sequence[tuple[Frame, Pose]], motion: Motion) -> Expected:
+    """Predict where a frame is from others, the last of them first: by odometry or at constant velocity."""
+    before, last = near[0]
+    seconds = frame.time - before.time
+    reach = motion.reach(seconds)
+    if frame.odometry is not None and before.odometry is not None:
+        moved = carry(frame.odometry, before.odometry, last)
+        return Expected(moved, reach, moved)
+    if len(near) == 1:
+        return Expected(last, reach, last)
+    earlier, pose = near[1]
+    return Expected(last, reach, predict(last, pose, seconds / (before.time - earlier.time), reach))
 
 
-def find_from(query: Query, f: Follower, time: float, motion: Motion) -> Found | None:
-    """Find a frame from the pose of another: where it is predicted, or where it looks best within reach.
-
-    None also if the photo is mirrored.
-    """
-    expected = expect(f, time, motion)
-    near = query_near(query, f.pose, min(expected.reach, MAX_RADIUS))
-    ends = descend_briefly(near)
-    if is_mirrored(near, ends):
-        return None
-    places = list_places(query, ends, ends.best_score)
-    state = track(query, expected.start)
-    if state is not None and not expected.holds(state.pose):
-        state = None
-    if places and (state is None or state.log_odds < MOST_EXPECTED):
-        best = track(query, places[0].pose)
-        if best is not None and distance(best.pose, f.pose) <= expected.reach:
-            return choose(state, best, places, expected)
-    return None if state is None else Found(state, "tracked")
-
-
-def choose(state: State | None, best: State, places: Sequence[Place], expected: Expected) -> Found | None:
-    """Choose between the end of the descent from the predicted pose and that from the best place near.
-
-    What is not where it was predicted is to be sure, or within the motion and to look better than all near.
-    """
-    if state is not None and best.log_odds <= state.log_odds:
-        return Found(state, "tracked")
-    if state is not None and is_same_place(best.pose, state.pose):
-        return Found(best, "tracked")
-    is_alone = all(p.behind <= -COPY_LOG_ODDS or is_same(p.pose, best.pose) for p in places)
-    is_sure = state is None and best.log_odds >= MOST_EXPECTED
-    if is_sure or (is_alone and expected.holds(best.pose)):
-        return Found(best, "near", is_alone)
-    return None if state is None else Found(state, "tracked")
-
-
-def distance(pose: Pose, other: Pose) -> float:
-    """Return the distance [m] of two poses."""
-    return float(np.linalg.norm(pose.center_world - other.center_world))
-
-
-def expect(f: Follower, time: float, motion: Motion) -> Expected:
-    """Predict where the camera is at a time, and how far from there it can be."""
-    reach = motion.speed * abs(time - f.time) + REACH_SLACK
-    if f.earlier is None or f.time == f.earlier_time:
-        return Expected(f.pose, reach, f.pose, reach)
-    start = predict(f.pose, f.earlier, (time - f.time) / (f.time - f.earlier_time), reach)
-    radius = motion.max_acceleration * (time - f.time) ** 2 + REACH_SLACK if motion.is_timed else reach
-    return Expected(f.pose, reach, start, radius)
-
-
-def predict(before: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
+def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
     """Predict a camera's pose at constant velocity from an earlier pose and the last.
 
     `ratio` is the time since the last pose divided by the time between the two. The prediction is at most
     `max_distance` [m] away.
     """
-    move = ratio * (before.center_world - earlier.center_world)
-    length = float(np.linalg.norm(move))
-    move *= min(1.0, max_distance / max(length, 1e-9))
-    turn = ratio * log_so3(before.R_cam_from_world @ earlier.R_cam_from_world.T)
-    return Pose(exp_so3(turn) @ before.R_cam_from_world, before.center_world + move)
+    move = ratio * (last.center_world - earlier.center_world)
+    move *= min(1.0, max_distance / max(float(np.linalg.norm(move)), 1e-9))
+    turn = ratio * log_so3(last.R_cam_from_world @ earlier.R_cam_from_world.T)
+    return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
+
+
+def find_near(query: Query, expected: Expected) -> Found | None:
+    """Find a frame where it is expected, or where another place within reach looks more like it than a copy.
+
+    That is to be as sure as what is expected. None also if the photo is mirrored.
+    """
+    near = query_near(query, expected.last, expected.reach)
+    ends = descend_briefly(near)
+    if is_mirrored(near, ends):
+        return None
+    here = descend_near(query, expected.pose)
+    best_score = max(ends.best_score, here.best_score)
+    alike = [p for p in list_places(query, ends, best_score) if p.behind > -COPY_LOG_ODDS]
+    starts = [p for p in list_places(query, here, best_score) if p.behind > -COPY_LOG_ODDS] + alike[:1]
+    tracked = (track(query, place.pose) for place in starts)
+    end = next((s for s in tracked if s and distance(s.pose, expected.last) <= expected.reach), None)
+    if end is None:
+        return None
+    is_alone = all(is_same(p.pose, end.pose) for p in alike)
+    if is_same_place(end.pose, expected.pose):
+        return Found(end, "tracked", is_alone)
+    return Found(end, "near", is_alone) if end.log_odds >= MOST_EXPECTED else None
+
+
+def distance(pose: Pose, other: Pose) -> float:
+    """Return the distance [m] of two poses."""
+    return float(np.linalg.norm(pose.center_world - other.center_world))
 
 
 def track(query: Query, start: Pose) -> State | None:

@@ -19,6 +19,14 @@ CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
 ALL = "all"
 
 
+class Counts(NamedTuple):
+    """How many of some queries are right or called so."""
+
+    num_correct: int
+    num_localized: int
+    num_wrong: int  # of the localized
+
+
 class Summary(NamedTuple):
     """Statistics of some queries."""
 
@@ -44,17 +52,21 @@ def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
 
 def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Summary:
     """Return the statistics of one or more queries."""
-    is_correct = [row.is_correct(thresholds) for row in rows]
-    is_localized = [row.result.status == LOCALIZED for row in rows]
     return Summary(
-        num_queries=len(rows),
-        num_correct=sum(is_correct),
-        num_localized=sum(is_localized),
-        num_wrong=sum(a and not b for a, b in zip(is_localized, is_correct, strict=True)),
+        len(rows),
+        *count_rows(rows, thresholds),
         position_quartiles=quartiles([row.position_error for row in rows]),
         rotation_quartiles=quartiles([row.rotation_error for row in rows]),
         seconds=float(np.median([row.seconds for row in rows])),
     )
+
+
+def count_rows(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Counts:
+    """Return how many queries are correct, localized, and localized but wrong."""
+    is_correct = [row.is_correct(thresholds) for row in rows]
+    is_localized = [row.result.status == LOCALIZED for row in rows]
+    num_wrong = sum(a and not b for a, b in zip(is_localized, is_correct, strict=True))
+    return Counts(sum(is_correct), sum(is_localized), num_wrong)
 
 
 class Point(NamedTuple):

@@ -2,30 +2,29 @@
 
 import itertools
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from ...confidence.confidence import LOCALIZED
-from ...geometry.pose import Array, Pose, angle_between, pose_errors
-from ...walk.localize import Alone
+from ...geometry.pose import Array, Pose, angle_between
+from ...result import Result
 from ..scene import Query, Scene
-from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
-from .tables import ALL, Table
+from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds, make_query_result
+from .tables import ALL, Table, count_rows
 
 
 class Frame(NamedTuple):
     """A frame of a walk, and what was made of it."""
 
     query: Query
-    pose: Pose | None  # the best
-    is_localized: bool
-    alone: Alone | None = None  # what was made of it without the others
+    row: QueryResult
+    alone: QueryResult | None = None  # what was made of it without the others
 
     @property
     def sure_pose(self) -> Pose | None:
         """The pose of a frame that has one and is called localized."""
-        return self.pose if self.is_localized and self.query.is_answerable else None
+        return self.row.result.pose if self.query.is_answerable else None
 
 
 class WalkSummary(NamedTuple):
@@ -39,7 +38,7 @@ class WalkSummary(NamedTuple):
     num_refused: int  # of these: not localized
     squared_errors: Array  # (N,) of the positions of localized frames [m2]
     squared_steps: Array  # (M, 2) of the motion between neighbours both localized: [m2], [rad2]
-    first_sure: float | None  # [s] until the last of the walks has a sure frame; None if one has none
+    first_sure: float  # [s] until the last of the walks has a sure frame; inf if one has none
 
     @property
     def ate(self) -> float:
@@ -68,11 +67,17 @@ def group_walks(scenes: Iterable[Scene], rows: Iterable[QueryResult]) -> dict[tu
         for query in scene.queries:
             row = by_key.get((scene.name, scene.name_of(query)))
             if query.walk is not None and row is not None:
-                result = row.result
-                alone = result.walk.alone if result.walk else None
-                frame = Frame(query, result.best_pose, result.status == LOCALIZED, alone)
+                frame = Frame(query, row, make_row_alone(scene, query, row.result))
                 walks.setdefault((scene.name, query.walk), []).append(frame)
     return {name: sorted(frames, key=_time) for name, frames in sorted(walks.items())}
+
+
+def make_row_alone(scene: Scene, query: Query, result: Result) -> QueryResult | None:
+    """Return what was made of a frame without the others; None if it was not searched so."""
+    alone = None if result.walk is None else result.walk.alone
+    if alone is None:
+        return None
+    return make_query_result(scene, query, replace(result, status=alone.status, best_pose=alone.pose), None)
 
 
 def _time(frame: Frame) -> float:
@@ -91,31 +96,26 @@ def summarize_walks(
 ) -> WalkSummary:
     """Return the statistics of walks, the frames of each in the order of time."""
     frames = [frame for walk in walks for frame in walk]
-    good = [frame for frame in frames if frame.query.is_answerable]
-    errors = [pose_errors(f.pose, f.query.pose) if f.pose else (np.inf, np.inf) for f in good]
-    is_correct = [d < thresholds.max_distance and a < thresholds.max_angle for d, a in errors]
-    is_sure = [frame.is_localized for frame in good]
-    num_refused = sum(not frame.is_localized for frame in frames if not frame.query.is_answerable)
-    num_bad = len(frames) - len(good)
-    num_wrong = sum(a and not b for a, b in zip(is_sure, is_correct, strict=True)) + num_bad - num_refused
+    counts = count_rows([frame.row for frame in frames], thresholds)
+    bad = [frame.row for frame in frames if not frame.query.is_answerable]
+    sure_bad = count_rows(bad, thresholds).num_localized
     steps = [
         step_errors((a.query.pose, b.query.pose), (a.sure_pose, b.sure_pose))
         for walk in walks
         for a, b in itertools.pairwise(walk)
         if a.sure_pose and b.sure_pose
     ]
-    firsts = [next((_time(f) - _time(walk[0]) for f in walk if f.is_localized), np.inf) for walk in walks]
-    first_sure = max(firsts, default=np.inf)
+    firsts = [next((_time(f) - _time(walk[0]) for f in walk if f.row.result.pose), np.inf) for walk in walks]
     return WalkSummary(
         len(frames),
-        sum(is_correct),
-        sum(is_sure),
-        num_wrong,
-        num_bad,
-        num_refused,
-        np.array([d**2 for (d, _), sure in zip(errors, is_sure, strict=True) if sure]),
+        counts.num_correct,
+        counts.num_localized - sure_bad,
+        counts.num_wrong,
+        len(bad),
+        len(bad) - sure_bad,
+        np.array([frame.row.position_error**2 for frame in frames if frame.sure_pose]),
         np.array(steps).reshape(-1, 2) ** 2,
-        first_sure if np.isfinite(first_sure) else None,
+        max(firsts, default=np.inf),
     )
 
 
@@ -135,13 +135,10 @@ def alone_table(walks: dict[tuple[str, str], list[Frame]], thresholds: Threshold
     columns = [f"{what} {how}" for how in ("alone", "together") for what in ("correct", "localized", "wrong")]
     rows = []
     for name, frames in walks.items():
-        searched = [(frame, frame.alone) for frame in frames if frame.alone is not None]
-        alone = [f._replace(pose=a.pose, is_localized=a.status == LOCALIZED) for f, a in searched]
-        counts: list[str] = []
-        for some in (alone, [frame for frame, _ in searched]):
-            s = summarize_walks([some], thresholds)
-            counts += [f"{n}" if some else "-" for n in (s.num_correct, s.num_localized, s.num_wrong)]
-        rows.append((" ".join(name), f"{len(searched)}", *counts))
+        searched = [(frame.alone, frame.row) for frame in frames if frame.alone is not None]
+        counts = [count_rows(some, thresholds) for some in zip(*searched, strict=True)]
+        cells = [f"{n}" for c in counts for n in c] or ["-"] * len(columns)
+        rows.append((" ".join(name), f"{len(searched)}", *cells))
     return Table("frames that were searched in the whole scan", ("walk", "frames", *columns), tuple(rows))
 
 
@@ -150,9 +147,8 @@ def _cells(s: WalkSummary) -> list[str]:
     fractions = [_fraction(s.num_correct, num_good), _fraction(s.num_localized, num_good)]
     refused = f"{s.num_refused} of {s.num_bad}" if s.num_bad else "-"
     step, turn = s.rpe
-    found = [_number(s.ate, 4), _number(step, 4), _number(float(np.degrees(turn)), 3)]
-    first = "-" if s.first_sure is None else f"{s.first_sure:.1f}"
-    return [f"{s.num_frames}", *fractions, f"{s.num_wrong}", refused, *found, first]
+    path = _number(s.ate, 4), _number(step, 4), _number(float(np.degrees(turn)), 3), _number(s.first_sure, 1)
+    return [f"{s.num_frames}", *fractions, f"{s.num_wrong}", refused, *path]
 
 
 def _fraction(count: int, total: int) -> str:
