@@ -11,7 +11,7 @@ from ..jobs.threads import Workers
 from ..scan_map.camera_positions import CLEARANCE_VOXEL, COARSE_SPACING, MIN_CLEARANCE, nearest_distances
 from ..scan_map.scan_map import ScanMap
 
-REACH = 1.6 * COARSE_SPACING  # [m] to neighbours in the grid: across edges, not all corners
+REACH = math.sqrt(2.5) * COARSE_SPACING  # [m] to neighbours in the grid: across edges (sqrt 2), not corners
 TUBE_RADIUS = MIN_CLEARANCE / 2.0  # [m] of a free way
 DETOUR = 1.0 / math.cos(math.pi / 8.0)  # paths along edges and across squares are at most so much longer
 
