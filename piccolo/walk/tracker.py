@@ -58,7 +58,7 @@ ELSEWHERE = SAME_PLACE + REACH_SLACK  # [m] from where it was, a camera is at an
 
 
 class Expected(NamedTuple):
-    """Where a frame is to be expected, from the pose of another."""
+    """The pose that a frame is expected to have, from the pose of another."""
 
     last: Pose  # of the other frame
     reach: float  # [m] from there

@@ -20,7 +20,7 @@ ALL = "all"
 
 
 class Counts(NamedTuple):
-    """How many of some queries are right or called so."""
+    """Numbers of queries that are right, or called localized."""
 
     num_correct: int
     num_localized: int
