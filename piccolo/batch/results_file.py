@@ -1,15 +1,17 @@
 """Results on disk, one line a panorama, appended as they come, so that a stopped batch goes on."""
 
 import json
+import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from ..errors import InputError
+from ..files.atomic import STDOUT, write_atomically
 from ..files.line_file import LineFile, whole_lines, whole_size
-from ..result import FAILED, FORMAT
+from ..result import FAILED, FORMAT, Result
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
@@ -169,3 +171,13 @@ class Records:
         spans += [line.span if line else next(new_spans) for line in self.order]
         file.rearrange(spans)
         return num_dropped
+
+
+def write_results(out: Path | None, results: Sequence[Result]) -> None:
+    """Write the results, whole or not at all."""
+    text = "".join(f"{result.to_json()}\n" for result in results)
+    if out is None or out == STDOUT:
+        sys.stdout.write(text)
+        sys.stdout.flush()
+    else:
+        write_atomically(out, text.encode())

@@ -7,6 +7,8 @@ from pathlib import Path
 
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import read_relative_poses
+from ..batch.results_file import WAYS, write_results
+from ..files.atomic import is_stream
 from ..jobs.stopwatch import Stopwatch
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
@@ -14,7 +16,6 @@ from ..result import Result
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
 from .options import check_alone
-from .outputs import check_new_results, write_results
 
 NOT_WITH = ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 
@@ -23,6 +24,13 @@ def check_bundle_options(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go with --relative."""
     if arguments.relative:
         check_alone(arguments, "--relative", NOT_WITH)
+
+
+def check_new_results(arguments: argparse.Namespace) -> None:
+    """Refuse a file of --out that has results, without --overwrite: all are written at once."""
+    out = arguments.out
+    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
+        raise UsageError(f"--out: {out} has results already; {WAYS}")
 
 
 def run_bundle(

@@ -8,16 +8,17 @@ from pathlib import Path
 
 from ..batch.inputs import is_from_stdin
 from ..batch.localizer import Localizer
+from ..batch.results_file import write_results
 from ..coloring.color_scan import LEAST_PHOTOS, check_suffix, color_map, write_colored_scan
 from ..confidence.confidence import LOCALIZED
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
 from ..scan_map.scan_map import ScanMap
+from .bundle import check_new_results
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
 from .options import check_alone
-from .outputs import check_new_results, write_results
 from .progress import progress_bar
 
 NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before

@@ -4,13 +4,11 @@ import argparse
 import os
 import stat
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 
-from ..batch.results_file import WAYS
-from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
+from ..files.atomic import check_output, is_stdout, is_stream
 from ..panorama.cube import SUFFIXES
-from ..result import Result
 from .errors import UsageError
 
 Outputs = Mapping[str, Path | None]  # by option; None where it is not given
@@ -90,20 +88,3 @@ def print_report(arguments: argparse.Namespace, outputs: Outputs, text: str, end
         print(text, end=end)
     elif not arguments.quiet:
         print(text, end=end, file=sys.stderr)
-
-
-def check_new_results(arguments: argparse.Namespace) -> None:
-    """Refuse a file of --out that has results, without --overwrite: all are written at once."""
-    out = arguments.out
-    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
-        raise UsageError(f"--out: {out} has results already; {WAYS}")
-
-
-def write_results(out: Path | None, results: Sequence[Result]) -> None:
-    """Write the results, whole or not at all."""
-    text = "".join(f"{result.to_json()}\n" for result in results)
-    if out is None or out == STDOUT:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    else:
-        write_atomically(out, text.encode())

@@ -15,7 +15,7 @@ from .. import __version__
 from ..batch.frame_times import times_of
 from ..batch.inputs import is_from_stdin
 from ..batch.relative_poses import read_odometry
-from ..batch.results_file import WAYS, Records
+from ..batch.results_file import WAYS, Records, write_results
 from ..camera import Calibration
 from ..errors import InputError
 from ..files.atomic import check_output, is_stream
@@ -37,7 +37,7 @@ from ..walk.motion import Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY, check_alone
-from .outputs import check_suffix, write_results
+from .outputs import check_suffix
 from .progress import progress_bar, show_progress
 
 STEP = re.compile(r"(\d+(?:\.\d+)?)(s|m)")

@@ -65,7 +65,7 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
 def probability_of_next(frames: Sequence[Frame], path: Path, k: int) -> float:
     """Return the probability of the place of the next key frame, if it was tracked from a frame's own.
 
-    It is 1 if it was not, and even if there is a gap between the two.
+    It is 1 if it was not, and 0.5 if there is a gap between the two.
     """
     after = next((n for n in range(k + 1, len(frames)) if frames[n].is_key), None)
     if after is None or frames[after].key != frames[k].key:

@@ -50,6 +50,10 @@ class Path(NamedTuple):
         return int(found.argmax()) if found.sum() > EVEN else None
 
 
+# what steps depend on: the states of two frames, those that are walked from; and the log odds of the steps
+_Known = tuple[list[State], list[State], bytes, Array]
+
+
 class _Steps(NamedTuple):
     """Log odds of the steps from a key frame's states to those of a later one."""
 
@@ -138,8 +142,7 @@ class Lattice:
         self.space = space
         self.motion = motion
         self.frames: list[Frame] = []
-        # steps taken before, by the states of both frames (kept) and which of the first are likely
-        self.known: dict[tuple[int, int, bytes], tuple[list[State], list[State], Array]] = {}
+        self.known: dict[tuple[int, int], _Known] = {}  # steps of two frames, as they were last
         self.columns: list[_Column] = []
         self.ended: list[float] = [0.0]  # log of the sum over ways that end before each column
 
@@ -183,10 +186,12 @@ class Lattice:
         m = column.number
         states = self.frames[m].states, self.frames[k].states
         is_likely = column.forward >= column.forward.max() + JUMP_LOG
-        key = id(states[0]), id(states[1]), is_likely.tobytes()
-        if key not in self.known:
-            self.known[key] = (*states, self._step(m, k, is_likely, most_expected))
-        return self.known[key][2]
+        known = self.known.get((m, k))
+        is_same = known is not None and known[0] is states[0] and known[1] is states[1]
+        if known is None or not is_same or known[2] != is_likely.tobytes():
+            steps = self._step(m, k, is_likely, most_expected)
+            known = self.known[m, k] = (*states, is_likely.tobytes(), steps)
+        return known[3]
 
     def _step(self, m: int, k: int, is_likely: NDArray[np.bool_], most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another.

@@ -1,6 +1,6 @@
 """A second look at a walk's frames, when the frames after them are known too."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import islice
 
@@ -13,7 +13,7 @@ from .beliefs import Belief, believe
 from .frames import Frame
 from .motion import carry
 from .path import Path, build_lattice
-from .tracker import Expected, Found, Tracker, expect, find_near, refine_state
+from .tracker import Expected, Found, Tracker, distance, expect, find_near, refine_state
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 
@@ -27,8 +27,9 @@ def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[
     """
     num = len(tracker.frames)
     path = _refine_likely(tracker, read, show)
+    beliefs = [believe(tracker.frames, path, k) for k in range(num)]
     for k in show(iter(range(num)[::-1]), num, "look for lost frames"):
-        _find_lost(tracker, path, k, read)
+        _find_lost(tracker, path, beliefs, k, read)
     path = _refine_likely(tracker, read, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
 
@@ -66,35 +67,52 @@ def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
         frame.states = others if query is None else refine_state(query, frame.states, rough)
 
 
-def _find_lost(tracker: Tracker, path: Path, k: int, read: Read) -> None:
-    """Track a frame that is not sure from where it is to be expected, or look for it near sure ones.
-
-    These are later ones if possible, as the tracker came from earlier ones.
-    """
-    frame = tracker.frames[k]
-    belief = believe(tracker.frames, path, k)
-    ways: list[tuple[int, Expected]] = []
-    if frame.key is not None and belief.expected is not None:
-        reach = tracker.motion.reach(0.0)
-        ways = [(frame.key, Expected(belief.expected, reach, belief.expected))]
-    if not belief.is_sure and (near := _list_sure(tracker, path, k, 1) or _list_sure(tracker, path, k, -1)):
-        poses = [(tracker.frames[m], pose) for m, pose in near]
-        ways.append((near[0][0], expect(frame, poses, tracker.motion)))
+def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int, read: Read) -> None:
+    """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
+    frames = tracker.frames
+    ways = _list_ways(tracker, beliefs, k)
     panorama = read(k) if ways else None
     if panorama is None or not panorama.is_valid.any():
         return
     query = tracker.prepare(panorama)
-    found = ((begin, find_near(query, expected)) for begin, expected in ways)
-    begin, end = next(((b, f) for b, f in found if f is not None and f.is_alone), (k, None))
-    if end is not None:
-        _hang(tracker.frames, path, k, begin, end)
+    for begin, expected in ways:
+        found = find_near(query, expected)
+        if found is None or not _is_walked(tracker, beliefs, k, found.state.pose):
+            continue
+        if found.is_alone or expected.pose is beliefs[k].expected:
+            _hang(frames, path, k, begin, found)
+            beliefs[k] = believe(frames, path, k)
+            return
 
 
-def _list_sure(tracker: Tracker, path: Path, k: int, step: int) -> list[tuple[int, Pose]]:
-    """List the nearest two sure frames in one direction, with their poses."""
-    numbers = range(k + step, len(tracker.frames) if step > 0 else -1, step)
-    beliefs = ((m, believe(tracker.frames, path, m)) for m in numbers)
-    return list(islice(((m, belief.states[0].pose) for m, belief in beliefs if belief.is_sure), 2))
+def _is_walked(tracker: Tracker, beliefs: Sequence[Belief], k: int, pose: Pose) -> bool:
+    """Return True if a frame's pose is within reach of the nearest sure frames."""
+    frames = tracker.frames
+    nearest = [side[0] for side in _list_sure(frames, beliefs, k)]
+    reaches = [tracker.motion.reach(frames[k].time - frames[m].time) for m in nearest]
+    distances = [distance(pose, beliefs[m].states[0].pose) for m in nearest]
+    return all(d <= reach for d, reach in zip(distances, reaches, strict=True))
+
+
+def _list_ways(tracker: Tracker, beliefs: Sequence[Belief], k: int) -> list[tuple[int, Expected]]:
+    """List the frames from which a frame may be found, and where it is then expected."""
+    frames = tracker.frames
+    belief = beliefs[k]
+    key = frames[k].key
+    ways = []
+    if key is not None and belief.expected is not None:
+        ways = [(key, Expected(belief.expected, tracker.motion.reach(0.0), belief.expected))]
+    if not belief.is_sure and (sides := _list_sure(frames, beliefs, k)):
+        near = [(frames[m], beliefs[m].states[0].pose) for m in sides[0]]
+        ways.append((sides[0][0], expect(frames[k], near, tracker.motion)))
+    return ways
+
+
+def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Belief], k: int) -> list[list[int]]:
+    """List the two nearest sure frames after and before a frame, the side that is nearer in time first."""
+    ways = range(k + 1, len(frames)), range(k - 1, -1, -1)
+    sides = [list(islice((m for m in way if beliefs[m].is_sure), 2)) for way in ways]
+    return sorted(filter(None, sides), key=lambda side: abs(frames[side[0]].time - frames[k].time))
 
 
 def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Found) -> None:
@@ -107,5 +125,5 @@ def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Found) -> N
     departed = frames[key].departed = frames[key].departed or at_key
     arrived = carry(found.state.pose, at_key, departed)
     frames[k] = replace(
-        frames[k], states=[found.state], how="tracked", is_key=False, key=key, arrived=arrived, departed=None
+        frames[k], states=[found.state], how=found.how, is_key=False, key=key, arrived=arrived, departed=None
     )

@@ -54,13 +54,13 @@ from .places import (
     query_near,
 )
 
-ELSEWHERE = SAME_PLACE + REACH_SLACK  # [m] from where it was, a camera is at another place
+ELSEWHERE = SAME_PLACE + 2.0 * REACH_SLACK  # [m] a camera of so long a reach may be at another place
 
 
 class Expected(NamedTuple):
-    """The pose that a frame is expected to have, from the pose of another."""
+    """The pose that a frame is expected to have, from the pose of another, and its limits."""
 
-    last: Pose  # of the other frame
+    last: Pose  # of the other frame, moved by the odometry if there is one
     reach: float  # [m] from there
     pose: Pose  # predicted
 
@@ -195,7 +195,7 @@ class Tracker:
         """
         while True:
             probabilities = self.lattice.filter_last()
-            is_likely = probabilities > EVEN * probabilities.max()
+            is_likely = probabilities >= EVEN * probabilities.max()
             likeliest = max(compress(frame.states, is_likely), key=lambda state: state.log_odds)
             if likeliest.is_refined:
                 frame.states = put_state(frame.states, likeliest)
@@ -267,9 +267,10 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
 
 
 def find_near(query: Query, expected: Expected) -> Found | None:
-    """Find a frame where it is expected, or where another place within reach looks more like it than a copy.
+    """Find a frame where it is expected, unless a place within reach looks better than a copy of that would.
 
-    That is to be as sure as what is expected. None also if the photo is mirrored.
+    If it is not found there, the best place within reach is tried. What is not where it was expected is to be
+    sure by itself. None also if the photo is mirrored.
     """
     near = query_near(query, expected.last, expected.reach)
     ends = descend_briefly(near)
@@ -277,16 +278,24 @@ def find_near(query: Query, expected: Expected) -> Found | None:
         return None
     here = descend_near(query, expected.pose)
     best_score = max(ends.best_score, here.best_score)
-    alike = [p for p in list_places(query, ends, best_score) if p.behind > -COPY_LOG_ODDS]
-    starts = [p for p in list_places(query, here, best_score) if p.behind > -COPY_LOG_ODDS] + alike[:1]
-    tracked = (track(query, place.pose) for place in starts)
-    end = next((s for s in tracked if s and distance(s.pose, expected.last) <= expected.reach), None)
+    is_alike = list_places(query, here, best_score)[0].behind > -COPY_LOG_ODDS
+    places = [p.pose for p in list_places(query, ends, best_score) if p.behind > -COPY_LOG_ODDS]
+    alike = [pose for pose in places if distance(pose, expected.last) <= expected.reach]
+    starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
+    found = (track(query, start) for start in starts)
+    end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
     if end is None:
         return None
-    is_alone = all(is_same(p.pose, end.pose) for p in alike)
-    if is_same_place(end.pose, expected.pose):
-        return Found(end, "tracked", is_alone)
-    return Found(end, "near", is_alone) if end.log_odds >= MOST_EXPECTED else None
+    share = len(near.scan_map.sparse) / len(query.scan_map.sparse)  # the fewer places, the less is chance
+    state = replace(end, gain=min(end.gain, -math.log(share)))
+    how: How = "tracked" if is_same_place(end.pose, expected.pose) else "near"
+    return Found(state, how, all(is_same_place(pose, end.pose) for pose in alike))
+
+
+def is_acceptable(state: State, expected: Expected) -> bool:
+    """Return True for a pose within reach that is where it was expected, or sure by itself."""
+    is_sure = state.log_odds >= MOST_EXPECTED or is_same_place(state.pose, expected.pose)
+    return is_sure and distance(state.pose, expected.last) <= expected.reach
 
 
 def distance(pose: Pose, other: Pose) -> float:
