@@ -17,7 +17,7 @@ from ..jobs.threads import Workers
 from ..localization.attempts import brief_query, is_whole
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
-from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY
+from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY, settle
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
 from ..localization.query import Query, prepare_query
@@ -319,19 +319,19 @@ def track(query: Query, start: Pose) -> State | None:
 def descend_last(query: Query, start: Pose) -> State:
     """Descend on the points themselves; return the end, with its odds by whole views.
 
-    A narrow photo gains nothing by being where it was expected: it may look the same at two poses near each
-    other.
+    A narrow photo converges slowly, and gains nothing by being where it was expected: it may look the same at
+    two poses near each other.
     """
-    pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
-    end = score_pose(query, pose)
-    is_near = np.linalg.norm(pose.center_world - start.center_world) < NEARLY
+    end = score_pose(query, descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS))
+    end = settle(query, end) if query.photo.is_partial else end
+    seen_from = start if distance(end.pose, start) < NEARLY else None
     covariance = None
     if end.score >= HOPELESS_SCORE:
-        covariance = estimate_covariance(query, pose, seen_from=start if is_near else None)
+        covariance = estimate_covariance(query, end.pose, seen_from=seen_from)
     probability = float(posterior([assess_end(query, end)], covariance)[0])
     log_odds = log_odds_of_place(probability, probability, covariance)
     gain = 0.0 if query.photo.is_partial else MOST_EXPECTED
-    return State(pose, log_odds, end.score, covariance, gain)
+    return State(end.pose, log_odds, end.score, covariance, gain)
 
 
 def has_own_matches(query: Query) -> bool:
