@@ -26,6 +26,7 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import SEARCH_VIEW, Views
+from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells, ViewArrays, ViewConfig
 from .comparison import compare, score_pose
 from .cone import Cone, find_cone, select_cells
@@ -137,10 +138,16 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
 
 
 def refine_on_middle_cells(query: Query, pose: Pose) -> Fit:
-    """Descend from a pose, and from poses around the end for as long as the score on fine cells rises."""
+    """Descend from a pose, and from poses around the end for as long as the score on fine cells rises.
+
+    Nothing is gained if they all lead back to the end.
+    """
     fit = descend_fine(query, descend_middle(query, pose).pose)
     for _ in range(MAX_PERTURBATIONS):
-        around = descend_fine(query, perturb_middle(query, fit.pose).pose)
+        other = perturb_middle(query, fit.pose).pose
+        if math.dist(other.center_world, fit.pose.center_world) < PLACE_SPACING:
+            break
+        around = descend_fine(query, other)
         gain = around.score - fit.score
         fit = around if gain > 0.0 else fit
         if gain < MIN_GAIN * around.score:
