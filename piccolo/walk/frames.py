@@ -22,7 +22,7 @@ from ..scan_map.scan_map import ScanMap
 How = Literal["alone", "near", "tracked", "none"]
 SAME_PLACE = 2.0  # [m] poses nearer to each other: key frames are so far apart
 SAME_HEADING = math.pi / 4.0  # and this are of one place: square rooms look alike turned by twice that
-MOST_EXPECTED = 3.0  # [log] that a frame gains by being where it was to be expected
+MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was to be expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 
 
@@ -34,7 +34,7 @@ class State:
     log_odds: float  # against none of the frame's poses being right
     score: float | None = None  # as of Evidence; None of a pose that was not refined
     covariance: PoseCovariance | None = None  # in the world
-    gain: float = MOST_EXPECTED  # [log] if it is where the frame was expected
+    gain: float = 0.0  # [log] of one that was found among the few places within reach
 
     @property
     def is_refined(self) -> bool:

@@ -286,10 +286,18 @@ def find_near(query: Query, expected: Expected) -> Found | None:
     end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
     if end is None:
         return None
-    share = len(near.scan_map.sparse) / len(query.scan_map.sparse)  # the fewer places, the less is chance
-    state = replace(end, gain=min(end.gain, -math.log(share)))
     how: How = "tracked" if is_same_place(end.pose, expected.pose) else "near"
+    state = replace(end, gain=compute_gain(query, near))
     return Found(state, how, all(is_same_place(pose, end.pose) for pose in alike))
+
+
+def compute_gain(query: Query, near: Query) -> float:
+    """Return what a frame gains [log] if it is found among some places: the fewer, the less it is by chance.
+
+    A narrow photo gains nothing: it may look the same at two poses near each other.
+    """
+    share = len(near.scan_map.sparse) / len(query.scan_map.sparse)
+    return 0.0 if query.photo.is_partial else min(-math.log(share), MOST_EXPECTED)
 
 
 def is_acceptable(state: State, expected: Expected) -> bool:
@@ -319,8 +327,7 @@ def track(query: Query, start: Pose) -> State | None:
 def descend_last(query: Query, start: Pose) -> State:
     """Descend on the points themselves; return the end, with its odds by whole views.
 
-    A narrow photo converges slowly, and gains nothing by being where it was expected: it may look the same at
-    two poses near each other.
+    A narrow photo converges slowly: its descent goes on.
     """
     end = score_pose(query, descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS))
     end = settle(query, end) if query.photo.is_partial else end
@@ -330,8 +337,7 @@ def descend_last(query: Query, start: Pose) -> State:
         covariance = estimate_covariance(query, end.pose, seen_from=seen_from)
     probability = float(posterior([assess_end(query, end)], covariance)[0])
     log_odds = log_odds_of_place(probability, probability, covariance)
-    gain = 0.0 if query.photo.is_partial else MOST_EXPECTED
-    return State(end.pose, log_odds, end.score, covariance, gain)
+    return State(end.pose, log_odds, end.score, covariance)
 
 
 def has_own_matches(query: Query) -> bool:
