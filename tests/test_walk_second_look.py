@@ -1,0 +1,87 @@
+"""Lost frames of a walk, looked for from the sure frames around them."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from piccolo.geometry.pose import Pose
+from piccolo.walk import second_look
+from piccolo.walk.beliefs import NOTHING, Belief
+from piccolo.walk.frames import Frame, State
+from piccolo.walk.motion import Motion
+from piccolo.walk.path import Path
+from piccolo.walk.tracker import Found
+
+TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
+LOST = 2
+
+
+def _at(x):
+    return Pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+@pytest.fixture
+def walk():
+    """Key frames along a line at 1 m/s, of which one is lost; and what is believed of each."""
+    sure = [State(_at(time), 8.0, 0.5) for time in TIMES]
+    frames = [
+        Frame(time, [state], is_key=True, departed=state.pose)
+        for time, state in zip(TIMES, sure, strict=True)
+    ]
+    frames[LOST] = Frame(TIMES[LOST])
+    beliefs = [Belief([state], np.array([0.99])) for state in sure]
+    beliefs[LOST] = NOTHING
+    probabilities = [belief.probabilities for belief in beliefs]
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), prepare=lambda panorama: panorama)
+    return tracker, Path(probabilities, [None] * len(frames)), beliefs
+
+
+def _find(walk, monkeypatch, x, is_alone=True):
+    """Look for the lost frame, which is found at a place; return it, and where it was expected."""
+    asked = []
+
+    def find(query, expected):
+        asked.append(expected)
+        return Found(State(_at(x), 5.0, 0.5), "near", is_alone)
+
+    monkeypatch.setattr(second_look, "find_near", find)
+    panorama = SimpleNamespace(is_valid=np.ones((2, 4), bool))
+    tracker, path, beliefs = walk
+    second_look._find_lost(tracker, path, beliefs, LOST, lambda k: panorama)
+    return tracker.frames[LOST], asked
+
+
+def test_a_lost_frame_is_expected_from_the_sure_frames_nearest_in_time(walk, monkeypatch):
+    frame, asked = _find(walk, monkeypatch, 10.1)
+    assert [expected.last.center_world[0] for expected in asked] == [9.5]
+    assert asked[0].pose.center_world[0] == pytest.approx(10.0)
+    assert asked[0].reach == Motion().reach(0.5)
+    assert (frame.key, frame.how, frame.is_key) == (1, "near", False)
+    assert frame.arrived.center_world[0] == pytest.approx(10.1)
+    assert walk[2][LOST].states[0].pose.center_world[0] == pytest.approx(10.1)
+
+
+@pytest.mark.parametrize(("x", "is_alone"), [(7.5, True), (10.1, False)])
+def test_a_place_out_of_reach_or_one_of_several_is_none(walk, monkeypatch, x, is_alone):
+    """From the frame after it, at 12 m, one at 7.5 m could not have been reached in 2 s."""
+    frame, asked = _find(walk, monkeypatch, x, is_alone)
+    assert len(asked) == 1
+    assert frame == Frame(TIMES[LOST])
+    assert walk[2][LOST] is NOTHING
+
+
+def test_a_sure_frame_is_not_looked_for(walk, monkeypatch):
+    walk[2][LOST] = walk[2][1]
+    assert _find(walk, monkeypatch, 10.1)[1] == []
+
+
+def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeypatch):
+    """Whatever looks like that place near it."""
+    expected = _at(10.2)
+    tracker, _, beliefs = walk
+    tracker.frames[LOST].key = 1
+    beliefs[LOST] = Belief([State(expected, 4.0)], np.array([0.5]), expected)
+    frame, asked = _find(walk, monkeypatch, 10.1, is_alone=False)
+    assert asked[0].pose is expected
+    assert frame.arrived.center_world[0] == pytest.approx(10.1)
