@@ -28,11 +28,11 @@ if TYPE_CHECKING:
     from .scan import Scan
     from .scan_map.prior import GpsPrior
     from .scan_walk import Walk
-    from .walk.localize import Alone, WalkFrame
     from .walk.path import Gap
+    from .walk.results import Alone, WalkFrame
 
 MODULES = {
-    "Alone": ".walk.localize",
+    "Alone": ".walk.results",
     "Alternative": ".confidence.localization",
     "CoarseToFineSettings": ".localization.settings",
     "Evidence": ".confidence.localization",
@@ -46,7 +46,7 @@ MODULES = {
     "Scan": ".scan",
     "Source": ".result",
     "Walk": ".scan_walk",
-    "WalkFrame": ".walk.localize",
+    "WalkFrame": ".walk.results",
     "open_scan": ".opening",
     "write_report": ".report.build",
 }

@@ -23,8 +23,8 @@ from .geometry.pose import Pose, check_rotation
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .scan_map.prior import GpsPrior
-from .walk.localize import Alone, WalkFrame
 from .walk.path import Gap
+from .walk.results import Alone, WalkFrame
 
 FORMAT = "piccolo-pose/9"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")

@@ -22,8 +22,8 @@ from .result import Failure, Result, Source, describe_failure, result_of, unread
 from .scan_map.named_scans import add_places
 from .walk.beliefs import believe
 from .walk.frames import Frame
-from .walk.localize import WalkFrame, make_localization, make_localizations, result_alone
 from .walk.motion import check_times
+from .walk.results import WalkFrame, make_localization, make_localizations, result_alone
 from .walk.second_look import finish
 from .walk.tracker import Tracker
 

@@ -22,7 +22,7 @@ from piccolo.scenes.evaluation.walks import (
     walk_table,
 )
 from piccolo.scenes.scene import Query, Scene
-from piccolo.walk.localize import Alone, WalkFrame
+from piccolo.walk.results import Alone, WalkFrame
 
 RATE = 2.0
 

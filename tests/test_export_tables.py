@@ -14,8 +14,8 @@ from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.result import Source
 from piccolo.scenes.export import Options, export
-from piccolo.walk.localize import WalkFrame
 from piccolo.walk.path import Gap
+from piccolo.walk.results import WalkFrame
 
 POSES = tilted_poses(4)
 EYE = np.eye(3)

@@ -7,8 +7,8 @@ from piccolo.batch.frame_times import times_of
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.walk.localize import smooth_positions
 from piccolo.walk.motion import Motion
+from piccolo.walk.results import smooth_positions
 
 MOTION = Motion(2.0, 0.5)
 TURN = exp_so3(np.array([0.1, -0.3, 1.0]))
