@@ -37,13 +37,13 @@ def walk():
     return tracker, Path(probabilities, [None] * len(frames)), beliefs
 
 
-def _find(walk, monkeypatch, x, is_alone=True):
+def _find(walk, monkeypatch, x, how="near", is_alone=True):
     """Look for the lost frame, which is found at a place; return it, and where it was expected."""
     asked = []
 
     def find(query, expected):
         asked.append(expected)
-        return Found(State(_at(x), 5.0, 0.5), "near", is_alone)
+        return Found(State(_at(x), 5.0, 0.5), how, is_alone)
 
     monkeypatch.setattr(second_look, "find_near", find)
     panorama = SimpleNamespace(is_valid=np.ones((2, 4), bool))
@@ -65,7 +65,7 @@ def test_a_lost_frame_is_expected_from_the_sure_frames_nearest_in_time(walk, mon
 @pytest.mark.parametrize(("x", "is_alone"), [(7.5, True), (10.1, False)])
 def test_a_place_out_of_reach_or_one_of_several_is_none(walk, monkeypatch, x, is_alone):
     """From the frame after it, at 12 m, one at 7.5 m could not have been reached in 2 s."""
-    frame, asked = _find(walk, monkeypatch, x, is_alone)
+    frame, asked = _find(walk, monkeypatch, x, "near", is_alone)
     assert len(asked) == 1
     assert frame == Frame(TIMES[LOST])
     assert walk[2][LOST] is NOTHING
@@ -82,6 +82,6 @@ def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeyp
     tracker, _, beliefs = walk
     tracker.frames[LOST].key = 1
     beliefs[LOST] = Belief([State(expected, 4.0)], np.array([0.5]), expected)
-    frame, asked = _find(walk, monkeypatch, 10.1, is_alone=False)
+    frame, asked = _find(walk, monkeypatch, 10.1, "tracked", is_alone=False)
     assert asked[0].pose is expected
     assert frame.arrived.center_world[0] == pytest.approx(10.1)

@@ -79,7 +79,7 @@ def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int, read
         found = find_near(query, expected)
         if found is None or not _is_walked(tracker, beliefs, k, found.state.pose):
             continue
-        if found.is_alone or expected.pose is beliefs[k].expected:
+        if found.is_alone or found.how == "tracked":
             _hang(frames, path, k, begin, found)
             beliefs[k] = believe(frames, path, k)
             return
