@@ -171,3 +171,17 @@ def test_bad_frames_are_black_mirrored_or_of_elsewhere():
             assert np.abs(a.rgb.astype(float) - b.rgb).mean() > 10.0
         else:
             np.testing.assert_array_equal(a.rgb, b.rgb[:, ::-1] if b.kind == "mirrored" else b.rgb)
+
+
+def test_photos_of_a_walk_have_one_light_and_their_own_noise():
+    clean, photos = (
+        np.array([frame.rgb for frame in frames(rate=0.2, variant=v)], float) for v in ("clean", "photo")
+    )
+    colors = [
+        photo.mean(axis=(0, 1)) / picture.mean(axis=(0, 1))
+        for photo, picture in zip(photos, clean, strict=True)
+    ]
+    assert np.ptp(colors, axis=0).max() < 0.1 * np.mean(colors)
+    fine = np.diff(photos, axis=2) - np.diff(clean, axis=2)
+    alike = np.corrcoef(fine.reshape(len(fine), -1))[np.triu_indices(len(fine), 1)]
+    assert abs(alike).max() < 0.3

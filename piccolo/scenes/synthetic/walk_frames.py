@@ -83,7 +83,8 @@ def frames_of(
             room = join_rooms([office.world.rooms[0], *present])
             rgb = photograph(room, pose, options.width, workers, meanwhile)
         if options.variant == "photo" and kind != "black":
-            rgb = change_light(rgb, np.random.default_rng([seed, 55, number]))  # one light for the whole walk
+            light = np.random.default_rng([seed, 55, number])  # one for the whole walk
+            rgb = change_light(rgb, light, np.random.default_rng([seed, 56, number, k]))
         yield Frame(rgb[:, ::-1].copy() if kind == "mirrored" else rgb, pose, time, kind)
 
 

@@ -130,11 +130,16 @@ def blur(image: Array, sigma: float) -> Array:
     return np.asarray(gaussian_filter(image, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest")))
 
 
-def change_light(rgb: NDArray[np.uint8], rng: np.random.Generator) -> NDArray[np.uint8]:
-    """Return the image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy."""
+def change_light(
+    rgb: NDArray[np.uint8], rng: np.random.Generator, noise: np.random.Generator
+) -> NDArray[np.uint8]:
+    """Return the image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy.
+
+    `noise` may be `rng`; photos of one light have the same `rng` each, and other noise.
+    """
     gain = rng.uniform(0.7, 1.3) * rng.uniform(0.85, 1.15, 3)
     linear = (rgb / 255.0) ** rng.uniform(0.8, 1.25)
-    noisy = blur(linear * gain, 0.8) + rng.normal(0.0, 0.02, rgb.shape)
+    noisy = blur(linear * gain, 0.8) + noise.normal(0.0, 0.02, rgb.shape)
     return np.asarray(np.round(noisy.clip(0.0, 1.0) * 255.0).astype(np.uint8))
 
 
@@ -185,7 +190,7 @@ def make_query(world: World, index: int, variant: str, width: int, workers: Work
     """Query number `index` of a variant: upright but for `tilt`, in a room drawn at random."""
     room, pose, rng = pose_of_query(world, index, variant)
     rgb = photograph(room, pose, width, workers)
-    return Query(change_light(rgb, rng) if variant == "photo" else rgb, pose, variant)
+    return Query(change_light(rgb, rng, rng) if variant == "photo" else rgb, pose, variant)
 
 
 def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, np.random.Generator]:
@@ -239,5 +244,5 @@ def make_photos(
     else:
         pictures = [("", picture_of_all(cameras.mounts, room, pose, workers))]
     if variant == "photo":
-        pictures = [(name, change_light(rgb, rng)) for name, rgb in pictures]
+        pictures = [(name, change_light(rgb, rng, rng)) for name, rgb in pictures]
     return pictures, pose
