@@ -16,6 +16,7 @@ from piccolo.localization import covariance
 from piccolo.localization.localize import localize
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import World, make_query, scan_world
 
@@ -31,9 +32,15 @@ def found():
 
 
 def _points(prepared, pose):
-    """The points at a pose with channels in levels."""
-    points = prepared.points_at(pose).around(pose.center_world)
-    return points._replace(channels=covariance.to_levels(points.channels))
+    return prepared.points_at(pose).around(pose.center_world)
+
+
+def _gradients(problem, poses, center):
+    gradients = np.empty((len(poses), 6))
+    rotations = np.array([pose.R_cam_from_world for pose in poses])
+    centers = np.array([pose.center_world for pose in poses]) - center
+    covariance.write_gradients(problem, rotations, centers, gradients)
+    return gradients
 
 
 def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
@@ -52,12 +59,15 @@ def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
 
 def test_hessian_predicts_the_gradient_a_step_away(found):
     prepared, pose, _ = found
-    points = _points(prepared, pose)
-    hessian = covariance.compute_hessian(prepared.photo.images.full(), points, pose, covariance.STEPS[0])
+    points, image = _points(prepared, pose), prepared.photo.images.full()
+    levels = covariance.to_levels(points.channels)
+    problem = ChannelProblem(
+        points.offsets, levels, points.weights, image.rgbx, image.width, covariance.SCALE
+    )
+    hessian = covariance.compute_hessian(problem, pose, covariance.STEPS[0])
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
-        before = covariance.compute_gradient(prepared.photo.images.full(), points, pose)
-        after = covariance.compute_gradient(prepared.photo.images.full(), points, moved)
+        before, after = _gradients(problem, (pose, moved), pose.center_world)
         expected = hessian @ delta
         assert np.linalg.norm(after - before - expected) < 0.5 * np.linalg.norm(expected)
 
@@ -105,12 +115,12 @@ def test_deviations_are_of_the_size_of_the_errors():
 @pytest.mark.parametrize("num_rough", [1, 2, 3])
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
     prepared, pose, _ = found
-    images, asked = [image() for image in prepared.photo.images], []
-    ways = list(zip(images[:3], (*covariance.STEPS, covariance.ROUGH_STEPS), strict=True))
+    texels, asked = [image().rgbx for image in prepared.photo.images], []
+    ways = list(zip(texels[:3], (*covariance.STEPS, covariance.ROUGH_STEPS), strict=True))
 
-    def hessian(image, points, pose, steps):
-        asked.append((image, steps))
-        return np.diag([1.0] * 5 + [-1.0 if any(image is i for i, _ in ways[:num_rough]) else 1.0])
+    def hessian(problem, pose, steps):
+        asked.append((problem.texels, steps))
+        return np.diag([1.0] * 5 + [-1.0 if any(problem.texels is t for t, _ in ways[:num_rough]) else 1.0])
 
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "compute_hessian", hessian)

@@ -201,7 +201,7 @@ def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkey
     def stay(query, start):
         """End where it began, as in a minimum."""
         starts.append(start)
-        return Hypothesis(start, 0.5)
+        return start, start
 
     monkeypatch.setattr(tracker, "refine_on_middle_cells", stay)
     end = tracker.track(taken, _off(true, 0.25, 4.0))
@@ -228,5 +228,5 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
 )
 def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, odds, score, is_found):
     query, true = seen
-    monkeypatch.setattr(tracker, "descend_last", lambda query, start: State(start, odds, score))
+    monkeypatch.setattr(tracker, "descend_last", lambda query, start, seen_from: State(start, odds, score))
     assert (track(query, true) is not None) == is_found

@@ -194,13 +194,16 @@ def compare_cells(
                     kept[i] = F0
 
 
-def compare(query: Query, pose: Pose) -> Comparison:
-    """Compare the scan as seen from a pose with the photo, by blocks; cached by the pose."""
+def compare(query: Query, pose: Pose, seen_from: Pose | None = None) -> Comparison:
+    """Compare the scan as seen from a pose with the photo, by blocks; cached by the pose.
+
+    `seen_from` is a pose so near that it sees the same, and whose view is known.
+    """
     kept = query.cache.comparisons
     if pose.key not in kept:
         config = query.method.fine_view
         view = config.arrays
-        place = round_position(pose)
+        place = round_position(seen_from or pose)
         sums = query.cache.views.averages(place, config)
         offsets, colors, weights, center = empty_cells(len(sums), place)
         moments = np.empty((view.num_stats, 8), np.float32)
@@ -227,9 +230,9 @@ def compare(query: Query, pose: Pose) -> Comparison:
     return comparison
 
 
-def score_pose(query: Query, pose: Pose) -> Hypothesis:
-    """Score a pose by comparing the scan with the photo, as for selection."""
-    return Hypothesis(pose, compare(query, pose).score)
+def score_pose(query: Query, pose: Pose, seen_from: Pose | None = None) -> Hypothesis:
+    """Score a pose by comparing the scan with the photo, as for selection; `seen_from` as in `compare`."""
+    return Hypothesis(pose, compare(query, pose, seen_from).score)
 
 
 def mask_occluders(query: Query, pose: Pose) -> Query:

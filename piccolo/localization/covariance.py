@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, step
 from ..geometry.sphere import find_cell
+from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
-from ..panorama.texels import Texels
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .query import Query
@@ -51,13 +51,13 @@ SHAPE_STEPS = (
 ROUGH_SHAPE_STEPS = DifferenceSteps(1, math.radians(0.8), 0.05, 1.0)
 
 
-def compute_gradient(image: Texels, points: Cells, pose: Pose) -> Array:
-    """Return the gradient (6,) of the robust loss, in the camera's frame."""
+@kernel
+def write_gradients(problem: ChannelProblem, rotations: Array, centers: Array, gradients: Array) -> None:
+    """Write the gradient (6,) of the robust loss, in the camera's frame, at each pose (N, 3, 3), (N, 3)."""
     sums = np.empty(NUM_SUMS)
-    center = pose.center_world - points.center_map
-    problem = ChannelProblem(points.offsets, points.channels, points.weights, image.rgbx, image.width, SCALE)
-    channel_equations(problem, pose.R_cam_from_world, center, sums)
-    return sums[GRADIENT:MATRIX].copy()
+    for k in range(len(rotations)):
+        channel_equations(problem, rotations[k], centers[k], sums)
+        gradients[k] = sums[GRADIENT:MATRIX]
 
 
 def fill_symmetric(upper: Array) -> Array:
@@ -77,40 +77,45 @@ def remove_poles(points: Cells, pose: Pose) -> Cells:
     return Cells(offsets, channels, weights, points.center_map)
 
 
-def compute_hessian(image: Texels, points: Cells, pose: Pose, steps: DifferenceSteps) -> Array:
+def compute_hessian(problem: ChannelProblem, pose: Pose, steps: DifferenceSteps) -> Array:
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
+    The points of the problem are around the pose.
     """
-    rows = []
-    for delta in np.diag([steps.turn] * 3 + [steps.move] * 3):
-        rise = compute_gradient(image, points, step(pose, delta)) - compute_gradient(
-            image, points, step(pose, -delta)
-        )
-        rows.append(rise / (2.0 * delta.sum()))
-    return np.asarray(0.5 * (np.array(rows) + np.array(rows).T))
+    sizes = np.repeat([steps.turn, steps.move], 3)
+    ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
+    rotations = np.array([end.R_cam_from_world for end in ends])
+    centers = np.array([end.center_world for end in ends]) - pose.center_world
+    gradients = np.empty((len(ends), 6))
+    write_gradients(problem, rotations, centers, gradients)
+    rows = (gradients[::2] - gradients[1::2]) / (2.0 * sizes[:, None])
+    return np.asarray(0.5 * (rows + rows.T))
 
 
-def equations_by_block(image: Texels, points: Cells, pose: Pose, block: NDArray[np.integer]) -> Array:
-    """Sum the normal equations (B, 29) over the points (N,) of each block, the camera at their centre."""
-    order = np.argsort(block, kind="stable")
-    counts = np.bincount(block)
-    offsets, levels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
-    begins = np.concatenate([[0], np.cumsum(counts)])
-    sums = np.empty((len(counts), NUM_SUMS))
-    problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
+def sort_by_block(points: Cells) -> tuple[Cells, NDArray[np.int64]]:
+    """Sort the points around a camera by the block of the sphere in which each lies.
+
+    Return also where each block begins, and the number of points (B + 1,).
+    """
+    ranges = np.linalg.norm(points.offsets, axis=0)
+    blocks = find_cell(points.offsets.T / ranges[:, None], ERROR_RINGS)
+    order = np.argsort(blocks, kind="stable")
+    offsets, channels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
+    begins = np.concatenate([[0], np.cumsum(np.bincount(blocks))])
+    return Cells(offsets, channels, weights, points.center_map), begins
+
+
+def sum_by_block(problem: ChannelProblem, pose: Pose, begins: NDArray[np.int64]) -> Array:
+    """Sum the normal equations (B, 29) over each block's points around a pose, from its `begins` (B + 1,)."""
+    sums = np.empty((len(begins) - 1, NUM_SUMS))
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
     return sums
 
 
-def assign_blocks(points: Cells) -> NDArray[np.integer]:
-    """Return the block (N,) of the sphere in which each point lies."""
-    return find_cell(points.offsets.T / np.linalg.norm(points.offsets, axis=0)[:, None], ERROR_RINGS)
-
-
-def block_gradients(image: Texels, points: Cells, pose: Pose) -> Array:
+def block_gradients(problem: ChannelProblem, pose: Pose, begins: NDArray[np.int64]) -> Array:
     """Return jackknife gradients (B, 6), in the camera's frame, of the blocks around it."""
-    sums = equations_by_block(image, points, pose, assign_blocks(points))
+    sums = sum_by_block(problem, pose, begins)
     shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
     return jackknife_gradients(shown[:, GRADIENT:MATRIX], fill_symmetric(shown[:, MATRIX:]))
 
@@ -143,13 +148,16 @@ def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, by the image that determines it best.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used.
+    rough, a third is used. The points are around the pose.
     """
+    (offsets, channels, weights, _), begins = sort_by_block(points)
+    levels = to_levels(channels)
 
     def by(steps: DifferenceSteps) -> Array | None:
         image = query.photo.images[steps.scale]()
-        hessian = compute_hessian(image, points, pose, steps)
-        covariance = sandwich_covariance(hessian, block_gradients(image, points, pose))
+        problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
+        hessian = compute_hessian(problem, pose, steps)
+        covariance = sandwich_covariance(hessian, block_gradients(problem, pose, begins))
         return covariance if covariance is None else steps.inflation * covariance
 
     has_shape = query.scan_map.has_shape
@@ -190,7 +198,6 @@ def estimate_covariance(
     shown = mask_occluders(query, pose)
     seen = shown.points_at(pose) if seen_from is None else query.points_at(seen_from)
     points = remove_poles(seen.around(pose.center_world), pose)
-    points = points._replace(channels=to_levels(points.channels))
     covariance = compute_covariance(shown, points, pose)
     if covariance is None:
         return None

@@ -23,11 +23,12 @@ from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
+from ..optimize.channel_loss import ChannelProblem
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
 from ..views.view import Cells
 from .comparison import mask_occluders, score_pose
-from .covariance import assign_blocks, equations_by_block, remove_poles
+from .covariance import SCALE, remove_poles, sort_by_block, sum_by_block
 from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
 from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
@@ -192,18 +193,19 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     narrowest = retake(changes.max(axis=0)).is_valid
     points = mask_edge(shown.points_at(pose), pose, narrowest)
     fine = shown.view_at(pose, query.method.fine_view)
-    around = remove_poles(points.around(pose.center_world), pose)
-    block = assign_blocks(around)
+    around, begins = sort_by_block(remove_poles(points.around(pose.center_world), pose))
+    levels = to_levels(around.channels)
     middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
         images = make_images(retake(change), query.method.scales)
+        full = images.full()
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
         near = pose if is_near else descend(fine, images.fine(), pose, NEARBY)
-        end = descend(points, images.full(), near, CLOSE)
-        seen = around.around(end.center_world)
-        seen = seen._replace(channels=to_levels(seen.channels))
-        return end, equations_by_block(images.full(), seen, end, block)[:, LOSS]
+        end = descend(points, full, near, CLOSE)
+        offsets = around.around(end.center_world).offsets
+        problem = ChannelProblem(offsets, levels, around.weights, full.rgbx, full.width, SCALE)
+        return end, sum_by_block(problem, end, begins)[:, LOSS]
 
     ends = query.workers.map(end_with, list(changes), "fit the focal length")
     return np.array([losses for _, losses in ends]), [end for end, _ in ends]

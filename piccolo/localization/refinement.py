@@ -137,22 +137,26 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
     return descend_around(cells, config.arrays.blocks, wide_image, narrow_image, pose, 1.0, query.workers)
 
 
-def refine_on_middle_cells(query: Query, pose: Pose) -> Fit:
+def refine_on_middle_cells(query: Query, pose: Pose) -> tuple[Pose, Pose]:
     """Descend from a pose, and from poses around the end for as long as the score on fine cells rises.
 
-    Nothing is gained if they all lead back to the end.
+    Nothing is gained if they all lead back to the end. Return also the pose whose view the last cells are.
     """
-    fit = descend_fine(query, descend_middle(query, pose).pose)
+    end = seen_from = descend_middle(query, pose).pose
+    other = perturb_middle(query, end).pose
+    fit = descend_fine(query, end)
     for _ in range(MAX_PERTURBATIONS):
-        other = perturb_middle(query, fit.pose).pose
-        if math.dist(other.center_world, fit.pose.center_world) < PLACE_SPACING:
+        if math.dist(other.center_world, end.center_world) < PLACE_SPACING:
             break
         around = descend_fine(query, other)
         gain = around.score - fit.score
-        fit = around if gain > 0.0 else fit
+        if gain > 0.0:
+            fit, seen_from = around, other
         if gain < MIN_GAIN * around.score:
             break
-    return fit
+        end = fit.pose
+        other = perturb_middle(query, end).pose
+    return fit.pose, seen_from
 
 
 def refine_by_perturbation(query: Query, fit: Fit) -> Fit:

@@ -316,25 +316,26 @@ def track(query: Query, start: Pose) -> State | None:
 
     A narrow photo is tracked again from where its matches with the scan drawn there put it.
     """
-    end = descend_last(query, refine_on_middle_cells(query, start).pose)
+    end = descend_last(query, *refine_on_middle_cells(query, start))
     if has_own_matches(query):
-        again = refine_on_middle_cells(query, verify(query, end.pose).pose).pose
-        end = max(end, descend_last(query, again), key=lambda state: state.log_odds)
+        again = descend_last(query, *refine_on_middle_cells(query, verify(query, end.pose).pose))
+        end = max(end, again, key=lambda state: state.log_odds)
     is_wrong = end.log_odds < 0.0 or end.score is None or end.score < SURE_SCORE
     return None if is_wrong else end
 
 
-def descend_last(query: Query, start: Pose) -> State:
+def descend_last(query: Query, start: Pose, seen_from: Pose) -> State:
     """Descend on the points themselves; return the end, with its odds by whole views.
 
-    A narrow photo converges slowly: its descent goes on.
+    `seen_from` is a pose nearby, whose view is known. A narrow photo converges slowly: its descent goes on.
     """
-    end = score_pose(query, descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS))
+    pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
+    end = score_pose(query, pose, seen_from if distance(pose, seen_from) < NEARLY else None)
     end = settle(query, end) if query.photo.is_partial else end
-    seen_from = start if distance(end.pose, start) < NEARLY else None
+    is_near = distance(end.pose, start) < NEARLY  # it sees the same points
     covariance = None
     if end.score >= HOPELESS_SCORE:
-        covariance = estimate_covariance(query, end.pose, seen_from=seen_from)
+        covariance = estimate_covariance(query, end.pose, seen_from=start if is_near else None)
     probability = float(posterior([assess_end(query, end)], covariance)[0])
     log_odds = log_odds_of_place(probability, probability, covariance)
     return State(end.pose, log_odds, end.score, covariance)
