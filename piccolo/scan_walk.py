@@ -80,6 +80,7 @@ class Walk:
 
     def __init__(self, tracker: Tracker, read_options: ReadOptions, about: WalkAbout) -> None:
         self.tracker = tracker
+        tracker.read = self._panorama
         self.read_options = read_options
         self.about = about
         self.pictures: list[Picture] = []
@@ -101,7 +102,10 @@ class Walk:
         return self.follow(self.prepare(frame, name), time, odometry)
 
     def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
-        """Read a frame and prepare what does not depend on other frames; another thread may do it."""
+        """Read a frame and prepare what does not depend on other frames; another thread may do it.
+
+        Of a live camera, one thread prepares frames and another follows them: open the scan with one thread.
+        """
         watch = Stopwatch()
         name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
         with reading_once():
@@ -169,7 +173,7 @@ class Walk:
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""
-        path, beliefs = finish(self.tracker, self._panorama, show)
+        path, beliefs = finish(self.tracker, show)
         found = make_localizations(self.tracker, path, beliefs)
         return [
             self._result(taken, add_places(self.tracker.scan_map, f), walk)

@@ -23,11 +23,13 @@ from piccolo.localization.verification import (
     PLACE,
     TURN,
     count_agreeing,
+    match_beside,
     match_pictures,
     matches_near,
     verify,
 )
 from piccolo.panorama import Panorama
+from piccolo.scenes.synthetic.world import change_light, photograph
 
 NUM_POINTS = 200_000
 WIDTH = 1024
@@ -60,6 +62,46 @@ def _moved(offset, yaw=0.0):
     """The true pose, turned and moved [m]."""
     R = yaw_rotation(yaw) @ _true_pose().R_cam_from_world
     return Pose(R, _true_pose().center_world + np.array(offset))
+
+
+@functools.lru_cache
+def _beside():
+    """A query of a photo taken half a metre beside, with other noise and light, and its true pose."""
+    world = rooms.room(1, NUM_POINTS)[0]
+    here = _narrow()[1]
+    pose = Pose(yaw_rotation(0.1) @ here.R_cam_from_world, here.center_world + np.array([0.3, 0.4, 0.0]))
+    rng = np.random.default_rng(0)
+    rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
+    panorama = Panorama(rgb, _narrow()[0].is_valid)
+    query = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    return query, rooms.local(1, pose, NUM_POINTS)
+
+
+def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
+    matches = match_beside(_query(), *_beside())
+    agreeing = count_matches(matches, _true_pose(), verification.COS_AGREE)
+    assert agreeing >= 20
+    assert (np.diff(matches.query) >= 0).all()
+    assert count_matches(matches, _moved((0.5, -0.4, 0.0)), verification.COS_AGREE) < 0.3 * agreeing
+    cloud = np.asarray(rooms.room(1, NUM_POINTS)[1].points)
+    nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in matches.points]
+    assert np.median(nearest) < 0.05
+
+
+def test_what_moves_with_the_camera_is_no_match():
+    """A photo matched with itself: of what is left, nothing is where the pose puts it."""
+    matches = match_beside(_query(), _query(), _true_pose())
+    assert len(matches.query) < 0.2 * len(_query().seen().keypoints.rays)
+    assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
+
+
+def test_photos_beside_verify_a_pose_together_with_the_scan():
+    beside = match_beside(_query(), *_beside())
+    alone, together = (verify(q, _true_pose()) for q in (_query(), replace(_query(), beside=beside)))
+    assert together.num_matches >= alone.num_matches + 10
+    assert rooms.errors(together.pose, _true_pose())[0] < 0.03
+    wrong = _moved((0.0, 0.0, 0.0), 2.0)
+    assert verify(replace(_query(), beside=beside), wrong).num_matches <= 6
 
 
 def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():

@@ -10,8 +10,8 @@ from piccolo.walk import second_look
 from piccolo.walk.beliefs import NOTHING, Belief
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
-from piccolo.walk.path import Path
-from piccolo.walk.tracker import Found
+from piccolo.walk.path import EVEN, Path
+from piccolo.walk.tracker import Found, expect
 
 TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
 LOST = 2
@@ -33,7 +33,12 @@ def walk():
     beliefs = [Belief([state], np.array([0.99])) for state in sure]
     beliefs[LOST] = NOTHING
     probabilities = [belief.probabilities for belief in beliefs]
-    tracker = SimpleNamespace(frames=frames, motion=Motion(), prepare=lambda panorama: panorama)
+
+    def find(query, frame, near):
+        expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
+        return second_look.find_near(query, expected)
+
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), find=find, query_of=lambda k: k)
     return tracker, Path(probabilities, [None] * len(frames)), beliefs
 
 
@@ -46,9 +51,8 @@ def _find(walk, monkeypatch, x, how="near", is_alone=True):
         return Found(State(_at(x), 5.0, 0.5), how, is_alone)
 
     monkeypatch.setattr(second_look, "find_near", find)
-    panorama = SimpleNamespace(is_valid=np.ones((2, 4), bool))
     tracker, path, beliefs = walk
-    second_look._find_lost(tracker, path, beliefs, LOST, lambda k: panorama)
+    second_look._find_lost(tracker, path, beliefs, LOST)
     return tracker.frames[LOST], asked
 
 
@@ -85,3 +89,24 @@ def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeyp
     frame, asked = _find(walk, monkeypatch, 10.1, "tracked", is_alone=False)
     assert asked[0].pose is expected
     assert frame.arrived.center_world[0] == pytest.approx(10.1)
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "is_refined", "listed"),
+    [
+        ([0.95, 0.04], [True, False], []),
+        ([0.8, 0.15], [True, False], [1]),
+        ([0.87, 0.05, 0.08], [True, False, False], [2]),
+        ([0.7, 0.06, 0.09, 0.08, 0.07], [True] + 4 * [False], [2, 3, 4]),
+        ([0.86, 0.09, 0.02, 0.02], [True, False, False, False], [1]),
+        ([0.4, 0.09, 0.09], [True, False, False], []),
+        ([0.04, 0.4, 0.3], [True, False, False], [1, 2]),
+    ],
+)
+def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is_refined, listed):
+    """Of those that do so together, as many as leave it sure without them."""
+    states = [State(_at(5.0 * k), 1.0, 0.5 if r else None) for k, r in enumerate(is_refined)]
+    tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
+    path = Path([np.array(probabilities)], [None])
+    assert second_look._list_rough(tracker, path, 0) == listed
+    assert sum(probabilities) < EVEN or path.choose(0) is not None

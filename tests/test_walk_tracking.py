@@ -10,7 +10,7 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
-from piccolo.localization import refinement
+from piccolo.localization import refinement, verification
 from piccolo.localization.attempts import CHANCE_MATCHES, brief_query
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -230,3 +230,37 @@ def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, 
     query, true = seen
     monkeypatch.setattr(tracker, "descend_last", lambda query, start, seen_from: State(start, odds, score))
     assert (track(query, true) is not None) == is_found
+
+
+def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen):
+    """Their queries are kept, or prepared again; a whole photo has no use for them."""
+    query, true = seen
+    taken = _narrow(query)
+    frames, asked = [Frame(0.5 * k) for k in range(6)], []
+    follower = tracker.Tracker(query.scan_map, query.settings, Workers(2), Motion())
+    follower.lattice.frames.extend(frames)
+    follower.read = lambda k: asked.append(k) or taken.photo.given
+    beside = _off(true, 0.5, 0.0)
+    near = [(4, beside), (3, beside)]
+    alone = follower.find(query, Frame(3.0), near)
+    assert asked == []
+    assert alone.state.score == pytest.approx(find_near(query, _expected(beside, 0.5)).state.score)
+    for _ in range(2):
+        follower.find(taken, Frame(3.0), near)
+    assert asked == [4, 3]
+    assert [follower.query_of(k) is None for k in range(6)] == [False] * 6
+    assert len(follower.queries) == tracker.NUM_QUERIES
+    follower.read = lambda k: None
+    assert follower.query_of(0) is None
+
+
+def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
+    query, true = seen
+    taken = _narrow(query)
+    here = Hypothesis(true, 0.5)
+    alone = tracker.assess_end(taken, here).num_matches
+    more = taken.seen().keypoints.take(np.arange(40))
+    others = verification.match_located(taken, more, np.full(40, 2.0, np.float32), true)
+    assert tracker.assess_end(replace(taken, beside=others), here).num_matches > alone
+    away = others._replace(points=others.points + np.float32(0.5))
+    assert tracker.assess_end(replace(taken, beside=away), here).num_matches == alone

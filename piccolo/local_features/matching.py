@@ -1,7 +1,7 @@
 """Matches: a photo's features and the map's features with similar descriptors."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,11 @@ class Matches(NamedTuple):
     tangents: NDArray[np.float32]  # (M, 3)
     sizes: NDArray[np.float32]  # (M,) diameter [m]
     weights: NDArray[np.float32]  # (M,) 1 of a distinct one, else LEAST_WEIGHT
+
+    def take(self, kept: NDArray[np.integer] | NDArray[np.bool_]) -> "Matches":
+        """Return the matches at indices, or of a mask (M,)."""
+        taken: list[Any] = [values[kept] for values in self]
+        return Matches(*taken)
 
 
 _ROWS = np.empty((0, 3), np.float32)
@@ -155,3 +160,9 @@ def join_matches(parts: Sequence[Matches], counts: Sequence[int]) -> Matches:
     first = np.repeat(np.cumsum([0, *counts])[:-1], [len(part.query) for part in parts])
     query, *others = (np.concatenate(values) for values in zip(NO_MATCHES, *parts, strict=True))
     return Matches(query + first.astype(np.int32), *others)
+
+
+def merge_matches(parts: Sequence[Matches]) -> Matches:
+    """Merge matches of the same features of a photo with different points."""
+    merged: list[Any] = [np.concatenate(values) for values in zip(*parts, strict=True)]
+    return Matches(*merged).take(np.argsort(merged[0], kind="stable"))

@@ -2,7 +2,7 @@
 
 A narrow photo looks like many places. Only at the right one do its local features lie where those of the
 drawn scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2015), and InLoc's
-verification of poses (Taira et al., CVPR 2018).
+verification of poses (Taira et al., CVPR 2018). Photos beside it in a walk are such pictures too.
 """
 
 import math
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..local_features.hypotheses import count_matches, exact_pose
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
-from ..local_features.matching import Matches
+from ..local_features.matching import Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView
-from ..local_features.view_image import render_gray
+from ..local_features.view_image import ViewImage, render_gray
 from .query import Query
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
@@ -50,8 +50,11 @@ def count_agreeing(query: Query, pose: Pose) -> int:
 
 
 def verify(query: Query, pose: Pose) -> Verified:
-    """Find the pose that most matches with the scan drawn near a pose agree with, and count these."""
-    matches = matches_near(query, pose)
+    """Find the pose that most matches near a pose agree with, and count the features that do.
+
+    These are matches with the scan drawn there, and with the photos beside.
+    """
+    matches = merge_matches([matches_near(query, pose), query.beside])
     found = exact_pose(matches, pose, None)
     if found is None:
         return Verified(pose, 0)
@@ -77,34 +80,57 @@ def matches_near(query: Query, pose: Pose) -> Matches:
 
 def match_drawn(query: Query, pose: Pose) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
-    views, own = query.seen()
-    parts = [find_drawn(query, pose, view) for view in views]
+    parts = [find_drawn(query, pose, view) for view in query.seen().views]
     drawn = join_keypoints([keypoints for keypoints, _ in parts])
-    mine, theirs = match_pictures(own, drawn)
-    ranges = np.concatenate([ranges for _, ranges in parts])[theirs]
+    return match_located(query, drawn, np.concatenate([ranges for _, ranges in parts]), pose)
+
+
+def match_beside(query: Query, other: Query, pose: Pose) -> Matches:
+    """Match a photo's features with those of another photo that was taken at a pose in the map.
+
+    What both show in the same direction is left out: it may be carried along, as dirt on a lens is.
+    """
+    views, keypoints = other.seen()
+    ranges = np.zeros(len(keypoints.rays), np.float32)
+    for view in views:
+        own = view.find_own(keypoints.rays)
+        ranges[own] = draw(other, pose, view)[0].ranges[view.project(keypoints.rays[own])]
+    is_seen = np.flatnonzero(ranges > 0.0)
+    matches = match_located(query, keypoints.take(is_seen), ranges[is_seen], pose)
+    rays_of_other = rotate_points(matches.directions.astype(np.float64), pose.R_cam_from_world)
+    return matches.take(np.sum(rays_of_other * matches.rays, axis=1) < COS_AGREE)
+
+
+def match_located(query: Query, others: Keypoints, ranges: NDArray[np.float32], pose: Pose) -> Matches:
+    """Match a photo's features with those of a picture at a pose in the map, whose ranges (N,) are known."""
+    own = query.seen().keypoints
+    mine, theirs = match_pictures(own, others)
     R_map_from_cam = pose.R_cam_from_world.T
-    directions = rotate_points(drawn.rays[theirs].astype(np.float64), R_map_from_cam)
-    tangents = rotate_points(drawn.tangents[theirs].astype(np.float64), R_map_from_cam)
+    directions = rotate_points(others.rays[theirs].astype(np.float64), R_map_from_cam)
+    tangents = rotate_points(others.tangents[theirs].astype(np.float64), R_map_from_cam)
     return Matches(
         mine.astype(np.int32),
         own.rays[mine],
         own.tangents[mine],
         own.sizes[mine],
-        (pose.center_world + directions * ranges[:, None]).astype(np.float32),
+        (pose.center_world + directions * ranges[theirs, None]).astype(np.float32),
         directions.astype(np.float32),
         tangents.astype(np.float32),
-        drawn.sizes[theirs] * ranges,
+        others.sizes[theirs] * ranges[theirs],
         np.ones(len(mine), np.float32),
     )
 
 
+def draw(query: Query, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, NDArray[np.uint8]]:
+    """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
+    shown = cv2.dilate(view.cut_mask(query.photo.panorama.is_valid), np.ones((2 * AROUND + 1,) * 2, np.uint8))
+    turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
+    return render_gray(query.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
+
+
 def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, NDArray[np.float32]]:
     """Draw what a view of the photo would show at a pose; return the keypoints, and their ranges (N,) [m]."""
-    shown = cv2.dilate(view.cut_mask(query.photo.panorama.is_valid), np.ones((2 * AROUND + 1,) * 2, np.uint8))
-    R_view_from_map = view.R_sphere_from_view.T @ pose.R_cam_from_world
-    image = render_gray(
-        query.scan_map.octree, Pose(R_view_from_map, pose.center_world), shown > 0, view.focal
-    )
+    image, shown = draw(query, pose, view)
     found = find_in_view(image.gray, np.where(image.is_filled, shown, np.uint8(0)), view)
     ranges = image.ranges[view.project(found.rays)]
     is_seen = np.flatnonzero(ranges > 0.0)

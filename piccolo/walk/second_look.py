@@ -2,81 +2,86 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import islice
+
+import numpy as np
 
 from ..confidence.confidence import MIN_CONFIDENCE
 from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
-from ..panorama import Panorama
+from ..localization.query import Query
 from .beliefs import Belief, believe
 from .frames import Frame
 from .motion import carry
-from .path import Path, build_lattice
-from .tracker import Expected, Found, Tracker, distance, expect, find_near, refine_state
+from .path import EVEN, Path, build_lattice
+from .tracker import Expected, Found, Tracker, distance, find_near, refine_state
 
-Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
+Find = Callable[[Query], Found | None]
 
 
 @one_blas_thread
-def finish(tracker: Tracker, read: Read, show: Progress = no_progress) -> tuple[Path, list[Belief]]:
+def finish(tracker: Tracker, show: Progress = no_progress) -> tuple[Path, list[Belief]]:
     """Find the path of all frames of a tracker, and what each may be.
 
     The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
     lost ones are looked for from sure ones.
     """
     num = len(tracker.frames)
-    path = _refine_likely(tracker, read, show)
+    path = _refine_likely(tracker, show)
     beliefs = [believe(tracker.frames, path, k) for k in range(num)]
     for k in show(iter(range(num)[::-1]), num, "look for lost frames"):
-        _find_lost(tracker, path, beliefs, k, read)
-    path = _refine_likely(tracker, read, show)
+        _find_lost(tracker, path, beliefs, k)
+    path = _refine_likely(tracker, show)
     return path, [believe(tracker.frames, path, k) for k in range(num)]
 
 
-def _refine_likely(tracker: Tracker, read: Read, show: Progress) -> Path:
+def _refine_likely(tracker: Tracker, show: Progress) -> Path:
     """Refine the likely places of all key frames, until the path needs no others; return it."""
     space = tracker.lattice.space
     lattice = build_lattice(tracker.frames, space, tracker.motion)
     path = lattice.smooth()
     while rough := [k for k in range(len(tracker.frames)) if _list_rough(tracker, path, k)]:
         for k in show(iter(rough), len(rough), "refine"):
-            _refine(tracker, path, k, read)
+            _refine(tracker, path, k)
         lattice = build_lattice(tracker.frames, space, tracker.motion, lattice)
         path = lattice.smooth()
     return path
 
 
 def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
-    """List the likely states of a frame that were not refined."""
-    is_likely = path.probabilities[k] > 1.0 - MIN_CONFIDENCE  # less leaves another sure
+    """List the rough states of a frame that are likely, or together leave the likeliest unsure."""
+    found = path.probabilities[k]
+    states = tracker.frames[k].states if len(found) else []
+    rough = sorted((j for j, state in enumerate(states) if not state.is_refined), key=lambda j: -found[j])
+    left = np.cumsum(found[rough][::-1])[::-1]  # with those that are less likely
+    limit = 1.0 - MIN_CONFIDENCE  # less leaves another sure
     return [
         j
-        for j, state in enumerate(tracker.frames[k].states)
-        if not state.is_refined and len(is_likely) and (is_likely[j] or j == path.choose(k))
+        for j, total in zip(rough, left, strict=True)
+        if found[j] > limit or j == path.choose(k) or (total > limit and found.max() > EVEN)
     ]
 
 
-def _refine(tracker: Tracker, path: Path, k: int, read: Read) -> None:
+def _refine(tracker: Tracker, path: Path, k: int) -> None:
     """Refine the likely places of a key frame."""
     frame = tracker.frames[k]
-    panorama = read(k)
-    query = None if panorama is None else tracker.prepare(panorama)
+    query = tracker.query_of(k)
     for rough in [frame.states[j] for j in _list_rough(tracker, path, k)]:
         others = [state for state in frame.states if state is not rough]
         frame.states = others if query is None else refine_state(query, frame.states, rough)
 
 
-def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int, read: Read) -> None:
+def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int) -> None:
     """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
     frames = tracker.frames
     ways = _list_ways(tracker, beliefs, k)
-    panorama = read(k) if ways else None
-    if panorama is None or not panorama.is_valid.any():
+    query = tracker.query_of(k) if ways else None
+    if query is None:
         return
-    query = tracker.prepare(panorama)
-    for begin, expected in ways:
-        found = find_near(query, expected)
+    for begin, find in ways:
+        found = find(query)
         if found is None or not _is_walked(tracker, beliefs, k, found.state.pose):
             continue
         if found.is_alone or found.how == "tracked":
@@ -94,17 +99,17 @@ def _is_walked(tracker: Tracker, beliefs: Sequence[Belief], k: int, pose: Pose) 
     return all(d <= reach for d, reach in zip(distances, reaches, strict=True))
 
 
-def _list_ways(tracker: Tracker, beliefs: Sequence[Belief], k: int) -> list[tuple[int, Expected]]:
-    """List the frames from which a frame may be found, and where it is then expected."""
-    frames = tracker.frames
+def _list_ways(tracker: Tracker, beliefs: Sequence[Belief], k: int) -> list[tuple[int, Find]]:
+    """List the frames from which a frame may be found, and how."""
+    frame = tracker.frames[k]
     belief = beliefs[k]
-    key = frames[k].key
-    ways = []
-    if key is not None and belief.expected is not None:
-        ways = [(key, Expected(belief.expected, tracker.motion.reach(0.0), belief.expected))]
-    if not belief.is_sure and (sides := _list_sure(frames, beliefs, k)):
-        near = [(frames[m], beliefs[m].states[0].pose) for m in sides[0]]
-        ways.append((sides[0][0], expect(frames[k], near, tracker.motion)))
+    ways: list[tuple[int, Find]] = []
+    if frame.key is not None and belief.expected is not None:
+        expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
+        ways = [(frame.key, partial(find_near, expected=expected))]
+    if not belief.is_sure and (sides := _list_sure(tracker.frames, beliefs, k)):
+        near = [(m, beliefs[m].states[0].pose) for m in sides[0]]
+        ways.append((sides[0][0], partial(tracker.find, frame=frame, near=near)))
     return ways
 
 

@@ -1,7 +1,7 @@
 """Tracking of a camera through a scan, frame by frame, from past frames only."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import compress
 from typing import NamedTuple
@@ -14,6 +14,7 @@ from ..geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
+from ..local_features.matching import NO_MATCHES, merge_matches
 from ..localization.attempts import brief_query, is_whole
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
@@ -24,7 +25,7 @@ from ..localization.query import Query, prepare_query
 from ..localization.refinement import descend, refine_on_middle_cells
 from ..localization.selection import SURE_SCORE, assess_poses
 from ..localization.settings import CoarseToFineSettings
-from ..localization.verification import verify
+from ..localization.verification import match_beside, verify
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .frames import (
@@ -54,6 +55,8 @@ from .places import (
     query_near,
 )
 
+Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
+NUM_QUERIES = 4  # are kept, of the frames that were asked for last
 ELSEWHERE = SAME_PLACE + 2.0 * REACH_SLACK  # [m] a camera of so long a reach may be at another place
 
 
@@ -89,6 +92,8 @@ class Tracker:
         self.workers = workers
         self.motion: Motion = motion
         self.lattice: Lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
+        self.read: Read = lambda k: None  # until somebody keeps the pictures
+        self.queries: dict[int, Query] = {}  # by the number of the frame
         self.found_at: float = -math.inf  # time when the camera was found last, or searched first
         self.next_search: float = 0.0  # [m] that it may have gone since, when it is searched everywhere
 
@@ -116,6 +121,7 @@ class Tracker:
     def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
         """Localize the next frame, whose query is prepared."""
         frame = Frame(time, odometry=odometry)
+        self._keep(len(self.frames), query)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             is_known = odometry is not None or not self.frames
             is_far = not is_known and self.motion.reach(time - self.frames[-1].time) > ELSEWHERE
@@ -157,8 +163,7 @@ class Tracker:
         if key is None:
             return
         since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
-        near = [(self.frames[k], self._pose_since(k)) for k in since[:-3:-1]]
-        found = find_near(query, expect(frame, near, self.motion))
+        found = self.find(query, frame, [(k, self._pose_since(k)) for k in since[:-3:-1]])
         if found is None:
             return
         frame.states = [found.state]
@@ -166,6 +171,29 @@ class Tracker:
         if found.how == "tracked":
             frame.arrived = found.state.pose
             frame.key = key
+
+    def find(self, query: Query, frame: Frame, near: Sequence[tuple[int, Pose]]) -> Found | None:
+        """Find a frame from others, the last of them first, by their numbers and poses."""
+        if has_own_matches(query):
+            others = [(other, pose) for k, pose in near if (other := self.query_of(k))]
+            beside = [match_beside(query, other, pose) for other, pose in others]
+            query = replace(query, beside=merge_matches([NO_MATCHES, *beside]))
+        return find_near(query, expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion))
+
+    def query_of(self, k: int) -> Query | None:
+        """Return the query of an earlier frame; None if its picture can't be read or shows nothing."""
+        if k not in self.queries:
+            panorama = self.read(k)
+            if panorama is None or not panorama.is_valid.any():
+                return None
+            self._keep(k, self.prepare(panorama))
+        return self.queries[k]
+
+    def _keep(self, k: int, query: Query) -> None:
+        """Keep the query of a frame among the last few."""
+        self.queries[k] = query
+        for old in list(self.queries)[:-NUM_QUERIES]:
+            del self.queries[old]
 
     def _last_key(self) -> int | None:
         """Return the number of the last key frame that can be tracked from."""
@@ -349,10 +377,11 @@ def has_own_matches(query: Query) -> bool:
 def assess_end(query: Query, end: Hypothesis) -> Standing:
     """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
 
-    Matches that put the photo elsewhere do not count.
+    Matches do not count if they put the photo elsewhere, with photos beside or without.
     """
+    standing = assess_poses(query if has_own_matches(query) else replace(query, num_parts=0), end, [])[0]
     if not has_own_matches(query):
-        return assess_poses(replace(query, num_parts=0), end, [])[0]
-    standing = assess_poses(query, end, [])[0]
-    is_here = distance(verify(query, end.pose).pose, end.pose) < MAX_DISTANCE
-    return standing if is_here else standing._replace(num_matches=0)
+        return standing
+    found = [verify(some, end.pose) for some in (query, replace(query, beside=NO_MATCHES))]
+    counts = [v.num_matches for v in found if distance(v.pose, end.pose) < MAX_DISTANCE]
+    return standing._replace(num_matches=max(counts, default=0))
