@@ -259,8 +259,8 @@ def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
     taken = _narrow(query)
     here = Hypothesis(true, 0.5)
     alone = tracker.assess_end(taken, here).num_matches
-    more = taken.seen().keypoints.take(np.arange(40))
-    others = verification.match_located(taken, more, np.full(40, 2.0, np.float32), true)
-    assert tracker.assess_end(replace(taken, beside=others), here).num_matches > alone
+    more = taken.seen().keypoints.take(np.arange(2 * alone))
+    others = verification.match_located(taken, more, np.full(2 * alone, 2.0, np.float32), true)
+    assert tracker.assess_end(replace(taken, beside=(others,)), here).num_matches > alone
     away = others._replace(points=others.points + np.float32(0.5))
-    assert tracker.assess_end(replace(taken, beside=away), here).num_matches == alone
+    assert tracker.assess_end(replace(taken, beside=(away,)), here).num_matches == alone

@@ -15,7 +15,7 @@ from ..geometry.pose import Array, Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
-from ..local_features.matching import NO_MATCHES, Matches, join_matches, match
+from ..local_features.matching import Matches, join_matches, match
 from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere, view_around
 from ..panorama import Panorama
 from ..panorama.edges import draw_edges, soften
@@ -127,7 +127,7 @@ class Query:
     cache: Cache
     num_parts: int  # of the features that are matched; 0 with whole views alone
     rotations: Array  # (N, 3, 3) camera from map, that are searched in place of those of the settings; N >= 0
-    beside: Matches = NO_MATCHES  # with photos beside this one, whose poses are known
+    beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
 
     @cached_property
     def keypoints(self) -> Keypoints:

@@ -50,15 +50,15 @@ def count_agreeing(query: Query, pose: Pose) -> int:
 
 
 def verify(query: Query, pose: Pose) -> Verified:
-    """Find the pose that most matches near a pose agree with, and count the features that do.
+    """Find the pose that most matches near a pose agree with, and count these.
 
-    These are matches with the scan drawn there, and with the photos beside.
+    They are matches with the scan drawn there, and with each of the photos beside: it counts which has most.
     """
-    matches = merge_matches([matches_near(query, pose), query.beside])
-    found = exact_pose(matches, pose, None)
+    pictures = [matches_near(query, pose), *query.beside]
+    found = exact_pose(merge_matches(pictures), pose, None)
     if found is None:
         return Verified(pose, 0)
-    return Verified(found.pose, count_matches(matches, found.pose, COS_AGREE))
+    return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
 
 
 def is_near(pose: Pose, other: Pose) -> bool:

@@ -14,7 +14,6 @@ from ..geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..local_features.matching import NO_MATCHES, merge_matches
 from ..localization.attempts import brief_query, is_whole
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
@@ -176,8 +175,7 @@ class Tracker:
         """Find a frame from others, the last of them first, by their numbers and poses."""
         if has_own_matches(query):
             others = [(other, pose) for k, pose in near if (other := self.query_of(k))]
-            beside = [match_beside(query, other, pose) for other, pose in others]
-            query = replace(query, beside=merge_matches([NO_MATCHES, *beside]))
+            query = replace(query, beside=tuple(match_beside(query, *other) for other in others))
         return find_near(query, expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion))
 
     def query_of(self, k: int) -> Query | None:
@@ -382,6 +380,6 @@ def assess_end(query: Query, end: Hypothesis) -> Standing:
     standing = assess_poses(query if has_own_matches(query) else replace(query, num_parts=0), end, [])[0]
     if not has_own_matches(query):
         return standing
-    found = [verify(some, end.pose) for some in (query, replace(query, beside=NO_MATCHES))]
+    found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
     counts = [v.num_matches for v in found if distance(v.pose, end.pose) < MAX_DISTANCE]
     return standing._replace(num_matches=max(counts, default=0))
