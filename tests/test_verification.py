@@ -96,6 +96,15 @@ def test_what_moves_with_the_camera_is_no_match():
     assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
 
 
+def test_a_mirrored_photo_has_no_matches_beside():
+    """It has some without that rule, as many things are symmetric."""
+    taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
+    mirrored = prepare_query(taken, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    own, others = (query.seen().keypoints for query in (mirrored, _beside()[0]))
+    assert len(match_pictures(own, others)[0]) > 0
+    assert match_beside(mirrored, *_beside()) is NO_MATCHES
+
+
 def test_the_picture_with_the_most_matches_counts(monkeypatch):
     query = replace(_query(), beside=(match_beside(_query(), *_beside()), NO_MATCHES))
     drawn, together = (verify(q, _true_pose()) for q in (_query(), query))

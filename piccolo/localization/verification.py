@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..local_features.hypotheses import count_matches, exact_pose
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
-from ..local_features.matching import Matches, merge_matches
+from ..local_features.matching import NO_MATCHES, Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView
 from ..local_features.view_image import ViewImage, render_gray
 from .query import Query
@@ -88,13 +88,17 @@ def match_drawn(query: Query, pose: Pose) -> Matches:
 def match_beside(query: Query, other: Query, pose: Pose) -> Matches:
     """Match a photo's features with those of another photo that was taken at a pose in the map.
 
-    What both show in the same direction is left out: it may be carried along, as dirt on a lens is.
+    What both show in the same direction is left out: it may be carried along, as dirt on a lens is. A photo
+    whose mirror image has more matches has none.
     """
     views, keypoints = other.seen()
+    own = query.seen().keypoints
+    if len(match_pictures(own.mirror(), keypoints)[0]) > len(match_pictures(own, keypoints)[0]):
+        return NO_MATCHES
     ranges = np.zeros(len(keypoints.rays), np.float32)
     for view in views:
-        own = view.find_own(keypoints.rays)
-        ranges[own] = draw(other, pose, view)[0].ranges[view.project(keypoints.rays[own])]
+        shown = view.find_own(keypoints.rays)
+        ranges[shown] = draw(other, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
     is_seen = np.flatnonzero(ranges > 0.0)
     matches = match_located(query, keypoints.take(is_seen), ranges[is_seen], pose)
     rays_of_other = rotate_points(matches.directions.astype(np.float64), pose.R_cam_from_world)
