@@ -104,7 +104,8 @@ class Walk:
     def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
         """Read a frame and prepare what does not depend on other frames; another thread may do it.
 
-        Of a live camera, one thread prepares frames and another follows them: open the scan with one thread.
+        Of a live camera, one thread prepares frames and another follows them. Two cores do most with a scan
+        that was opened with one thread.
         """
         watch = Stopwatch()
         name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
@@ -118,7 +119,7 @@ class Walk:
                 if isinstance(frame, np.ndarray):
                     raise
                 failure = Failure(text.replace(str(frame), name), is_passing)
-                digest = sha256_of(Path(frame), self.read_options.rig)
+                digest = self._digest(frame)
                 return Prepared(frame, Taken(name, None, watch.seconds, (), digest, failure), None, None)
         with watch.stage("prepare"):
             query = self.tracker.prepare(panorama)
@@ -163,7 +164,7 @@ class Walk:
         kept = convert(json.loads(line), Kept, dec_hook=lambda _, rows: np.array(rows))
         taken = kept.taken
         found = taken.name, kept.frame.time, taken.sha256
-        is_same = found == (name, time, sha256_of(picture, self.read_options.rig))
+        is_same = found == (name, time, self._digest(picture))
         if not is_same or (taken.failure and taken.failure.is_passing):
             return False
         self.pictures.append(picture)
@@ -187,9 +188,17 @@ class Walk:
         return self._result(self.taken[number], add_places(self.tracker.scan_map, found), walk)
 
     def _panorama(self, k: int) -> Panorama | None:
-        if self.taken[k].failure is not None:
-            return None
-        return replace(read_photo(self.pictures[k], self.read_options), focal_prior=None)
+        """Return the picture of an earlier frame; None if it can't be read, or is another now."""
+        picture = self.pictures[k]
+        taken = self.taken[k]
+        with reading_once():
+            is_same = isinstance(picture, np.ndarray) or self._digest(picture) == taken.sha256
+            if taken.failure is not None or not is_same:
+                return None
+            return replace(read_photo(picture, self.read_options), focal_prior=None)
+
+    def _digest(self, picture: str | PathLike[str]) -> str | None:
+        return sha256_of(Path(picture), self.read_options.rig)
 
     def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
         """Return the result of a frame; a frame that can't be read keeps its place in the walk."""

@@ -10,7 +10,7 @@ from piccolo.walk import second_look
 from piccolo.walk.beliefs import NOTHING, Belief
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
-from piccolo.walk.path import EVEN, Path
+from piccolo.walk.path import Path
 from piccolo.walk.tracker import Found, expect
 
 TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
@@ -109,4 +109,3 @@ def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is
     tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
     path = Path([np.array(probabilities)], [None])
     assert second_look._list_rough(tracker, path, 0) == listed
-    assert sum(probabilities) < EVEN or path.choose(0) is not None

@@ -11,9 +11,11 @@ from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization import refinement, verification
-from piccolo.localization.attempts import CHANCE_MATCHES, brief_query
+from piccolo.localization.attempts import brief_query
+from piccolo.localization.comparison import score_pose
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization.verification import CHANCE_MATCHES
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
@@ -216,9 +218,10 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
     true = seen[1]
     here = tracker.assess_end(taken, Hypothesis(true, 0.5))
     assert here.num_matches > CHANCE_MATCHES
-    beside = tracker.assess_end(taken, Hypothesis(_off(true, 0.25, 0.0), 0.5))
-    assert beside.num_matches == 0
-    assert log_odds(here) > log_odds(beside)
+    for metres, degrees in ((0.25, 0.0), (0.0, 6.0)):
+        elsewhere = tracker.assess_end(taken, Hypothesis(_off(true, metres, degrees), 0.5))
+        assert elsewhere.num_matches == 0
+    assert log_odds(here) > log_odds(elsewhere)
     assert tracker.assess_end(seen[0], Hypothesis(true, 0.5)).num_matches is None
     assert tracker.assess_end(replace(taken, num_parts=0), Hypothesis(true, 0.5)).num_matches is None
 
@@ -232,26 +235,50 @@ def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, 
     assert (track(query, true) is not None) == is_found
 
 
-def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen):
-    """Their queries are kept, or prepared again; a whole photo has no use for them."""
-    query, true = seen
-    taken = _narrow(query)
-    frames, asked = [Frame(0.5 * k) for k in range(6)], []
+@pytest.fixture
+def follower(seen):
+    """A tracker with some frames, all with the same narrow photo; and the numbers whose pictures are read."""
+    query = seen[0]
+    taken, asked = _narrow(query).photo.given, []
     follower = tracker.Tracker(query.scan_map, query.settings, Workers(2), Motion())
-    follower.lattice.frames.extend(frames)
-    follower.read = lambda k: asked.append(k) or taken.photo.given
-    beside = _off(true, 0.5, 0.0)
-    near = [(4, beside), (3, beside)]
-    alone = follower.find(query, Frame(3.0), near)
-    assert asked == []
-    assert alone.state.score == pytest.approx(find_near(query, _expected(beside, 0.5)).state.score)
-    for _ in range(2):
-        follower.find(taken, Frame(3.0), near)
-    assert asked == [4, 3]
-    assert [follower.query_of(k) is None for k in range(6)] == [False] * 6
-    assert len(follower.queries) == tracker.NUM_QUERIES
-    follower.read = lambda k: None
-    assert follower.query_of(0) is None
+    follower.lattice.frames.extend(Frame(0.5 * k) for k in range(6))
+    follower.read = lambda k: asked.append(k) or taken
+    return follower, asked
+
+
+def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen, follower, monkeypatch):
+    """A whole photo is not."""
+    query, true = seen
+    near = [(4, _off(true, 0.5, 0.0)), (3, _off(true, 0.4, 0.0))]
+    given = []
+    monkeypatch.setattr(tracker, "find_near", lambda query, expected: given.append((query, expected)))
+    monkeypatch.setattr(tracker, "match_beside", lambda *given: given)
+    taken = _narrow(query)
+    for photo in (query, taken):
+        follower[0].find(photo, Frame(3.0), near)
+    assert follower[1] == [4, 3]
+    assert given[0][0].beside == ()
+    assert [own is taken for own, _, _ in given[1][0].beside] == [True, True]
+    poses = [pose for _, _, pose in given[1][0].beside]
+    assert poses[0] is near[0][1]
+    assert poses[1] is near[1][1]
+    assert all(expected.last is near[0][1] for _, expected in given)
+
+
+def test_the_queries_of_narrow_photos_asked_for_last_are_kept(seen, follower):
+    """Each is as new: what was found with it before has no part in what is found later."""
+    walk, asked = follower
+    for k in (0, 1, 2, 3, 0, 4, 0, 1):
+        query = walk.query_of(k)
+        assert query.cache.comparisons == {}
+        score_pose(query, seen[1])
+    assert asked == [0, 1, 2, 3, 4, 1]
+    assert len(walk.queries) == tracker.NUM_QUERIES
+    walk.read = lambda k: rooms.as_panorama(rooms.query(SEED).rgb)
+    assert walk.query_of(5) is not None
+    assert 5 not in walk.queries, "it is whole"
+    walk.read = lambda k: None
+    assert walk.query_of(5) is None
 
 
 def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):

@@ -197,7 +197,7 @@ def compare_cells(
 def compare(query: Query, pose: Pose, seen_from: Pose | None = None) -> Comparison:
     """Compare the scan as seen from a pose with the photo, by blocks; cached by the pose.
 
-    `seen_from` is a pose so near that it sees the same, and whose view is known.
+    `seen_from` is a pose so near that it sees the same, and whose view is known; the first one holds.
     """
     kept = query.cache.comparisons
     if pose.key not in kept:

@@ -140,12 +140,12 @@ def perturb_middle(query: Query, pose: Pose) -> Fit:
 def refine_on_middle_cells(query: Query, pose: Pose) -> tuple[Pose, Pose]:
     """Descend from a pose, and from poses around the end for as long as the score on fine cells rises.
 
-    Nothing is gained if they all lead back to the end. Return also the pose whose view the last cells are.
+    Nothing is gained if they all lead back to the end. Return also the pose from which its cells were seen.
     """
     end = seen_from = descend_middle(query, pose).pose
-    other = perturb_middle(query, end).pose
     fit = descend_fine(query, end)
     for _ in range(MAX_PERTURBATIONS):
+        other = perturb_middle(query, end).pose
         if math.dist(other.center_world, end.center_world) < PLACE_SPACING:
             break
         around = descend_fine(query, other)
@@ -155,7 +155,6 @@ def refine_on_middle_cells(query: Query, pose: Pose) -> tuple[Pose, Pose]:
         if gain < MIN_GAIN * around.score:
             break
         end = fit.pose
-        other = perturb_middle(query, end).pose
     return fit.pose, seen_from
 
 

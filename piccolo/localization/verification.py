@@ -26,12 +26,13 @@ AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose 
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = math.cos(math.radians(2.0))
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
+CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NEAR = 0.3  # [m] matches with which a pose moves farther are another pose's
 NEAR_TURN = math.radians(5.0)
 
 
 class Verified(NamedTuple):
-    """A pose refined on the matches with the scan drawn near it, and the number that agree with it."""
+    """A pose refined on the matches near it, and the number that agree with it."""
 
     pose: Pose
     num_matches: int
@@ -40,8 +41,8 @@ class Verified(NamedTuple):
 def count_agreeing(query: Query, pose: Pose) -> int:
     """Count the photo's local features that agree with a pose.
 
-    Features of a photo of a part of the sphere are matched with the scan drawn at the pose, those of others
-    with the map's features.
+    Features of a photo of a part of the sphere are matched with the scan drawn at the pose and with photos
+    beside, those of others with the map's features.
     """
     if not (query.photo.is_partial and query.num_parts):
         return count_matches(query.matches, pose)
@@ -52,19 +53,21 @@ def count_agreeing(query: Query, pose: Pose) -> int:
 def verify(query: Query, pose: Pose) -> Verified:
     """Find the pose that most matches near a pose agree with, and count these.
 
-    They are matches with the scan drawn there, and with each of the photos beside: it counts which has most.
+    They are matches with the scan drawn there, and with each of the photos beside. These only show how the
+    photos lie to each other: where the scan has more than chance too, it counts which has most.
     """
     pictures = [matches_near(query, pose), *query.beside]
     found = exact_pose(merge_matches(pictures), pose, None)
     if found is None:
         return Verified(pose, 0)
-    return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
+    counts = [count_matches(matches, found.pose, COS_AGREE) for matches in pictures]
+    return Verified(found.pose, max(counts) if counts[0] > CHANCE_MATCHES else counts[0])
 
 
-def is_near(pose: Pose, other: Pose) -> bool:
-    """Return True if two poses are so near each other that they are one place."""
+def is_near(pose: Pose, other: Pose, most: float = NEAR) -> bool:
+    """Return True if two poses are so near each other, at most so far [m], that they are one place."""
     turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
-    return bool(turn < NEAR_TURN and math.dist(pose.center_world, other.center_world) < NEAR)
+    return bool(turn < NEAR_TURN and math.dist(pose.center_world, other.center_world) < most)
 
 
 def matches_near(query: Query, pose: Pose) -> Matches:

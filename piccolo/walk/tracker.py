@@ -20,11 +20,11 @@ from ..localization.covariance import estimate_covariance
 from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY, settle
 from ..localization.localize import localize
 from ..localization.prior import apply_prior
-from ..localization.query import Query, prepare_query
+from ..localization.query import Cache, Query, prepare_query
 from ..localization.refinement import descend, refine_on_middle_cells
 from ..localization.selection import SURE_SCORE, assess_poses
 from ..localization.settings import CoarseToFineSettings
-from ..localization.verification import match_beside, verify
+from ..localization.verification import is_near, match_beside, verify
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .frames import (
@@ -76,7 +76,7 @@ class Found(NamedTuple):
 
 
 class Tracker:
-    """The forward half of a walk: it uses past frames only, and keeps their poses."""
+    """The forward half of a walk: `add` uses past frames only, and keeps their poses."""
 
     def __init__(
         self,
@@ -120,8 +120,8 @@ class Tracker:
     def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
         """Localize the next frame, whose query is prepared."""
         frame = Frame(time, odometry=odometry)
-        self._keep(len(self.frames), query)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
+            self._keep(len(self.frames), query)
             is_known = odometry is not None or not self.frames
             is_far = not is_known and self.motion.reach(time - self.frames[-1].time) > ELSEWHERE
             if not is_far:
@@ -179,17 +179,20 @@ class Tracker:
         return find_near(query, expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion))
 
     def query_of(self, k: int) -> Query | None:
-        """Return the query of an earlier frame; None if its picture can't be read or shows nothing."""
-        if k not in self.queries:
+        """Return a frame's query, as new; None if its picture can't be read or shows nothing."""
+        query = self.queries.pop(k, None)
+        if query is None:
             panorama = self.read(k)
             if panorama is None or not panorama.is_valid.any():
                 return None
-            self._keep(k, self.prepare(panorama))
-        return self.queries[k]
+            query = self.prepare(panorama)
+        self._keep(k, query)
+        return replace(query, cache=Cache(query.cache.views))
 
     def _keep(self, k: int, query: Query) -> None:
-        """Keep the query of a frame among the last few."""
-        self.queries[k] = query
+        """Keep the query of a narrow photo among the last few."""
+        if has_own_matches(query):
+            self.queries[k] = query
         for old in list(self.queries)[:-NUM_QUERIES]:
             del self.queries[old]
 
@@ -340,7 +343,7 @@ def distance(pose: Pose, other: Pose) -> float:
 def track(query: Query, start: Pose) -> State | None:
     """Descend from a pose and around; None if the end more likely is wrong than right, or explains nothing.
 
-    A narrow photo is tracked again from where its matches with the scan drawn there put it.
+    A narrow photo is tracked again from where its matches put it.
     """
     end = descend_last(query, *refine_on_middle_cells(query, start))
     if has_own_matches(query):
@@ -377,9 +380,9 @@ def assess_end(query: Query, end: Hypothesis) -> Standing:
 
     Matches do not count if they put the photo elsewhere, with photos beside or without.
     """
-    standing = assess_poses(query if has_own_matches(query) else replace(query, num_parts=0), end, [])[0]
+    standing = assess_poses(replace(query, num_parts=0), end, [])[0]
     if not has_own_matches(query):
         return standing
     found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
-    counts = [v.num_matches for v in found if distance(v.pose, end.pose) < MAX_DISTANCE]
-    return standing._replace(num_matches=max(counts, default=0))
+    own = [v.num_matches for v in found if is_near(v.pose, end.pose, MAX_DISTANCE)]
+    return standing._replace(num_matches=max(own, default=0), is_drawn=True)
