@@ -11,11 +11,10 @@ from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization import refinement, verification
-from piccolo.localization.attempts import brief_query
+from piccolo.localization.attempts import CHANCE_MATCHES, brief_query
 from piccolo.localization.comparison import score_pose
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.localization.verification import CHANCE_MATCHES
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
@@ -241,15 +240,16 @@ def follower(seen):
     query = seen[0]
     taken, asked = _narrow(query).photo.given, []
     follower = tracker.Tracker(query.scan_map, query.settings, Workers(2), Motion())
-    follower.lattice.frames.extend(Frame(0.5 * k) for k in range(6))
+    odds = (4.0, 4.0, 4.0, tracker.MOST_EXPECTED, 4.0, 2.9)
+    follower.lattice.frames.extend(Frame(0.5 * k, [State(seen[1], o)]) for k, o in enumerate(odds))
     follower.read = lambda k: asked.append(k) or taken
     return follower, asked
 
 
 def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen, follower, monkeypatch):
-    """A whole photo is not."""
+    """If these are sure by themselves; a whole photo is not."""
     query, true = seen
-    near = [(4, _off(true, 0.5, 0.0)), (3, _off(true, 0.4, 0.0))]
+    near = [(5, _off(true, 0.6, 0.0)), (4, _off(true, 0.5, 0.0)), (3, _off(true, 0.4, 0.0))]
     given = []
     monkeypatch.setattr(tracker, "find_near", lambda query, expected: given.append((query, expected)))
     monkeypatch.setattr(tracker, "match_beside", lambda *given: given)
@@ -260,8 +260,8 @@ def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen, follow
     assert given[0][0].beside == ()
     assert [own is taken for own, _, _ in given[1][0].beside] == [True, True]
     poses = [pose for _, _, pose in given[1][0].beside]
-    assert poses[0] is near[0][1]
-    assert poses[1] is near[1][1]
+    assert poses[0] is near[1][1]
+    assert poses[1] is near[2][1]
     assert all(expected.last is near[0][1] for _, expected in given)
 
 

@@ -26,7 +26,7 @@ from .refinement import FIRST_ITERATIONS, descend_all, refine, refine_matches
 from .search import SearchedGravity, Starts, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
-from .verification import CHANCE_MATCHES, verify
+from .verification import verify
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_STARTS = 300  # few are enough for a clear photo
@@ -36,6 +36,7 @@ FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searche
 NUM_SCORED = 64  # starts, if only the best score is needed
 NUM_VERIFIED = 7  # alternatives of the best pose that are verified
 ENOUGH_MATCHES = 40  # of a part of the features: the others are not asked
+CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NUM_MATCHED = 6  # poses from matches that are refined
 
 Found = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless

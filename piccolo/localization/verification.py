@@ -26,7 +26,6 @@ AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose 
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = math.cos(math.radians(2.0))
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
-CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NEAR = 0.3  # [m] matches with which a pose moves farther are another pose's
 NEAR_TURN = math.radians(5.0)
 
@@ -53,15 +52,14 @@ def count_agreeing(query: Query, pose: Pose) -> int:
 def verify(query: Query, pose: Pose) -> Verified:
     """Find the pose that most matches near a pose agree with, and count these.
 
-    They are matches with the scan drawn there, and with each of the photos beside. These only show how the
-    photos lie to each other: where the scan has more than chance too, it counts which has most.
+    They are matches with the scan drawn there, and with each of the photos beside: the one with most counts.
+    Photos beside are as right as their own poses.
     """
     pictures = [matches_near(query, pose), *query.beside]
     found = exact_pose(merge_matches(pictures), pose, None)
     if found is None:
         return Verified(pose, 0)
-    counts = [count_matches(matches, found.pose, COS_AGREE) for matches in pictures]
-    return Verified(found.pose, max(counts) if counts[0] > CHANCE_MATCHES else counts[0])
+    return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
 
 
 def is_near(pose: Pose, other: Pose, most: float = NEAR) -> bool:
@@ -144,20 +142,20 @@ def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoin
     return found.take(is_seen), ranges[is_seen]
 
 
-def match_pictures(own: Keypoints, drawn: Keypoints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def match_pictures(own: Keypoints, others: Keypoints) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Match each feature with the most similar one, unless another elsewhere is nearly as similar.
 
     Squared distances of 8-bit descriptors are whole numbers, exact in float32 by any matrix product.
     """
-    if not len(own.rays) or not len(drawn.rays):
+    if not len(own.rays) or not len(others.rays):
         nothing = np.empty(0, np.intp)
         return nothing, nothing
     a = own.descriptors.astype(np.float32)
-    b = drawn.descriptors.astype(np.float32)
+    b = others.descriptors.astype(np.float32)
     distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
     nearest = distances.argmin(axis=1)
     best = distances[np.arange(len(a)), nearest]
-    is_same = sum(np.multiply.outer(one[nearest], one) for one in drawn.rays.T) > COS_ELSEWHERE
+    is_same = sum(np.multiply.outer(one[nearest], one) for one in others.rays.T) > COS_ELSEWHERE
     distances[is_same] = np.inf
     is_distinct = best < DISTINCT_RATIO**2 * distances.min(axis=1)
     return np.flatnonzero(is_distinct), nearest[is_distinct]

@@ -172,9 +172,13 @@ class Tracker:
             frame.key = key
 
     def find(self, query: Query, frame: Frame, near: Sequence[tuple[int, Pose]]) -> Found | None:
-        """Find a frame from others, the last of them first, by their numbers and poses."""
+        """Find a frame from others, the last of them first, by their numbers and poses.
+
+        A narrow photo is matched with those of them that are sure by themselves.
+        """
         if has_own_matches(query):
-            others = [(other, pose) for k, pose in near if (other := self.query_of(k))]
+            sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= MOST_EXPECTED]
+            others = [(other, pose) for k, pose in sure if (other := self.query_of(k))]
             query = replace(query, beside=tuple(match_beside(query, *other) for other in others))
         return find_near(query, expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion))
 
