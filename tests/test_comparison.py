@@ -123,6 +123,19 @@ def test_the_true_pose_explains_more_than_others():
         assert wrong.compute_ratio(seen) < 0.5
 
 
+def test_what_is_seen_from_a_pose_near_is_placed_as_it_is():
+    """A view of 2 cm beside is compared from the pose itself: no shift; it is not rendered again."""
+    seen, true_pose = _clean()
+    beside = Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.015, -0.012, 0.0]))
+    query = _query(rooms.query(1).rgb)
+    query.view_at(beside, query.method.fine_view)
+    found = compare(query, true_pose, beside)
+    assert query.cache.views.averages.cache_info().misses == 1
+    assert found.score == pytest.approx(seen.score, abs=0.02)
+    assert found.score != seen.score
+    assert compare(query, true_pose) is found
+
+
 @pytest.mark.parametrize("fraction", [0.2, 0.5])
 def test_an_occluder_costs_what_it_hides(fraction):
     seen, true_pose = _clean()
