@@ -306,15 +306,14 @@ def test_frames_come_back_from_their_lines(scan, building):
 
 def test_a_narrow_walk_goes_on_with_the_same_bits(building, tmp_path):
     """Frames are matched with those before, which are read again; with any number of threads."""
-    folder, queries = building[0], building[1][:5]
-    mask = np.full((rooms.WIDTH // 2, rooms.WIDTH), 255, np.uint8)
-    mask[:, rooms.WIDTH // 3 : -rooms.WIDTH // 3] = 0
-    cv2.imwrite(str(tmp_path / "mask.png"), mask)
+    folder, queries = building
+    is_hidden = abs(np.linspace(-1.0, 1.0, rooms.WIDTH)) > 0.33
+    cv2.imwrite(str(tmp_path / "mask.png"), np.uint8(255) * np.tile(is_hidden, (rooms.WIDTH // 2, 1)))
     ends, lines = [], []
     for num_threads, num_kept in ((2, 0), (1, 2)):
         scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=num_threads)
         walk = scan.track(gravity="known", mask=tmp_path / "mask.png")
-        for k, query in enumerate(queries):
+        for k, query in enumerate(queries[:5]):
             if k < num_kept:
                 assert walk.restore(lines[k].encode(), query.image, query.time, query.image.name)
             else:
@@ -322,21 +321,7 @@ def test_a_narrow_walk_goes_on_with_the_same_bits(building, tmp_path):
             lines.append(walk.last_to_json())
         ends.append([{**json.loads(result.to_json()), "seconds": None} for result in walk.finish()])
     assert ends[0] == ends[1]
-    assert [end["status"] for end in ends[0]].count("localized") >= 3
-    assert [end["walk"]["how"] for end in ends[0]].count("tracked") >= 3
-
-
-def test_a_frame_that_is_gone_or_another_is_not_read_again(scan, building, tmp_path):
-    path = tmp_path / "latest.png"
-    path.write_bytes(building[1][0].image.read_bytes())
-    walk = scan.track(gravity="known")
-    walk.add(path, 0.0)
-    np.testing.assert_array_equal(walk.tracker.read(0).rgb, cv2.imread(str(path))[..., ::-1])
-    path.write_bytes(building[1][1].image.read_bytes())
-    assert walk.tracker.read(0) is None
-    path.unlink()
-    assert walk.tracker.read(0) is None
-    assert [result.status for result in walk.finish()] == ["localized"]
+    assert [(end["status"], end["walk"]["how"]) for end in ends[0]].count(("localized", "tracked")) >= 2
 
 
 def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys):

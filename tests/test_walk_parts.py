@@ -1,8 +1,11 @@
-"""Parts of a walk: positions smoothed together, times from names, tables and EXIF."""
+"""Parts of a walk: positions smoothed together, times from names, tables and EXIF, frames read again."""
 
+import cv2
 import numpy as np
 import pytest
+from rooms import write_room
 
+import piccolo
 from piccolo.batch.frame_times import times_of
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError
@@ -93,3 +96,18 @@ def test_times_by_names_tables_and_exif(tmp_path):
         times_of([tmp_path / "walk.jpg"], "names")
     with pytest.raises(InputError, match=r"^`times` exif: found a frame without a time in EXIF"):
         times_of(frames, "exif")
+
+
+def test_a_frame_that_is_gone_or_another_is_not_read_again(tmp_path):
+    folder = write_room(tmp_path, "--seed 3 --points 40000 --panoramas 2 --width 512 --variants clean")
+    pictures = [path.read_bytes() for path in sorted((folder / "images").iterdir())]
+    path = tmp_path / "latest.png"
+    path.write_bytes(pictures[0])
+    walk = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=2).track(gravity="known")
+    walk.add(path, 0.0)
+    np.testing.assert_array_equal(walk.tracker.read(0).rgb, cv2.imread(str(path))[..., ::-1])
+    path.write_bytes(pictures[1])
+    assert walk.tracker.read(0) is None
+    path.unlink()
+    assert walk.tracker.read(0) is None
+    assert [result.status for result in walk.finish()] == ["localized"]

@@ -151,7 +151,8 @@ def refine_on_middle_cells(query: Query, pose: Pose) -> tuple[Pose, Pose]:
         around = descend_fine(query, other)
         gain = around.score - fit.score
         if gain > 0.0:
-            fit, seen_from = around, other
+            fit = around
+            seen_from = other
         if gain < MIN_GAIN * around.score:
             break
         end = fit.pose
