@@ -59,7 +59,8 @@ def test_gradients_as_left_out_are_those_at_the_pose_without_the_block():
 
 def test_hessian_predicts_the_gradient_a_step_away(found):
     prepared, pose, _ = found
-    points, image = _points(prepared, pose), prepared.photo.images.full()
+    points = _points(prepared, pose)
+    image = prepared.photo.images.full()
     levels = covariance.to_levels(points.channels)
     problem = ChannelProblem(
         points.offsets, levels, points.weights, image.rgbx, image.width, covariance.SCALE

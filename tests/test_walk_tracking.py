@@ -238,7 +238,8 @@ def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, 
 def follower(seen):
     """A tracker with some frames, all with the same narrow photo; and the numbers whose pictures are read."""
     query = seen[0]
-    taken, asked = _narrow(query).photo.given, []
+    taken = _narrow(query).photo.given
+    asked = []
     follower = tracker.Tracker(query.scan_map, query.settings, Workers(2), Motion())
     odds = (4.0, 4.0, 4.0, tracker.MOST_EXPECTED, 4.0, 2.9)
     follower.lattice.frames.extend(Frame(0.5 * k, [State(seen[1], o)]) for k, o in enumerate(odds))

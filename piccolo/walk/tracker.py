@@ -365,10 +365,10 @@ def descend_last(query: Query, start: Pose, seen_from: Pose) -> State:
     pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
     end = score_pose(query, pose, seen_from if distance(pose, seen_from) < NEARLY else None)
     end = settle(query, end) if query.photo.is_partial else end
-    is_near = distance(end.pose, start) < NEARLY  # it sees the same points
+    sees_same = distance(end.pose, start) < NEARLY
     covariance = None
     if end.score >= HOPELESS_SCORE:
-        covariance = estimate_covariance(query, end.pose, seen_from=start if is_near else None)
+        covariance = estimate_covariance(query, end.pose, seen_from=start if sees_same else None)
     probability = float(posterior([assess_end(query, end)], covariance)[0])
     log_odds = log_odds_of_place(probability, probability, covariance)
     return State(end.pose, log_odds, end.score, covariance)
