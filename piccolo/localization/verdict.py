@@ -2,16 +2,17 @@
 
 import math
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, classify, posterior
+from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
+from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
@@ -23,7 +24,7 @@ from .focal_length import FocalFit
 from .prior import contradictions
 from .query import Query
 from .selection import SURE_MATCHES, Selection, assess_poses
-from .verification import count_agreeing
+from .verification import count_agreeing, find_copies
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 MIRROR_RATIO = 1.2  # least ratio of matches, mirrored photo to photo
@@ -58,7 +59,8 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     evidence = collect_evidence(query, found, agreement, fractions)
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = assess_poses(query, found.best, reported)
-    probabilities = posterior(standings, covariance)
+    weighed = credit_copies(query, [h.pose for h in (found.best, *reported)], standings)
+    probabilities = posterior(weighed, covariance)
     warnings = contradictions(query.scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
@@ -82,8 +84,23 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
         warnings,
         cameras=() if fit is None else query.photo.given.cameras,
         focal_length=None if fit is None else fit.focal_length(query.photo.given),
-        standings=tuple(standings),
+        standings=tuple(weighed),
     )
+
+
+def credit_copies(query: Query, poses: Sequence[Pose], standings: Sequence[Standing]) -> list[Standing]:
+    """Credit copies of the best pose's place with as many matches as that has: there would be as many.
+
+    How many a photo has with the scan drawn at each tells how well each was scanned.
+    """
+    most = standings[0].num_matches
+    if not (query.photo.is_partial and most):
+        return list(standings)
+    credited = list(standings)
+    for k, is_copy in enumerate(find_copies(query, poses[0], poses[1:]), 1):
+        if is_copy:
+            credited[k] = standings[k]._replace(num_matches=max(standings[k].num_matches or 0, most))
+    return credited
 
 
 def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:

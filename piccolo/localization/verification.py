@@ -6,6 +6,7 @@ verification of poses (Taira et al., CVPR 2018). Photos beside it in a walk are 
 """
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import cv2
@@ -28,6 +29,14 @@ COS_ELSEWHERE = math.cos(math.radians(2.0))
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 NEAR = 0.3  # [m] matches with which a pose moves farther are another pose's
 NEAR_TURN = math.radians(5.0)
+
+
+class Located(NamedTuple):
+    """Keypoints of a picture at a pose in the map, and how far away what they show is."""
+
+    keypoints: Keypoints
+    ranges: NDArray[np.float32]  # (N,) [m]
+    pose: Pose
 
 
 class Verified(NamedTuple):
@@ -81,9 +90,25 @@ def matches_near(query: Query, pose: Pose) -> Matches:
 
 def match_drawn(query: Query, pose: Pose) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
+    return match_located(query.seen().keypoints, find_all_drawn(query, pose))
+
+
+def find_all_drawn(query: Query, pose: Pose) -> Located:
+    """Draw all that the photo would show at a pose in the map; return the keypoints."""
     parts = [find_drawn(query, pose, view) for view in query.seen().views]
-    drawn = join_keypoints([keypoints for keypoints, _ in parts])
-    return match_located(query, drawn, np.concatenate([ranges for _, ranges in parts]), pose)
+    ranges = np.concatenate([ranges for _, ranges in parts])
+    return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
+
+
+def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
+    """Return True for each of other poses at which the scan looks as at a pose, as in rooms of one kind.
+
+    The scan drawn at the one is matched with the scan drawn at the other.
+    """
+    keypoints = find_all_drawn(query, pose).keypoints
+    matches = [match_located(keypoints, find_all_drawn(query, other)) for other in others]
+    found = [exact_pose(m, other, None) for m, other in zip(matches, others, strict=True)]
+    return [f is not None and is_near(f.pose, other) for f, other in zip(found, others, strict=True)]
 
 
 def match_beside(query: Query, other: Query, pose: Pose) -> Matches:
@@ -101,14 +126,14 @@ def match_beside(query: Query, other: Query, pose: Pose) -> Matches:
         shown = view.find_own(keypoints.rays)
         ranges[shown] = draw(other, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
     is_seen = np.flatnonzero(ranges > 0.0)
-    matches = match_located(query, keypoints.take(is_seen), ranges[is_seen], pose)
+    matches = match_located(own, Located(keypoints.take(is_seen), ranges[is_seen], pose))
     rays_of_other = rotate_points(matches.directions.astype(np.float64), pose.R_cam_from_world)
     return matches.take(np.sum(rays_of_other * matches.rays, axis=1) < COS_AGREE)
 
 
-def match_located(query: Query, others: Keypoints, ranges: NDArray[np.float32], pose: Pose) -> Matches:
-    """Match a photo's features with those of a picture at a pose in the map, whose ranges (N,) are known."""
-    own = query.seen().keypoints
+def match_located(own: Keypoints, picture: Located) -> Matches:
+    """Match keypoints of a photo with those of a picture whose pose is known."""
+    others, ranges, pose = picture
     mine, theirs = match_pictures(own, others)
     R_map_from_cam = pose.R_cam_from_world.T
     directions = rotate_points(others.rays[theirs].astype(np.float64), R_map_from_cam)
