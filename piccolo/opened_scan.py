@@ -1,6 +1,6 @@
 """A scan prepared for a method: `Scan`, the commands and the batches localize photos in it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -21,9 +21,11 @@ from .geometry.colors import Labels
 from .geometry.pose import Pose, check_rotation
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
+from .localization.beside import localize_beside, locate
 from .localization.bundle import localize_bundle
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
+from .localization.verification import Located
 from .panorama import Panorama, ReadOptions, read_photo
 from .panorama.photo import PhotoFacts, sha256_of
 from .paper.localize import PaperMap
@@ -74,15 +76,14 @@ class OpenedScan:
 
         Raises InputError for the preset paper, and for a focal length that is to be refined.
         """
-        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
-            raise InputError("walks: not available with the preset paper")
+        prepared, settings = self.not_of_paper("walks", settings)
         if read_options.refine_focal:
             raise InputError(
                 "`refine_focal`: not an option of walks; refine the focal length with a single photo"
             )
-        check_within(self.prepared, settings.prior.within)
+        check_within(prepared, settings.prior.within)
         quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
-        tracker = Tracker(self.prepared, settings, quiet, motion)
+        tracker = Tracker(prepared, settings, quiet, motion)
         repeated = settings_json(settings, self.cloud_settings, read_options)
         about = WalkAbout(self.name, self.warnings, {**repeated, "walk": motion.to_settings()})
         return Walk(tracker, read_options, about)
@@ -139,6 +140,52 @@ class OpenedScan:
             self._make_result(panorama, picture, photo, found, about, watch.seconds), gps_prior=gps
         )
 
+    def locate(
+        self, panorama: File, result: Result, read_options: ReadOptions, settings: Settings
+    ) -> Located:
+        """Return the keypoints of a photo that is localized, for photos beside it."""
+        if result.best_pose is None:
+            raise ValueError("a photo without a pose")
+        prepared, settings = self.not_of_paper("photos beside others", settings)
+        with reading_once():
+            picture = read_photo(panorama, read_options.with_refined_camera(result.cameras, Path(panorama)))
+        return locate(prepared, picture, self.from_world(result.best_pose), settings, self.workers)
+
+    def localize_again(
+        self,
+        panorama: File,
+        first: Result,
+        pictures: Mapping[str, Located],
+        read_options: ReadOptions,
+        settings: Settings,
+    ) -> Result:
+        """Localize a photo that is not sure, beside others that are, given by their names.
+
+        Returns the `first` result if the second is no surer. A photo whose focal length is a guess is not
+        looked at.
+        """
+        watch = Stopwatch(dict(first.seconds))
+        prepared, settings = self.not_of_paper("photos beside others", settings)
+        with watch.stage("read"), reading_once():
+            picture = read_photo(panorama, read_options)
+            photo = photo_facts(panorama, read_options.rig)
+        if has_guessed_focal(picture):
+            return replace(first, beside=())
+        known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
+        poses = [self.from_world(pose) for pose in known]
+        found, names = localize_beside(prepared, picture, poses, pictures, settings, self.workers, watch)
+        if found.confidence <= first.confidence:
+            return replace(first, beside=())
+        about = settings_json(settings, self.cloud_settings, read_options)
+        result = self._make_result(panorama, picture, photo, found, about, watch.seconds)
+        return replace(result, gps_prior=first.gps_prior, beside=names)
+
+    def not_of_paper(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
+        """Return the map and settings; InputError for the preset paper, which does not have `what`."""
+        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
+            raise InputError(f"{what}: not available with the preset paper")
+        return self.prepared, settings
+
     def localize_bundle(
         self,
         panoramas: Sequence[File | NDArray[np.uint8]],
@@ -152,8 +199,7 @@ class OpenedScan:
         Raises InputError for a photo that can't be read, for the preset paper, and for a focal length that is
         a guess.
         """
-        if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
-            raise InputError("`relative_poses`: not available with the preset paper")
+        prepared, settings = self.not_of_paper("`relative_poses`", settings)
         self.check_options(read_options, settings)
         check_relative_poses(cams_from_bundle)
         if not panoramas:
@@ -164,7 +210,7 @@ class OpenedScan:
             photos = [photo_facts(panorama, read_options.rig) for panorama in panoramas]
         if any(map(has_guessed_focal, pictures)):
             raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
-        found = localize_bundle(self.prepared, pictures, cams_from_bundle, settings, self.workers, watch)
+        found = localize_bundle(prepared, pictures, cams_from_bundle, settings, self.workers, watch)
         about = settings_json(settings, self.cloud_settings, read_options)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
         return [

@@ -26,7 +26,7 @@ from .scan_map.prior import GpsPrior
 from .walk.path import Gap
 from .walk.results import Alone, WalkFrame
 
-FORMAT = "piccolo-pose/9"
+FORMAT = "piccolo-pose/10"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE = "unreadable"
 FAILED = "failed"
@@ -90,6 +90,9 @@ class Result:
         Where the photo's GPS position lies in the scan, if both are known.
     walk
         For a frame of a walk, how its pose was found. Status, pose and covariance are then those of the walk.
+    beside
+        Names of the photos beside which it was found, of one that was not sure alone; empty if it was looked
+        for so in vain, None if it was not.
     seconds
         Time [s] spent on this photo, by stage.
     settings, warnings
@@ -120,6 +123,7 @@ class Result:
     storey: int | None = None
     height_above_floor: float | None = None
     walk: WalkFrame | None = None
+    beside: tuple[str, ...] | None = None
 
     @property
     def is_calibrated(self) -> bool:
@@ -200,6 +204,7 @@ class Result:
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "gps_prior": self.gps_prior and asdict(self.gps_prior),
             "walk": self.walk and _walk_json(self.walk),
+            "beside": None if self.beside is None else list(self.beside),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -211,6 +216,7 @@ class Result:
         """Return the result that `to_json` wrote. Raises InputError for any other text."""
         with document_of(text, FORMAT, "result") as document:
             cloud = document.pop("cloud")
+            beside = document["beside"]
             best = document if document["status"] == LOCALIZED else document["best_guess"]
             matrix = document["covariance"]
             about = document["least_constrained_direction"]
@@ -218,7 +224,7 @@ class Result:
             source = {f.name: document[f.name] for f in fields(Source)}
             size = source.pop("image_size")
             given: dict[str, Any] = {
-                "cloud": cloud if isinstance(cloud, str) else _paths(cloud),
+                "cloud": cloud if isinstance(cloud, str) else _names(cloud),
                 "best_pose": None if best is None else _pose_from_json(best),
                 "source": Source(image_size=size and tuple(size), **source),
                 "cameras": read_mounts(document["camera"]) if document.get("camera") else (),
@@ -229,6 +235,7 @@ class Result:
                 "covariance": None if matrix is None else PoseCovariance(np.array(matrix), about),
                 "height_above_floor": document["height_above_floor_m"],
                 "walk": document["walk"] and _walk_from_json(document["walk"]),
+                "beside": None if beside is None else _names(beside),
                 "warnings": tuple(document["warnings"]),
             }
             plain = {f.name: document[f.name] for f in fields(cls) if f.name not in given}
@@ -327,10 +334,10 @@ def _in(scan: str | None) -> str:
     return f" ({scan})" if scan else ""
 
 
-def _paths(value: object) -> tuple[str, ...]:
-    """Return a list of paths; TypeError for anything else."""
-    if not isinstance(value, list) or not all(isinstance(path, str) for path in value):
-        raise TypeError("a cloud that is neither a path nor a list of paths")
+def _names(value: object) -> tuple[str, ...]:
+    """Return a list of names; TypeError for anything else."""
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise TypeError("neither a name nor a list of names")
     return tuple(value)
 
 

@@ -12,12 +12,14 @@ from typing import Any, NamedTuple
 from .. import __version__
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
+from ..errors import InputError
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.settings import CoarseToFineSettings
+from ..localization.verification import Located
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
@@ -27,6 +29,8 @@ from ..scan_map.open_map import CachePolicy
 from ..views.pictures import encode_image, overlay_png
 from .priors import PriorTable
 
+MOST_PICTURES = 200  # beside which a photo is looked at again: the sure ones nearest in order
+
 
 class Task(NamedTuple):
     """A panorama to be localized."""
@@ -35,6 +39,8 @@ class Task(NamedTuple):
     settings: Settings
     calibration: Calibration | None = None  # the camera of this photo
     files: Mapping[str, bytes] | None = None  # what is at `pano`, where that is not to be seen
+    first: str = ""  # JSON of its result, if it is looked at again
+    beside: tuple[str, ...] = ()  # JSON of the results of photos that are sure, beside which it is looked at
 
     @contextmanager
     def place(self, folder: Path) -> Iterator[Path]:
@@ -95,6 +101,10 @@ class Localizer:
         files = files_of(pano) if self.sends_photos else None
         return Task(pano, self.settings_of(pano), calibration, files)
 
+    def task_again(self, first: str, beside: tuple[str, ...]) -> Task:
+        """Return what is to be done for a panorama that is looked at again; results are JSON."""
+        return self.task(Path(json.loads(first)["pano"]))._replace(first=first, beside=beside)
+
     def settings_of(self, pano: Path) -> Settings:
         """Return the settings of one panorama: its own prior, if it has one."""
         if self.priors is None or not isinstance(self.settings, CoarseToFineSettings):
@@ -115,7 +125,12 @@ class Localizer:
     def open(self) -> Callable[[Task], Answer]:
         """Open the scan in this process; return what answers tasks."""
         limit_memory(self.max_memory)
-        return partial(self.answer, self.open_scan(Workers(self.num_threads)))
+        return self.answer_in(self.open_scan(Workers(self.num_threads)))
+
+    def answer_in(self, scan: OpenedScan) -> Callable[[Task], Answer]:
+        """Return what answers tasks in an opened scan."""
+        locate = lru_cache(MOST_PICTURES)(partial(self.locate, scan))
+        return lambda task: self.answer_again(scan, task, locate) if task.first else self.answer(scan, task)
 
     def open_scan(self, workers: Workers) -> OpenedScan:
         """Read and prepare the scan."""
@@ -128,9 +143,31 @@ class Localizer:
 
     def answer(self, scan: OpenedScan, task: Task) -> Answer:
         """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
+        localize = partial(
+            scan.localize_query, settings=task.settings, is_masked=None, calibration=task.calibration
+        )
+        return self._answer(scan, task, localize)
+
+    def answer_again(self, scan: OpenedScan, task: Task, locate: Callable[[str], Located | None]) -> Answer:
+        """Look at a photo again, beside others; `locate` returns one's keypoints by its result's JSON."""
+        found = {json.loads(line)["pano"]: located for line in task.beside if (located := locate(line))}
+        first = Result.from_json(task.first)
+        localize = partial(scan.localize_again, first=first, pictures=found, settings=task.settings)
+        return self._answer(scan, task, localize)
+
+    def locate(self, scan: OpenedScan, line: str) -> Located | None:
+        """Return the keypoints of a photo by the JSON of its result; None if it can't be read any more."""
+        result = Result.from_json(line)
+        pano = Path(result.pano)
+        with suppress(OSError, InputError):
+            return scan.locate(self.folder / pano, result, self.read_options, self.settings_of(pano))
+        return None
+
+    def _answer(self, scan: OpenedScan, task: Task, localize: Callable[..., Result]) -> Answer:
+        """Return the answer by a function of the photo's path and the options with which it is read."""
         with task.place(self.folder) as path, reading_once():
             try:
-                found = scan.localize_query(path, self.read_options, task.settings, None, task.calibration)
+                found = localize(path, read_options=self.read_options)
                 overlay, mask = self._pictures(scan, path, found)
             except Exception as error:
                 name = str(task.pano)

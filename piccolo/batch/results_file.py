@@ -150,7 +150,7 @@ class Records:
             if lines:
                 self._named.add(str(pano))
                 digest = compute_digest(pano)
-                same = (line for line in lines if digest in (None, line.pano_sha256))
+                same = (line for line in lines[::-1] if digest in (None, line.pano_sha256))
                 taken = next((line for line in same if line.status != FAILED), None)
             self.order.append(taken)
             if taken is None:
@@ -158,19 +158,21 @@ class Records:
             else:
                 lines.remove(taken)
 
-    def finish(self, file: LineFile, keeps_others: bool) -> int:
-        """Put the lines into the order of the panoramas, without older ones of them.
+    def list_spans(self, file: LineFile) -> list[tuple[int, int]]:
+        """Return the span [byte] of each panorama's line, in their order; those of this run are behind."""
+        new_lines = whole_lines(file.path, file.size, self.size)
+        new_spans = pairwise(accumulate(map(len, new_lines), initial=self.size))
+        return [line.span if line else next(new_spans) for line in self.order]
+
+    def finish(self, file: LineFile, spans: Sequence[tuple[int, int]], keeps_others: bool) -> int:
+        """Put the lines at `spans`, those of the panoramas in their order, into the file, and no older ones.
 
         Those of panoramas that were not named are kept before them, or dropped; returns how many were.
         """
         others = [line for name in self._others.keys() - self._named for line in self._others[name]]
-        spans = sorted(line.span for line in others) if keeps_others else []
-        num_dropped = len(others) - len(spans)
-        new_lines = whole_lines(file.path, file.size, self.size)
-        new_spans = pairwise(accumulate(map(len, new_lines), initial=self.size))
-        spans += [line.span if line else next(new_spans) for line in self.order]
-        file.rearrange(spans)
-        return num_dropped
+        kept = sorted(line.span for line in others) if keeps_others else []
+        file.rearrange([*kept, *spans])
+        return len(others) - len(kept)
 
 
 def write_results(out: Path | None, results: Sequence[Result]) -> None:

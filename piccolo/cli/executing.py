@@ -6,7 +6,6 @@ import signal
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
@@ -110,7 +109,7 @@ def executing(
             localizer = replace(localizer, cache=CachePolicy(folder=folder))
         scan = open_scan(localizer, arguments.threads or num_cores())
         if cluster is None and (num_jobs := count_fitting(arguments, num_jobs)) == 1:
-            yield Here(partial(localizer.answer, scan)), localizer
+            yield Here(localizer.answer_in(scan)), localizer
             return
         if cluster and is_remote(arguments):
             localizer = at_the_workers(arguments, cluster, localizer, scan, is_kept)

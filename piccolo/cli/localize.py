@@ -6,7 +6,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,10 @@ from tqdm import tqdm
 
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas
 from ..batch.localizer import Answer, Localizer
+from ..batch.outputs import FileOutput, Output, StreamOutput
 from ..batch.priors import read_priors
 from ..batch.results_file import Records
+from ..batch.second_look import Look, list_looks
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import printable
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
@@ -149,22 +151,25 @@ def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
 
 
 @contextmanager
-def open_output(out: Path) -> Iterator[tuple[LineFile | None, Write]]:
-    """Yield a function that writes one line to stdout, a FIFO, or the end of a file; and that file."""
+def open_output(run: Run) -> Iterator[tuple[Output, Records]]:
+    """Yield where the results go, and which an earlier run has left there."""
+    out = run.arguments.out or STDOUT
+    may_change = run.total not in (None, 1)
     if is_stdout(out):
-        yield None, lambda line: print(line, flush=True)
+        yield StreamOutput(lambda line: print(line, flush=True), may_change), Records()
     elif is_stream(out):
         with out.open("wb", buffering=0) as stream:
-            yield None, lambda line: write_line(stream.fileno(), out, line)
+            yield StreamOutput(lambda line: write_line(stream.fileno(), out, line), may_change), Records()
     else:
         with open_locked(out) as file:
-            yield file, file.append
+            records = take_up_results(run, file)
+            yield FileOutput(file, records), records
 
 
-def take_up_results(run: Run, file: LineFile | None) -> Records:
+def take_up_results(run: Run, file: LineFile) -> Records:
     """Return the results of earlier runs in the output, which are to be as those of this run would be."""
-    records = Records(file.path if file else None)
-    if file and file.size and not run.arguments.overwrite:
+    records = Records(file.path)
+    if file.size and not run.arguments.overwrite:
         expected = run.localizer.expect(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
         records.read(expected, None if run.total is None else run.panoramas)
     return records
@@ -239,15 +244,45 @@ def localize_all(
     return interruption
 
 
-def finish(
-    run: Run, records: Records, file: LineFile | None, interruption: Interruption, seconds: float
-) -> int:
+def plan_looks(run: Run, output: Output, is_again: bool) -> list[Look]:
+    """Return which photos are to be looked at again, `is_again` if others have a result since."""
+    if run.total in (None, 1) or run.localizer.sends_photos:
+        return []
+    return list_looks(output.texts(), is_again)
+
+
+def look_again(run: Run, looks: Sequence[Look], executor: Executor, output: Output) -> Interruption:
+    """Look again at photos that are not sure, beside those that are, until a signal ends it."""
+    tasks = (run.localizer.task_again(look.first, look.beside) for look in looks)
+    values = executor.values(tasks)
+    with interruptible() as interruption:
+        pairs = show_progress(values, run.arguments.quiet, desc="second look", total=len(looks), unit="")
+        for look, (_, wait) in zip(looks, interruption.each(pairs, values.take_finished()), strict=False):
+            with suppress(WorkerLostError):
+                record_second(run, look, wait(), output)
+    return interruption
+
+
+def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
+    """Replace a result by that of a second look, unless the photo could not be read again."""
+    result = answer.result
+    replace_line = partial(output.replace, look.number)
+    if result.beside:
+        run.counts[look.status] -= 1
+        record(run, answer, replace_line)
+    elif result.error is None:
+        replace_line(result.to_json())
+
+
+def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
     """Put the results in order, say what was done, and how to go on; return the exit code."""
     arguments = run.arguments
-    counts = run.counts + records.counts
+    counts = Counter(run.counts)
+    counts.update(records.counts)
+    is_file = isinstance(output, FileOutput)
     num_dropped = 0
-    if file and not interruption.number:
-        num_dropped = records.finish(file, keeps_others=run.total is None)
+    if not (is_file and interruption.number):
+        num_dropped = output.finish(keeps_others=run.total is None)
     if run.total != 1 or run.left_out or num_dropped:
         words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
         again = ", which the same command will try again" if counts[FAILED] else ""
@@ -257,13 +292,13 @@ def finish(
     if interruption.number:
         how = (
             "the same command continues from here"
-            if file
+            if is_file
             else "with --out FILE the same command would continue"
         )
         return interruption.stop(arguments, f"{counts.total()} results", how)
     if run.total is None:
         note_unused_priors(arguments, run.localizer)
-    return choose_exit_code(counts)
+    return choose_exit_code(+counts)
 
 
 def run_frames(run: Run) -> int:
@@ -294,8 +329,7 @@ def main(arguments: argparse.Namespace) -> int:
             arguments, list(run.panoramas), localizer, opening, partial(print_result, arguments)
         )
     rig = run.localizer.read_options.rig
-    with open_output(arguments.out or STDOUT) as (file, write):
-        records = take_up_results(run, file)
+    with open_output(run) as (output, records):
         panoramas = iter(run.panoramas)
         if run.total is not None:
             panoramas = progress_bar(arguments.quiet)(panoramas, run.total, "check what is finished")
@@ -306,9 +340,9 @@ def main(arguments: argparse.Namespace) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        if first is None:
+        if first is None and not plan_looks(run, output, is_again=False):
             print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
-            return finish(run, records, file, Interruption(), 0.0)
+            return finish(run, records, output, Interruption(), 0.0)
         num_jobs = count_jobs(arguments, num_left)
         with (
             connecting(arguments, num_jobs) as cluster,
@@ -316,7 +350,11 @@ def main(arguments: argparse.Namespace) -> int:
             watch.stage("all"),
         ):
             executor, run.localizer = place
-            if file:
-                file.cut(records.size)  # before the first line is appended
-            interruption = localize_all(run, records, itertools.chain([first], left), executor, write)
-        return finish(run, records, file, interruption, watch.seconds["all"])
+            if isinstance(output, FileOutput):
+                output.begin()
+            rest = itertools.chain([first] if first else [], left)
+            interruption = localize_all(run, records, rest, executor, output.write)
+            looks = [] if interruption.number else plan_looks(run, output, is_again=first is not None)
+            if looks:
+                interruption = look_again(run, looks, executor, output)
+        return finish(run, records, output, interruption, watch.seconds["all"])

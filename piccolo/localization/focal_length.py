@@ -280,7 +280,8 @@ def recalibrate(query: Query, change: Array) -> Query:
     taken = given.resample(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
     features = tuple(Once(partial(_turn_features, part, before, after)) for part in query.features)
-    return replace(fresh, features=features, num_parts=query.num_parts)
+    beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in query.beside)
+    return replace(fresh, features=features, num_parts=query.num_parts, beside=beside)
 
 
 def _turn_features(part: Once[Features], before: Mount, after: Mount) -> Features:

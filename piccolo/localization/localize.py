@@ -118,10 +118,15 @@ def find_once(
                 break
         hypotheses += search_beyond_prior(query, scan_map, watch)
         with watch.stage("refine"):
-            found = refine_to_the_end(query, hypotheses)
-            if query.photo.given.focal_prior is None or found.best.score < HOPELESS_SCORE:
-                return Found(query, found, None)
-            return Found(*calibrate(query, found))
+            return finish(query, hypotheses)
+
+
+def finish(query: Query, hypotheses: Sequence[Hypothesis]) -> Found:
+    """Refine the best of several poses to the end, with the focal length if that is not exact."""
+    found = refine_to_the_end(query, hypotheses)
+    if query.photo.given.focal_prior is None or found.best.score < HOPELESS_SCORE:
+        return Found(query, found, None)
+    return Found(*calibrate(query, found))
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:

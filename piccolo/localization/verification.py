@@ -111,30 +111,41 @@ def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
     return [f is not None and is_near(f.pose, other) for f, other in zip(found, others, strict=True)]
 
 
-def match_beside(query: Query, other: Query, pose: Pose) -> Matches:
-    """Match a photo's features with those of another photo that was taken at a pose in the map.
+def locate_keypoints(query: Query, pose: Pose) -> Located:
+    """Give the keypoints of a photo that was taken at a pose in the map their ranges, from the scan."""
+    views, keypoints = query.seen()
+    ranges = np.zeros(len(keypoints.rays), np.float32)
+    for view in views:
+        shown = view.find_own(keypoints.rays)
+        ranges[shown] = draw(query, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
+    is_seen = np.flatnonzero(ranges > 0.0)
+    return Located(keypoints.take(is_seen), ranges[is_seen], pose)
+
+
+def match_beside(query: Query, other: Located) -> Matches:
+    """Match a photo's features with those of another photo.
 
     What both show in the same direction is left out: it may be carried along, as dirt on a lens is. A photo
     whose mirror image has more matches has none.
     """
-    views, keypoints = other.seen()
     own = query.seen().keypoints
-    if len(match_pictures(own.mirror(), keypoints)[0]) > len(match_pictures(own, keypoints)[0]):
+    mine, theirs = match_pictures(own, other.keypoints)
+    if len(match_pictures(own.mirror(), other.keypoints)[0]) > len(mine):
         return NO_MATCHES
-    ranges = np.zeros(len(keypoints.rays), np.float32)
-    for view in views:
-        shown = view.find_own(keypoints.rays)
-        ranges[shown] = draw(other, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
-    is_seen = np.flatnonzero(ranges > 0.0)
-    matches = match_located(own, Located(keypoints.take(is_seen), ranges[is_seen], pose))
-    rays_of_other = rotate_points(matches.directions.astype(np.float64), pose.R_cam_from_world)
+    matches = pair(own, mine, other, theirs)
+    rays_of_other = rotate_points(matches.directions.astype(np.float64), other.pose.R_cam_from_world)
     return matches.take(np.sum(rays_of_other * matches.rays, axis=1) < COS_AGREE)
 
 
 def match_located(own: Keypoints, picture: Located) -> Matches:
     """Match keypoints of a photo with those of a picture whose pose is known."""
+    mine, theirs = match_pictures(own, picture.keypoints)
+    return pair(own, mine, picture, theirs)
+
+
+def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArray[np.intp]) -> Matches:
+    """Return the matches of keypoints (M,) of a photo with those (M,) of a picture whose pose is known."""
     others, ranges, pose = picture
-    mine, theirs = match_pictures(own, others)
     R_map_from_cam = pose.R_cam_from_world.T
     directions = rotate_points(others.rays[theirs].astype(np.float64), R_map_from_cam)
     tangents = rotate_points(others.tangents[theirs].astype(np.float64), R_map_from_cam)
