@@ -54,7 +54,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/9"
+    assert document["format"] == "piccolo-pose/10"
     assert (document["storey"], document["height_above_floor_m"]) == (2, 1.51)
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
@@ -129,13 +129,13 @@ def test_several_files_of_a_cloud_are_a_list():
     assert Result.from_json(several.to_json()) == several
     for cloud in (7, ["a", 7], None):
         document = json.loads(several.to_json()) | {"cloud": cloud}
-        with pytest.raises(InputError, match="neither a path nor a list of paths"):
+        with pytest.raises(InputError, match="neither a name nor a list of names"):
             Result.from_json(json.dumps(document))
 
 
 @pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/9"}']
+    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/10"}']
 )
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/9"):
+    with pytest.raises(InputError, match="piccolo-pose/10"):
         Result.from_json(text)

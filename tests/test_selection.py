@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from made_up import at, compared, place, places
 
+from piccolo.confidence.confidence import Standing
 from piccolo.confidence.occlusion import Agreement
 from piccolo.localization import last_descent, refinement, selection, verdict
 from piccolo.localization.last_descent import refine_to_the_end
@@ -164,6 +165,25 @@ def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things(
     ):
         query = compared(monkeypatch, {0.0: score, 3.0: other}, {0.0: num_matches})
         assert selection.is_sure(query, [at(0.0, score), at(3.0, other)]) == is_sure
+
+
+def test_copies_are_credited_with_the_matches_of_the_best(monkeypatch):
+    """Of a photo of a part of the sphere; how many a copy has by itself says how it was scanned."""
+    asked = []
+    copies = {1.0: True, 2.0: False, 3.0: True}
+    is_copy = lambda query, pose, others: asked.append(place(pose)) or [copies[place(p)] for p in others]
+    monkeypatch.setattr(verdict, "find_copies", is_copy)
+    poses = [at(x, 0.0).pose for x in (0.0, 1.0, 2.0, 3.0)]
+    standings = [Standing(1.0, 0.5, n, is_drawn=True) for n in (12, 3, 4, 20)]
+    for is_partial, most, expected in ((True, 12, [12, 12, 4, 20]), (False, 12, [12, 3, 4, 20])):
+        query = SimpleNamespace(photo=SimpleNamespace(is_partial=is_partial))
+        found = verdict.credit_copies(query, poses, standings)
+        assert [s.num_matches for s in found] == expected
+        assert found[0].num_matches == most
+    assert asked == [0.0]
+    without = [s._replace(num_matches=None) for s in standings]
+    whole = SimpleNamespace(photo=SimpleNamespace(is_partial=True))
+    assert verdict.credit_copies(whole, poses, without) == without
 
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):

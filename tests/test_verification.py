@@ -24,6 +24,8 @@ from piccolo.localization.verification import (
     PLACE,
     TURN,
     count_agreeing,
+    find_copies,
+    locate_keypoints,
     match_beside,
     match_pictures,
     matches_near,
@@ -67,7 +69,7 @@ def _moved(offset, yaw=0.0):
 
 @functools.lru_cache
 def _beside():
-    """A query of a photo taken half a metre beside, with other noise and light, and its true pose."""
+    """The keypoints of a photo taken half a metre beside, with other noise and light, at its true pose."""
     world = rooms.room(1, NUM_POINTS)[0]
     here = _narrow()[1]
     pose = Pose(yaw_rotation(0.1) @ here.R_cam_from_world, here.center_world + np.array([0.3, 0.4, 0.0]))
@@ -75,11 +77,11 @@ def _beside():
     rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
     panorama = Panorama(rgb, _narrow()[0].is_valid)
     query = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    return query, rooms.local(1, pose, NUM_POINTS)
+    return locate_keypoints(query, rooms.local(1, pose, NUM_POINTS))
 
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
-    matches = match_beside(_query(), *_beside())
+    matches = match_beside(_query(), _beside())
     agreeing = count_matches(matches, _true_pose(), verification.COS_AGREE)
     assert agreeing >= 20
     assert (np.diff(matches.query) >= 0).all()
@@ -91,7 +93,7 @@ def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
 
 def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
-    matches = match_beside(_query(), _query(), _true_pose())
+    matches = match_beside(_query(), locate_keypoints(_query(), _true_pose()))
     assert len(matches.query) < 0.2 * len(_query().seen().keypoints.rays)
     assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
 
@@ -100,19 +102,26 @@ def test_a_mirrored_photo_has_no_matches_beside():
     """It has some without that rule, as many things are symmetric."""
     taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
     mirrored = prepare_query(taken, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    own, others = (query.seen().keypoints for query in (mirrored, _beside()[0]))
-    assert len(match_pictures(own, others)[0]) > 0
-    assert match_beside(mirrored, *_beside()) is NO_MATCHES
+    assert len(match_pictures(mirrored.seen().keypoints, _beside().keypoints)[0]) > 0
+    assert match_beside(mirrored, _beside()) is NO_MATCHES
 
 
 def test_the_picture_with_the_most_matches_counts(monkeypatch):
-    query = replace(_query(), beside=(match_beside(_query(), *_beside()), NO_MATCHES))
+    query = replace(_query(), beside=(match_beside(_query(), _beside()), NO_MATCHES))
     assert rooms.errors(verify(query, _true_pose()).pose, _true_pose())[0] < 0.03
     assert verify(query, _moved((0.0, 0.0, 0.0), 2.0)).num_matches <= 6
     monkeypatch.setattr(verification, "matches_near", lambda *_: NO_MATCHES)
     beside = verify(query, _true_pose())
     assert beside.num_matches >= 20
     assert rooms.errors(beside.pose, _true_pose())[0] < 0.1
+
+
+def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
+    """A pose near another is of the same place, and where one looks elsewhere is none."""
+    near = _moved((0.05, 0.0, 0.02), math.radians(1.0))
+    others = [near, _moved((0.0, 0.0, 0.0), 2.0), _moved((1.0, -0.8, 0.0))]
+    assert find_copies(_query(), _true_pose(), others) == [True, False, False]
+    assert find_copies(_query(), _true_pose(), []) == []
 
 
 def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():

@@ -253,7 +253,8 @@ def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen, follow
     near = [(5, _off(true, 0.6, 0.0)), (4, _off(true, 0.5, 0.0)), (3, _off(true, 0.4, 0.0))]
     given = []
     monkeypatch.setattr(tracker, "find_near", lambda query, expected: given.append((query, expected)))
-    monkeypatch.setattr(tracker, "match_beside", lambda *given: given)
+    monkeypatch.setattr(tracker, "locate_keypoints", lambda *given: given)
+    monkeypatch.setattr(tracker, "match_beside", lambda own, other: (own, *other))
     taken = _narrow(query)
     for photo in (query, taken):
         follower[0].find(photo, Frame(3.0), near)
@@ -288,7 +289,8 @@ def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
     here = Hypothesis(true, 0.5)
     alone = tracker.assess_end(taken, here).num_matches
     more = taken.seen().keypoints.take(np.arange(2 * alone))
-    others = verification.match_located(taken, more, np.full(2 * alone, 2.0, np.float32), true)
+    located = verification.Located(more, np.full(2 * alone, 2.0, np.float32), true)
+    others = verification.match_located(taken.seen().keypoints, located)
     assert tracker.assess_end(replace(taken, beside=(others,)), here).num_matches > alone
     away = others._replace(points=others.points + np.float32(0.5))
     assert tracker.assess_end(replace(taken, beside=(away,)), here).num_matches == alone

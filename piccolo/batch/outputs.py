@@ -1,4 +1,4 @@
-"""Where the results of a batch go: a stream, or a file that grows and is put in order at the end."""
+"""Outputs of a batch: a stream, or a file that grows and is put in order at the end."""
 
 import os
 from collections.abc import Callable
