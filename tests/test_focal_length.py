@@ -16,6 +16,7 @@ from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Evidence, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
+from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization.localize import select_likeliest
 from piccolo.localization.query import prepare_query
@@ -79,6 +80,18 @@ def test_the_picture_tells_the_focal_length_within_its_deviation():
     assert 0.0005 < fit.deviation < 0.01
     assert fit.conflict < 3.0
     assert fit.focal_length(panorama).given_std_px == pytest.approx(0.01 * given * TRUE)
+
+
+def test_matches_with_photos_beside_follow_the_focal_length():
+    """A ray goes to the same pixel of the picture, by the new focal length."""
+    panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE)
+    query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
+    rays = np.float32([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0]])
+    beside = NO_MATCHES._replace(rays=rays)
+    (turned,) = focal.recalibrate(replace(query, beside=(beside,)), np.array([0.02])).beside
+    np.testing.assert_allclose(turned.rays[0], rays[0], atol=1e-6)
+    slope = turned.rays[1, 1] / turned.rays[1, 0]
+    assert slope == pytest.approx(0.75 * math.exp(-0.02), abs=1e-4)
 
 
 def test_k1_is_fitted_with_the_focal_length_of_a_guess():

@@ -171,8 +171,12 @@ def test_copies_are_credited_with_the_matches_of_the_best(monkeypatch):
     """Of a photo of a part of the sphere; how many a copy has by itself says how it was scanned."""
     asked = []
     copies = {1.0: True, 2.0: False, 3.0: True}
-    is_copy = lambda query, pose, others: asked.append(place(pose)) or [copies[place(p)] for p in others]
-    monkeypatch.setattr(verdict, "find_copies", is_copy)
+
+    def find_copies(_query, pose, others):
+        asked.append(place(pose))
+        return [copies[place(other)] for other in others]
+
+    monkeypatch.setattr(verdict, "find_copies", find_copies)
     poses = [at(x, 0.0).pose for x in (0.0, 1.0, 2.0, 3.0)]
     standings = [Standing(1.0, 0.5, n, is_drawn=True) for n in (12, 3, 4, 20)]
     for is_partial, most, expected in ((True, 12, [12, 12, 4, 20]), (False, 12, [12, 3, 4, 20])):

@@ -9,6 +9,7 @@ import pytest
 import rooms
 from measuring.confidence import mask_outside_field
 
+from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
@@ -17,6 +18,7 @@ from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
+from piccolo.localization.beside import localize_beside
 from piccolo.localization.localize import localize
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -89,6 +91,24 @@ def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
     cloud = np.asarray(rooms.room(1, NUM_POINTS)[1].points)
     nearest = [np.linalg.norm(cloud - point, axis=1).min() for point in matches.points]
     assert np.median(nearest) < 0.05
+
+
+def test_a_photo_is_localized_beside_one_that_shows_the_same():
+    """Without a pose of its own; and not beside one that shows nothing of it."""
+    panorama = _narrow()[0]
+    nothing = replace_keypoints(_beside(), np.arange(3))
+    ask = functools.partial(localize_beside, rooms.scan_map(1, NUM_POINTS), panorama, [])
+    found, names = ask({"bare": nothing, "beside": _beside()}, SETTINGS, Workers(2), Stopwatch())
+    assert names == ("beside",)
+    assert found.status == "localized"
+    assert found.evidence.num_matches >= 20
+    assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
+    assert ask({"bare": nothing}, SETTINGS, Workers(2), Stopwatch()) == (Localization(), ())
+
+
+def replace_keypoints(located, kept):
+    """The keypoints of a photo at some indices."""
+    return verification.Located(located.keypoints.take(kept), located.ranges[kept], located.pose)
 
 
 def test_what_moves_with_the_camera_is_no_match():
