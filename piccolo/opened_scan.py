@@ -1,6 +1,6 @@
 """A scan prepared for a method: `Scan`, the commands and the batches localize photos in it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from os import PathLike
 from pathlib import Path
@@ -21,11 +21,10 @@ from .geometry.colors import Labels
 from .geometry.pose import Pose, check_rotation
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
-from .localization.beside import localize_beside, locate
+from .localization.beside import Picture, localize_beside, locate
 from .localization.bundle import localize_bundle
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
-from .localization.verification import Located
 from .panorama import Panorama, ReadOptions, read_photo
 from .panorama.photo import PhotoFacts, sha256_of
 from .paper.localize import PaperMap
@@ -76,7 +75,7 @@ class OpenedScan:
 
         Raises InputError for the preset paper, and for a focal length that is to be refined.
         """
-        prepared, settings = self.not_of_paper("walks", settings)
+        prepared, settings = self.require_default_method("walks", settings)
         if read_options.refine_focal:
             raise InputError(
                 "`refine_focal`: not an option of walks; refine the focal length with a single photo"
@@ -142,45 +141,52 @@ class OpenedScan:
 
     def locate(
         self, panorama: File, result: Result, read_options: ReadOptions, settings: Settings
-    ) -> Located:
-        """Return the keypoints of a photo that is localized, for photos beside it."""
+    ) -> Picture | None:
+        """Return the keypoints of a photo that is localized; None if it is another photo now."""
         if result.best_pose is None:
             raise ValueError("a photo without a pose")
-        prepared, settings = self.not_of_paper("photos beside others", settings)
+        prepared, settings = self.require_default_method("photos beside others", settings)
         with reading_once():
-            picture = read_photo(panorama, read_options.with_refined_camera(result.cameras, Path(panorama)))
-        return locate(prepared, picture, self.from_world(result.best_pose), settings, self.workers)
+            read_options = read_options.with_refined_camera(result.cameras, Path(panorama))
+            picture = read_photo(panorama, read_options)
+            photo = photo_facts(panorama, read_options.rig)
+        if photo.sha256 != result.source.pano_sha256:
+            return None
+        pose = self.from_world(result.best_pose)
+        return Picture(locate(prepared, picture, pose, settings, self.workers), result.confidence)
 
     def localize_again(
         self,
         panorama: File,
         first: Result,
-        pictures: Mapping[str, Located],
+        list_pictures: Callable[[], Mapping[str, Picture]],
         read_options: ReadOptions,
         settings: Settings,
-    ) -> Result:
-        """Localize a photo that is not sure, beside others that are, given by their names.
+    ) -> tuple[Result, tuple[str, ...]]:
+        """Localize a photo that is not sure, beside others that are; return also the names of these.
 
-        Returns the `first` result if the second is no surer. A photo whose focal length is a guess is not
-        looked at.
+        `list_pictures` returns those that are asked, by name. If none shows the same, the result is the
+        first one. A photo whose focal length is a guess is not looked at.
         """
         watch = Stopwatch(dict(first.seconds))
-        prepared, settings = self.not_of_paper("photos beside others", settings)
+        prepared, settings = self.require_default_method("photos beside others", settings)
         with watch.stage("read"), reading_once():
             picture = read_photo(panorama, read_options)
             photo = photo_facts(panorama, read_options.rig)
-        if has_guessed_focal(picture):
-            return replace(first, beside=())
+        if has_guessed_focal(picture) or prepared.has_shape or photo.sha256 != first.source.pano_sha256:
+            return first, ()
         known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
         poses = [self.from_world(pose) for pose in known]
+        with watch.stage("read"):
+            pictures = list_pictures()
         found, names = localize_beside(prepared, picture, poses, pictures, settings, self.workers, watch)
-        if found.confidence <= first.confidence:
-            return replace(first, beside=())
+        if not names:
+            return first, ()
         about = settings_json(settings, self.cloud_settings, read_options)
         result = self._make_result(panorama, picture, photo, found, about, watch.seconds)
-        return replace(result, gps_prior=first.gps_prior, beside=names)
+        return replace(result, gps_prior=first.gps_prior), names
 
-    def not_of_paper(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
+    def require_default_method(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
         """Return the map and settings; InputError for the preset paper, which does not have `what`."""
         if not isinstance(self.prepared, ScanMap) or not isinstance(settings, CoarseToFineSettings):
             raise InputError(f"{what}: not available with the preset paper")
@@ -199,7 +205,7 @@ class OpenedScan:
         Raises InputError for a photo that can't be read, for the preset paper, and for a focal length that is
         a guess.
         """
-        prepared, settings = self.not_of_paper("`relative_poses`", settings)
+        prepared, settings = self.require_default_method("`relative_poses`", settings)
         self.check_options(read_options, settings)
         check_relative_poses(cams_from_bundle)
         if not panoramas:

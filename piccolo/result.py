@@ -50,6 +50,14 @@ class Source:
 
 
 @dataclass(frozen=True)
+class Beside:
+    """A second look at a photo, beside others of a batch."""
+
+    photos: tuple[str, ...]  # paths of those that show the same, those with the most matches first
+    asked_sha256: str  # digest of all that were asked
+
+
+@dataclass(frozen=True)
 class Result:
     """Result of localizing one photo.
 
@@ -91,8 +99,7 @@ class Result:
     walk
         For a frame of a walk, how its pose was found. Status, pose and covariance are then those of the walk.
     beside
-        Names of the photos beside which it was found, of one that was not sure alone; empty if it was looked
-        for so in vain, None if it was not.
+        For a photo that was not sure alone, the photos of the batch beside which it was looked at again.
     seconds
         Time [s] spent on this photo, by stage.
     settings, warnings
@@ -123,7 +130,7 @@ class Result:
     storey: int | None = None
     height_above_floor: float | None = None
     walk: WalkFrame | None = None
-    beside: tuple[str, ...] | None = None
+    beside: Beside | None = None
 
     @property
     def is_calibrated(self) -> bool:
@@ -204,7 +211,7 @@ class Result:
             "seconds": {stage: round(seconds, 4) for stage, seconds in self.seconds.items()},
             "gps_prior": self.gps_prior and asdict(self.gps_prior),
             "walk": self.walk and _walk_json(self.walk),
-            "beside": None if self.beside is None else list(self.beside),
+            "beside": self.beside and asdict(self.beside),
             "settings": self.settings,
             "warnings": list(self.warnings),
             "version": __version__,
@@ -235,7 +242,7 @@ class Result:
                 "covariance": None if matrix is None else PoseCovariance(np.array(matrix), about),
                 "height_above_floor": document["height_above_floor_m"],
                 "walk": document["walk"] and _walk_from_json(document["walk"]),
-                "beside": None if beside is None else _names(beside),
+                "beside": beside and Beside(_names(beside["photos"]), beside["asked_sha256"]),
                 "warnings": tuple(document["warnings"]),
             }
             plain = {f.name: document[f.name] for f in fields(cls) if f.name not in given}

@@ -1,52 +1,69 @@
 """A second look at photos of a batch that are not sure, beside those that are."""
 
+import errno
 import json
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
+import numpy as np
 import pytest
+from test_localize_cameras import place, scan
 
 from piccolo import open_scan, opened_scan
-from piccolo.batch import localizer as module
-from piccolo.batch.localizer import MOST_PICTURES, Answer
+from piccolo.batch.localizer import Localizer
 from piccolo.batch.outputs import StreamOutput
-from piccolo.batch.second_look import list_looks
+from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
+from piccolo.jobs.threads import Workers
+from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import ReadOptions
-from piccolo.result import Result
+from piccolo.result import Beside, Result
+from piccolo.scenes.synthetic.world import render_picture
 
 CAMERA = {"model": "PINHOLE"}
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
+NONE_ASKED = {"photos": [], "asked_sha256": "0"}
 
 
-def _text(pano, status="localized", beside=None, camera=CAMERA):
-    return json.dumps({"pano": pano, "status": status, "beside": beside, "camera": camera})
+def _text(pano, status="localized", beside=None, camera=CAMERA, confidence=0.95):
+    fields = {"pano": pano, "pano_sha256": "1", "status": status, "confidence": confidence}
+    return json.dumps({**fields, "beside": beside, "camera": camera})
 
 
 def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
     """What was localized beside others is no picture for others; spheres are not looked at again."""
     statuses = ("localized", "ambiguous", "not_localized", "unreadable", "failed")
     texts = [_text(f"{k}", status) for k, status in enumerate(statuses)]
-    texts += [_text("5", "localized", ["0"]), _text("6", "localized", camera=None)]
-    texts += [_text("7", "ambiguous", camera=None), _text("8", "not_localized", [])]
-    looks = list_looks(texts, is_again=False)
-    assert [(look.number, look.status, look.first) for look in looks] == [
-        (1, "ambiguous", texts[1]),
-        (2, "not_localized", texts[2]),
+    texts += [_text("5", beside={"photos": ["0"], "asked_sha256": "0"}), _text("6", camera=None)]
+    texts += [_text("7", "ambiguous", camera=None), _text("8", "not_localized", NONE_ASKED)]
+    texts += [_text("9", confidence=0.89)]
+    looks = list_looks(texts)
+    assert [(look.number, look.status, look.pano, look.first) for look in looks] == [
+        (1, "ambiguous", "1", texts[1]),
+        (2, "not_localized", "2", texts[2]),
+        (5, "localized", "5", ""),
+        (8, "not_localized", "8", texts[8]),
     ]
     assert all(look.beside == (texts[0], texts[6]) for look in looks)
-    assert [look.number for look in list_looks(texts, is_again=True)] == [1, 2, 8]
-    assert list_looks(texts[1:5], is_again=True) == []
+    asked = {"photos": [], "asked_sha256": looks[0].asked_sha256}
+    texts[1] = _text("1", "ambiguous", asked)
+    assert [look.number for look in list_looks(texts)] == [2, 5, 8]
+    texts[6] = _text("6", "ambiguous")
+    assert [look.number for look in list_looks(texts)] == [1, 2, 5, 6, 8]
+    assert [(look.number, look.beside) for look in list_looks(texts[1:6])] == [(0, ()), (4, ())]
 
 
 def test_a_photo_is_looked_at_beside_the_nearest_in_order():
     texts = [_text(f"{k}", "ambiguous" if k == 40 else "localized") for k in range(MOST_PICTURES + 30)]
-    (look,) = list_looks(texts, is_again=False)
+    (look,) = list_looks(texts)
     assert look.beside == tuple(text for k, text in enumerate(texts) if k != 40 and k <= MOST_PICTURES)
 
 
@@ -61,7 +78,7 @@ def test_lines_on_a_stream_keep_their_order_and_wait_for_one_that_may_change():
         if may_change:
             output.replace(1, "surer")
             assert output.texts() == [texts[0], "surer", texts[2]]
-        output.finish()
+        output.close()
         assert written == ([texts[0], "surer", texts[2]] if may_change else texts)
 
 
@@ -85,40 +102,46 @@ class Looked(NamedTuple):
 @pytest.fixture
 def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
-    answer, looked = module.Localizer.answer, Looked([], {})
+    ask, looked = OpenedScan.localize_query, Looked([], {})
 
-    def answer_first(self, scan, task):
-        found = answer(self, scan, task).result
-        is_sure = task.pano.name not in ("b.jpg", "d.jpg")
+    def localize_query(self, panorama, *more):
+        found = ask(self, panorama, *more)
+        is_sure = panorama.name not in ("b.jpg", "d.jpg")
         found = replace(found, cameras=PHONE, status=found.status if is_sure else "ambiguous")
-        looked.firsts[task.pano.name] = found.to_json()
-        return Answer(found)
+        looked.firsts[panorama.name] = found.to_json()
+        return found
 
-    def answer_again(self, scan, task, locate):
-        first = Result.from_json(task.first)
-        looked.asked.append((task.pano.name, [Path(json.loads(text)["pano"]).name for text in task.beside]))
-        if task.pano.name == "d.jpg":
-            return Answer(replace(first, beside=()))
-        return Answer(replace(first, status="localized", beside=(json.loads(task.beside[0])["pano"],)))
+    def localize_again(_self, panorama, first, list_pictures, *_):
+        names = tuple(list_pictures())
+        looked.asked.append((panorama.name, [Path(name).name for name in names]))
+        return (first, ()) if panorama.name == "d.jpg" else (replace(first, status="localized"), names[:1])
 
-    monkeypatch.setattr(module.Localizer, "answer", answer_first)
-    monkeypatch.setattr(module.Localizer, "answer_again", answer_again)
+    monkeypatch.setattr(OpenedScan, "localize_query", localize_query)
+    monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
+    monkeypatch.setattr(Localizer, "locate", lambda self, scan, line: line)
     return looked
 
 
 def _run(scene, photos, *more):
-    cloud = str(scene / "cloud.ply")
-    return localize.main(["--cloud", cloud, "--pano", str(photos), "--cache", "none", *map(str, more)])
+    cloud, cache = str(scene / "cloud.ply"), scene.parent / "cache of second looks"
+    return localize.main(["--cloud", cloud, "--pano", str(photos), "--cache", str(cache), *map(str, more)])
 
 
 def _lines(text):
-    return [(Path(d["pano"]).name, d["status"], d["beside"]) for d in map(json.loads, text.splitlines())]
+    """Name, status, and names of those beside which it was found."""
+    found = [(Path(d["pano"]).name, d["status"], d["beside"]) for d in map(json.loads, text.splitlines())]
+    return [
+        (name, status, beside and [Path(photo).name for photo in beside["photos"]])
+        for name, status, beside in found
+    ]
+
+
+SURE = ("localized", None)
 
 
 def test_a_photo_is_found_beside_others_in_a_file_and_on_stdout(scene, photos, tmp_path, looked, capsys):
     out = tmp_path / "poses.jsonl"
-    first = str(photos / "a.jpg")
-    expected = [("a.jpg", "localized", None), ("b.jpg", "localized", [first]), ("c.jpg", "localized", None)]
+    expected = [("a.jpg", *SURE), ("b.jpg", "localized", ["a.jpg"]), ("c.jpg", *SURE)]
     assert _run(scene, photos, "--out", out) == 0
     assert _lines(out.read_text()) == expected
     assert looked.asked == [("b.jpg", ["a.jpg", "c.jpg"])]
@@ -132,90 +155,165 @@ def test_a_photo_is_found_beside_others_in_a_file_and_on_stdout(scene, photos, t
     assert len(looked.asked) == 2, "a photo alone has none beside it"
 
 
-def test_a_second_look_goes_on_where_it_was_stopped(scene, photos, tmp_path, looked, capsys):
-    """With all first results it begins, with a second one that result is kept; a new photo repeats it."""
-    out = tmp_path / "poses.jsonl"
+def test_a_second_look_is_of_the_photos_that_there_are(scene, photos, tmp_path, looked, capsys):
+    """Wherever a run was killed, and whatever was added or removed, it ends like one that was not."""
+    out, whole = tmp_path / "poses.jsonl", tmp_path / "whole.jsonl"
     (photos / "d.jpg").write_bytes((photos / "c.jpg").read_bytes())
-    assert _run(scene, photos, "--out", out, "--quiet") == 1
-    whole = out.read_text()
-    a, b, c, d = whole.splitlines(keepends=True)
-    assert _lines(d) == [("d.jpg", "ambiguous", [])]
-    firsts = [looked.firsts[name] + "\n" for name in ("b.jpg", "d.jpg")]
-    for left, repeated in ((firsts, ["b.jpg", "d.jpg"]), ([*firsts, b], ["d.jpg"]), ([b, d], [])):
+
+    def run_again(*repeated):
         looked.asked.clear()
-        out.write_text("".join([a, left[0], c, *left[1:]]))
         assert _run(scene, photos, "--out", out, "--quiet") == 1
-        assert [name for name, _ in looked.asked] == repeated
-        assert out.read_text() == whole
-    looked.asked.clear()
+        assert [name for name, _ in looked.asked] == list(repeated)
+        assert _run(scene, photos, "--out", whole, "--quiet", "--overwrite") == 1
+        untimed = [json.loads(line) | {"seconds": 0} for line in whole.read_text().splitlines()]
+        assert [json.loads(line) | {"seconds": 0} for line in out.read_text().splitlines()] == untimed
+
+    run_again("b.jpg", "d.jpg")
+    a, b, c, d = out.read_text().splitlines(keepends=True)
+    assert _lines(b + d) == [("b.jpg", "localized", ["a.jpg"]), ("d.jpg", "ambiguous", [])]
+    first, last = (looked.firsts[name] + "\n" for name in ("b.jpg", "d.jpg"))
+    for lines, repeated in (
+        ((a, first, c, last), ("b.jpg", "d.jpg")),
+        ((a, first, c, last, b), ("d.jpg",)),
+        ((a, first, c, last, b, d[:50]), ("d.jpg",)),
+        ((a, b, c, d), ()),
+    ):
+        out.write_text("".join(lines))
+        run_again(*repeated)
+    (photos / "bad.jpg").write_bytes(b"nothing")
+    assert _run(scene, photos, "--out", out, "--quiet") == 3
+    assert len(_lines(out.read_text())) == 5
+    (photos / "bad.jpg").unlink()
+    run_again()
     (photos / "e.jpg").write_bytes((photos / "a.jpg").read_bytes())
-    assert _run(scene, photos, "--out", out, "--quiet") == 1
-    assert looked.asked == [("d.jpg", ["a.jpg", "c.jpg", "e.jpg"])]
+    run_again("b.jpg", "d.jpg")
+    for name in ("a.jpg", "e.jpg"):
+        (photos / name).unlink()
+        run_again("b.jpg", "d.jpg")
+    (photos / "c.jpg").unlink()
+    run_again()  # with nothing beside them they are as they were alone
+    assert [line[1:] for line in _lines(out.read_text())] == [("ambiguous", None)] * 2
     capsys.readouterr()
 
 
-def test_a_photo_that_is_gone_then_keeps_its_result(scene, photos, tmp_path, looked, monkeypatch):
+def test_of_lines_that_stay_those_are_dropped_that_others_replace(
+    scene, photos, tmp_path, looked, monkeypatch, capsys
+):
+    """A run was killed in a second look; the next is of a name on standard input."""
     out = tmp_path / "poses.jsonl"
-    (photos / "d.jpg").write_bytes((photos / "c.jpg").read_bytes())
+    assert _run(scene, photos, "--out", out, "--quiet") == 0
+    a, b, c = out.read_text().splitlines(keepends=True)
+    out.write_text(a + looked.firsts["b.jpg"] + "\n" + c + b)
+    names = tmp_path / "names"
+    names.write_text(str(photos / "a.jpg"))
+    with names.open() as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        assert _run(scene, "-", "--out", out) == 0
+    assert "dropped" not in capsys.readouterr().err
+    assert out.read_text() == c + b + a
 
-    def answer_again(self, scan, task, _locate):
-        return self._answer(scan, task, lambda *_, **__: (photos / "none").read_bytes())
 
-    monkeypatch.setattr(module.Localizer, "answer_again", answer_again)
+def test_a_look_that_fails_is_told_and_leaves_the_result(
+    scene, photos, tmp_path, looked, monkeypatch, capsys
+):
+    out = tmp_path / "poses.jsonl"
+
+    def localize_again(*_):
+        raise OSError(errno.EIO, "Input/output error", "disk")
+
+    monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
     assert _run(scene, photos, "--out", out, "--quiet") == 1
-    assert [line[1:] for line in _lines(out.read_text())][1] == ("ambiguous", None)
+    assert "disk: cannot be used (Input/output error)" in capsys.readouterr().err
+    assert _lines(out.read_text())[1] == ("b.jpg", "ambiguous", None)
+
+    def stop(*_):
+        raise RuntimeError
+
+    monkeypatch.setattr(OpenedScan, "localize_again", stop)
+    assert _run(scene, photos, "--quiet") == 4
+    assert len(_lines(capsys.readouterr().out)) == 3, "lines that waited are not lost"
 
 
-def test_a_second_result_counts_if_it_is_surer(scene, monkeypatch):
-    """And no photo whose focal length is a guess is looked at."""
+def test_what_is_looked_at(scene, monkeypatch):
+    """No photo whose focal length is a guess, none that is another by now; and with all that was found."""
     scan = open_scan(scene / "cloud.ply", cache=False)
-    photo = str(scene / "images" / "clean_0.jpg")
-    first = scan.localize(photo)
+    photo = scene / "images" / "clean_0.jpg"
+    first = replace(scan.localize(str(photo)), confidence=0.5, status="ambiguous")
     opened, asked = scan._opened, []
+    other = replace(first, source=replace(first.source, pano_sha256="0"))
 
-    def localize_beside(prepared, picture, poses, pictures, *_):
-        asked.append(([scan._opened.from_world(first.best_pose).key], [pose.key for pose in poses[:1]]))
-        return Localization("localized", confidence, 0.0, first.best_pose, alternatives=()), tuple(pictures)
+    def localize_beside(_prepared, _picture, poses, pictures, *_):
+        asked.append([pose.key for pose in poses[:1]])
+        return Localization("localized", 0.7, 0.3, first.best_pose), tuple(pictures)
 
     monkeypatch.setattr(opened_scan, "localize_beside", localize_beside)
-    for confidence, beside in ((0.7, ("x",)), (0.5, ())):
-        doubtful = replace(first, confidence=0.5, status="ambiguous")
-        found = opened.localize_again(photo, doubtful, {"x": None}, ReadOptions(), opened.settings)
-        assert found.beside == beside
-        assert found.confidence == max(confidence, 0.5)
-        assert found.status == ("localized" if beside else "ambiguous")
-        assert found.source == first.source
-    assert all(given == known for given, known in asked)
+
+    def look(before, pictures):
+        return opened.localize_again(photo, before, lambda: pictures, ReadOptions(), opened.settings)
+
+    found, names = look(first, {"x": None})
+    assert (found.status, found.confidence, names) == ("localized", 0.7, ("x",))
+    assert found.source == first.source
+    assert asked == [[opened.from_world(first.best_pose).key]]
+    assert look(first, {}) == (first, ())
+    assert len(asked) == 2
+    assert look(other, {"x": None}) == (other, ())
     monkeypatch.setattr(opened_scan, "has_guessed_focal", lambda picture: True)
-    assert opened.localize_again(photo, doubtful, {}, ReadOptions(), opened.settings).beside == ()
+    assert look(first, {"x": None}) == (first, ())
     assert len(asked) == 2
 
 
-def test_a_picture_that_is_gone_is_none_and_others_are_located_once(scene, tmp_path, monkeypatch):
+def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypatch):
     scan = open_scan(scene / "cloud.ply", cache=False)
     photo = tmp_path / "a.jpg"
     photo.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
     text = scan.localize(str(photo)).to_json()
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
-    localizer = module.Localizer((scene / "cloud.ply",), *settings, ReadOptions(), None)
-    located = localizer.locate(opened, text)
+    localizer = Localizer((scene / "cloud.ply",), *settings, ReadOptions(), None)
+    located, confidence = localizer.locate(opened, text)
+    assert confidence == json.loads(text)["confidence"]
     assert located.pose.key == opened.from_world(Result.from_json(text).best_pose).key
     assert len(located.ranges) == len(located.keypoints.rays) > 50
     assert (located.ranges > 0.0).all()
     asked = []
-    monkeypatch.setattr(module.Localizer, "locate", lambda self, scan, line: asked.append(line))
-    monkeypatch.setattr(
-        module.Localizer, "answer_again", lambda self, scan, task, locate: [locate(t) for t in task.beside]
-    )
-    answer = localizer.answer_in(opened)
-    task = localizer.task_again(text, ("x", "y"))
-    assert task.pano == photo
-    answer(task)
-    answer(task._replace(beside=("y", "z")))
-    assert asked == ["x", "y", "z"]
-    monkeypatch.undo()
+    with monkeypatch.context() as patch:
+        patch.setattr(Localizer, "locate", lambda self, scan, line: asked.append(line))
+        patch.setattr(OpenedScan, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
+        answer = localizer.answer_in(opened)
+        for beside in ((text, " " + text), (" " + text, "  " + text)):
+            answer(localizer.task(photo)._replace(look=Look(0, "ambiguous", str(photo), text, beside, "1")))
+    assert [line.count(" {") - text.count(" {") for line in asked] == [0, 1, 1]
+    photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
+    assert localizer.locate(opened, text) is None
     photo.unlink()
     assert localizer.locate(opened, text) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
-        opened.not_of_paper("photos beside others", None)
+        opened.require_default_method("photos beside others", None)
+
+
+def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
+    """From pictures to results; a copy of itself is none beside it."""
+    this, pose = place(1)
+    beside = Pose(yaw_rotation(0.15) @ pose.R_cam_from_world, pose.center_world + np.array([0.2, 0.15, 0.0]))
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    for path, taken_at in zip(paths, (pose, beside), strict=True):
+        rgb = render_picture(Mount(pinhole(640, 480, 320.0)), this, taken_at, Workers(2))
+        cv2.imwrite(str(path), rgb[..., ::-1])
+    opened = scan()._opened
+    settings = opened.settings, opened.cloud_settings
+    localizer = Localizer((Path("room"),), *settings, ReadOptions(focal_px=320.0), None)
+    answer = localizer.answer_in(opened)
+    a, b = (answer(localizer.task(path)).result for path in paths)
+    assert a.status == "localized"
+    lost = replace(b, status="not_localized", confidence=0.0, best_pose=None, alternatives=())
+    look = Look(0, lost.status, str(paths[1]), lost.to_json(), (a.to_json(),), "1")
+    found = answer(localizer.task(paths[1])._replace(look=look)).result
+    assert found.status == "localized"
+    assert found.confidence <= a.confidence
+    assert found.beside == Beside((str(paths[0]),), "1")
+    assert pose_errors(found.pose, beside)[0] < 0.05
+    assert Result.from_json(found.to_json()).to_json() == found.to_json()
+    itself = look._replace(beside=(replace(a, pano=str(paths[1]), source=b.source).to_json(),))
+    again = answer(localizer.task(paths[1])._replace(look=itself)).result
+    assert again.to_json() == replace(lost, beside=Beside((), "1")).to_json()

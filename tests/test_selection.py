@@ -179,7 +179,7 @@ def test_copies_are_credited_with_the_matches_of_the_best(monkeypatch):
     monkeypatch.setattr(verdict, "find_copies", find_copies)
     poses = [at(x, 0.0).pose for x in (0.0, 1.0, 2.0, 3.0)]
     standings = [Standing(1.0, 0.5, n, is_drawn=True) for n in (12, 3, 4, 20)]
-    for is_partial, most, expected in ((True, 12, [12, 12, 4, 20]), (False, 12, [12, 3, 4, 20])):
+    for is_partial, most, expected in ((True, 20, [20, 20, 4, 20]), (False, 12, [12, 3, 4, 20])):
         query = SimpleNamespace(photo=SimpleNamespace(is_partial=is_partial))
         found = verdict.credit_copies(query, poses, standings)
         assert [s.num_matches for s in found] == expected

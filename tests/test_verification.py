@@ -18,7 +18,7 @@ from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.beside import localize_beside
+from piccolo.localization.beside import Picture, localize_beside
 from piccolo.localization.localize import localize
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -27,10 +27,10 @@ from piccolo.localization.verification import (
     TURN,
     count_agreeing,
     find_copies,
-    locate_keypoints,
     match_beside,
     match_pictures,
     matches_near,
+    place_keypoints,
     verify,
 )
 from piccolo.panorama import Panorama
@@ -79,7 +79,7 @@ def _beside():
     rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
     panorama = Panorama(rgb, _narrow()[0].is_valid)
     query = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    return locate_keypoints(query, rooms.local(1, pose, NUM_POINTS))
+    return place_keypoints(query, rooms.local(1, pose, NUM_POINTS))
 
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
@@ -98,12 +98,19 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     panorama = _narrow()[0]
     nothing = replace_keypoints(_beside(), np.arange(3))
     ask = functools.partial(localize_beside, rooms.scan_map(1, NUM_POINTS), panorama, [])
-    found, names = ask({"bare": nothing, "beside": _beside()}, SETTINGS, Workers(2), Stopwatch())
+    found, names = ask(
+        {"bare": Picture(nothing, 0.99), "beside": Picture(_beside(), 0.97)},
+        SETTINGS,
+        Workers(2),
+        Stopwatch(),
+    )
     assert names == ("beside",)
     assert found.status == "localized"
+    assert found.confidence <= 0.97
+    assert found.probability_none == pytest.approx(1.0 - found.confidence, abs=0.01)
     assert found.evidence.num_matches >= 20
     assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
-    assert ask({"bare": nothing}, SETTINGS, Workers(2), Stopwatch()) == (Localization(), ())
+    assert ask({"bare": Picture(nothing, 0.99)}, SETTINGS, Workers(2), Stopwatch()) == (Localization(), ())
 
 
 def replace_keypoints(located, kept):
@@ -113,7 +120,7 @@ def replace_keypoints(located, kept):
 
 def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
-    matches = match_beside(_query(), locate_keypoints(_query(), _true_pose()))
+    matches = match_beside(_query(), place_keypoints(_query(), _true_pose()))
     assert len(matches.query) < 0.2 * len(_query().seen().keypoints.rays)
     assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
 

@@ -253,7 +253,7 @@ def test_a_narrow_photo_is_matched_with_the_frames_it_is_found_from(seen, follow
     near = [(5, _off(true, 0.6, 0.0)), (4, _off(true, 0.5, 0.0)), (3, _off(true, 0.4, 0.0))]
     given = []
     monkeypatch.setattr(tracker, "find_near", lambda query, expected: given.append((query, expected)))
-    monkeypatch.setattr(tracker, "locate_keypoints", lambda *given: given)
+    monkeypatch.setattr(tracker, "place_keypoints", lambda *given: given)
     monkeypatch.setattr(tracker, "match_beside", lambda own, other: (own, *other))
     taken = _narrow(query)
     for photo in (query, taken):

@@ -12,24 +12,23 @@ from typing import Any, NamedTuple
 from .. import __version__
 from ..camera import Calibration
 from ..cloud.settings import CloudSettings
-from ..errors import InputError
+from ..errors import InputError, is_passing
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
+from ..localization.beside import Picture
 from ..localization.settings import CoarseToFineSettings
-from ..localization.verification import Located
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
 from ..panorama import ReadOptions, read_panorama
-from ..result import Result, Source, unreadable_result
+from ..result import Beside, Result, Source, unreadable_result
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..views.pictures import encode_image, overlay_png
 from .priors import PriorTable
-
-MOST_PICTURES = 200  # beside which a photo is looked at again: the sure ones nearest in order
+from .second_look import MOST_PICTURES, Look
 
 
 class Task(NamedTuple):
@@ -39,8 +38,7 @@ class Task(NamedTuple):
     settings: Settings
     calibration: Calibration | None = None  # the camera of this photo
     files: Mapping[str, bytes] | None = None  # what is at `pano`, where that is not to be seen
-    first: str = ""  # JSON of its result, if it is looked at again
-    beside: tuple[str, ...] = ()  # JSON of the results of photos that are sure, beside which it is looked at
+    look: Look | None = None  # if it is looked at again, beside others
 
     @contextmanager
     def place(self, folder: Path) -> Iterator[Path]:
@@ -101,10 +99,6 @@ class Localizer:
         files = files_of(pano) if self.sends_photos else None
         return Task(pano, self.settings_of(pano), calibration, files)
 
-    def task_again(self, first: str, beside: tuple[str, ...]) -> Task:
-        """Return what is to be done for a panorama that is looked at again; results are JSON."""
-        return self.task(Path(json.loads(first)["pano"]))._replace(first=first, beside=beside)
-
     def settings_of(self, pano: Path) -> Settings:
         """Return the settings of one panorama: its own prior, if it has one."""
         if self.priors is None or not isinstance(self.settings, CoarseToFineSettings):
@@ -130,7 +124,11 @@ class Localizer:
     def answer_in(self, scan: OpenedScan) -> Callable[[Task], Answer]:
         """Return what answers tasks in an opened scan."""
         locate = lru_cache(MOST_PICTURES)(partial(self.locate, scan))
-        return lambda task: self.answer_again(scan, task, locate) if task.first else self.answer(scan, task)
+
+        def answer(task: Task) -> Answer:
+            return self.answer(scan, task) if task.look is None else self.answer_again(scan, task, locate)
+
+        return answer
 
     def open_scan(self, workers: Workers) -> OpenedScan:
         """Read and prepare the scan."""
@@ -143,31 +141,51 @@ class Localizer:
 
     def answer(self, scan: OpenedScan, task: Task) -> Answer:
         """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
-        localize = partial(
-            scan.localize_query, settings=task.settings, is_masked=None, calibration=task.calibration
-        )
+
+        def localize(path: Path) -> Result:
+            return scan.localize_query(path, self.read_options, task.settings, None, task.calibration)
+
         return self._answer(scan, task, localize)
 
-    def answer_again(self, scan: OpenedScan, task: Task, locate: Callable[[str], Located | None]) -> Answer:
-        """Look at a photo again, beside others; `locate` returns one's keypoints by its result's JSON."""
-        found = {json.loads(line)["pano"]: located for line in task.beside if (located := locate(line))}
-        first = Result.from_json(task.first)
-        localize = partial(scan.localize_again, first=first, pictures=found, settings=task.settings)
+    def answer_again(self, scan: OpenedScan, task: Task, locate: Callable[[str], Picture | None]) -> Answer:
+        """Look at a photo again, beside others; `locate` returns one of these by its result's JSON."""
+        look = task.look
+        if look is None:
+            return self.answer(scan, task)
+
+        def list_pictures() -> dict[str, Picture]:
+            found = ((json.loads(line)["pano"], locate(line)) for line in look.beside)
+            return {name: picture for name, picture in found if picture}
+
+        def localize(path: Path) -> Result:
+            read = self.read_options
+            if look.first:
+                first = Result.from_json(look.first)
+            else:
+                first = scan.localize_query(path, read, task.settings, None, task.calibration)
+            if not look.beside:
+                return replace(first, beside=None)
+            found, names = scan.localize_again(path, first, list_pictures, read, task.settings)
+            return replace(found, beside=Beside(names, look.asked_sha256))
+
         return self._answer(scan, task, localize)
 
-    def locate(self, scan: OpenedScan, line: str) -> Located | None:
-        """Return the keypoints of a photo by the JSON of its result; None if it can't be read any more."""
+    def locate(self, scan: OpenedScan, line: str) -> Picture | None:
+        """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
         result = Result.from_json(line)
         pano = Path(result.pano)
-        with suppress(OSError, InputError):
+        try:
             return scan.locate(self.folder / pano, result, self.read_options, self.settings_of(pano))
+        except (OSError, InputError) as error:
+            if is_passing(error):
+                raise
         return None
 
-    def _answer(self, scan: OpenedScan, task: Task, localize: Callable[..., Result]) -> Answer:
-        """Return the answer by a function of the photo's path and the options with which it is read."""
+    def _answer(self, scan: OpenedScan, task: Task, localize: Callable[[Path], Result]) -> Answer:
+        """Return the answer by a function of the photo's path."""
         with task.place(self.folder) as path, reading_once():
             try:
-                found = localize(path, read_options=self.read_options)
+                found = localize(path)
                 overlay, mask = self._pictures(scan, path, found)
             except Exception as error:
                 name = str(task.pano)

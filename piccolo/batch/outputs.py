@@ -24,9 +24,9 @@ class StreamOutput:
             self._write(text)
             return
         self._texts.append(text)
-        self._is_waiting = self._is_waiting or parse_line(text).is_to_do(is_again=False)
+        self._is_waiting = self._is_waiting or parse_line(text).is_doubtful
         if not self._is_waiting:
-            self.finish()
+            self.close()
 
     def texts(self) -> list[str]:
         """Return the lines so far."""
@@ -36,12 +36,11 @@ class StreamOutput:
         """Replace a photo's line."""
         self._texts[number] = text
 
-    def finish(self, keeps_others: bool = False) -> int:
-        """Write the lines that waited; returns 0, as none is dropped."""
+    def close(self) -> None:
+        """Write the lines that waited."""
         for text in self._texts[self._num_written :]:
             self._write(text)
         self._num_written = len(self._texts)
-        return 0
 
 
 class FileOutput:
@@ -75,7 +74,7 @@ class FileOutput:
         self._file.append(text)
         self._replaced[number] = begin, self._file.size
 
-    def finish(self, keeps_others: bool = False) -> int:
+    def finish(self, keeps_others: bool) -> int:
         """Put the lines into order; returns how many were dropped (`Records.finish`)."""
         return self._records.finish(self._file, self._spans(), keeps_others)
 

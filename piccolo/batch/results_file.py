@@ -84,6 +84,13 @@ class Finished(NamedTuple):
     span: tuple[int, int]  # [byte] in the file
     pano_sha256: str | None
     status: str
+    is_second: bool  # it replaces an earlier one, as the photo was looked at again
+
+
+def drop_replaced(lines: Sequence[Finished]) -> list[Finished]:
+    """Return the lines of a photo without those that another replaces."""
+    replaced = {line.pano_sha256 for line in lines if line.is_second}
+    return [line for line in lines if line.is_second or line.pano_sha256 not in replaced]
 
 
 class Records:
@@ -130,7 +137,8 @@ class Records:
             if named is None or pano in named:
                 check_as_expected(fields, expected(Path(pano)))
             span = (self.size, self.size + len(content))
-            line = Finished(span, fields.get("pano_sha256"), str(fields.get("status")))
+            is_second = fields.get("beside") is not None
+            line = Finished(span, fields.get("pano_sha256"), str(fields.get("status")), is_second)
             self._others.setdefault(pano, []).append(line)
             self.size = span[1]
         if self._others and named is not None and named.isdisjoint(self._others):
@@ -169,10 +177,12 @@ class Records:
 
         Those of panoramas that were not named are kept before them, or dropped; returns how many were.
         """
-        others = [line for name in self._others.keys() - self._named for line in self._others[name]]
+        others = [
+            line for name in self._others.keys() - self._named for line in drop_replaced(self._others[name])
+        ]
         kept = sorted(line.span for line in others) if keeps_others else []
         file.rearrange([*kept, *spans])
-        return len(others) - len(kept)
+        return 0 if keeps_others else len(others)
 
 
 def write_results(out: Path | None, results: Sequence[Result]) -> None:

@@ -1,30 +1,32 @@
 """A second look at the photos of a batch that are not sure, beside others that are."""
 
 import json
+from bisect import bisect
 from collections.abc import Sequence
+from hashlib import sha256
 from typing import Any, NamedTuple
 
-from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from .localizer import MOST_PICTURES
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED, MIN_CONFIDENCE, NOT_LOCALIZED
+
+MOST_PICTURES = 200  # beside which a photo is looked at again
 
 
 class Line(NamedTuple):
     """A photo's result in a batch."""
 
     text: str  # its JSON
+    pano: str
+    pano_sha256: str | None
     status: str
-    beside: list[str] | None  # as in `Result`
-    is_pinhole: bool  # it has a camera: it is no sphere
+    is_sure: bool  # others may be localized beside it
+    has_camera: bool  # it is no sphere
+    beside: dict[str, Any] | None  # of `Beside`
 
     @property
-    def is_sure(self) -> bool:
-        """True if others may be localized beside it."""
-        return self.status == LOCALIZED and not self.beside
-
-    def is_to_do(self, is_again: bool) -> bool:
-        """Return True if it may be surer beside others; `is_again` if these are others than before."""
-        is_doubtful = self.is_pinhole and self.status in (AMBIGUOUS, NOT_LOCALIZED)
-        return is_doubtful and (self.beside is None or is_again)
+    def is_doubtful(self) -> bool:
+        """True if it may be surer beside others, or was not sure before it was looked at beside others."""
+        was_doubtful = self.beside is not None or self.status in (AMBIGUOUS, NOT_LOCALIZED)
+        return self.has_camera and was_doubtful
 
 
 class Look(NamedTuple):
@@ -32,27 +34,44 @@ class Look(NamedTuple):
 
     number: int  # in the batch
     status: str  # so far
-    first: str  # JSON of its result
+    pano: str
+    first: str  # JSON of its result without the others; empty if that is to be computed again
     beside: tuple[str, ...]  # JSON of the results of photos that are sure
+    asked_sha256: str  # digest of these
 
 
 def parse_line(text: str) -> Line:
     """Return a line of results as far as a second look needs it."""
     fields: dict[str, Any] = json.loads(text)
-    return Line(text, fields["status"], fields["beside"], bool(fields["camera"]))
+    beside = fields["beside"]
+    is_sure = fields["status"] == LOCALIZED and fields["confidence"] >= MIN_CONFIDENCE and beside is None
+    has_camera = bool(fields["camera"])
+    digest = fields["pano_sha256"]
+    return Line(text, fields["pano"], digest, fields["status"], is_sure, has_camera, beside)
 
 
-def list_looks(texts: Sequence[str], is_again: bool) -> list[Look]:
+def list_looks(texts: Sequence[str]) -> list[Look]:
     """List the photos to look at again among results in order, each with others that are sure.
 
-    These are the nearest in order: what was taken one after another mostly belongs together. `is_again` if
-    there are others than when the last ones were looked at.
+    These are the nearest in order: what was taken one after another mostly belongs together. A photo that was
+    looked at beside the same photos is done.
     """
     lines = [parse_line(text) for text in texts]
     sure = [k for k, line in enumerate(lines) if line.is_sure]
     looks = []
-    for k, line in enumerate(lines) if sure else ():
-        if line.is_to_do(is_again):
-            near = sorted(sorted(sure, key=lambda n: abs(n - k))[:MOST_PICTURES])
-            looks.append(Look(k, line.status, line.text, tuple(lines[n].text for n in near)))
+    for k, line in enumerate(lines):
+        if not line.is_doubtful:
+            continue
+        place = bisect(sure, k)
+        around = sure[max(place - MOST_PICTURES, 0) : place + MOST_PICTURES]
+        near = [lines[n] for n in sorted(sorted(around, key=lambda n: abs(n - k))[:MOST_PICTURES])]
+        asked = digest_of(near)
+        if asked != (line.beside["asked_sha256"] if line.beside else digest_of([])):
+            first = "" if line.beside and line.beside["photos"] else line.text
+            looks.append(Look(k, line.status, line.pano, first, tuple(n.text for n in near), asked))
     return looks
+
+
+def digest_of(lines: Sequence[Line]) -> str:
+    """Return a digest of photos: of their paths and contents."""
+    return sha256(json.dumps([(line.pano, line.pano_sha256) for line in lines]).encode()).hexdigest()

@@ -6,7 +6,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -72,6 +72,12 @@ class Run:
     left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
+
+    @property
+    def looks_again(self) -> bool:
+        """True if photos that are not sure are looked at again beside others."""
+        is_default = isinstance(self.localizer.settings, CoarseToFineSettings)
+        return is_default and self.total not in (None, 1)
 
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
@@ -154,12 +160,14 @@ def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
 def open_output(run: Run) -> Iterator[tuple[Output, Records]]:
     """Yield where the results go, and which an earlier run has left there."""
     out = run.arguments.out or STDOUT
-    may_change = run.total not in (None, 1)
     if is_stdout(out):
-        yield StreamOutput(lambda line: print(line, flush=True), may_change), Records()
+        with closing(StreamOutput(lambda line: print(line, flush=True), run.looks_again)) as output:
+            yield output, Records()
     elif is_stream(out):
         with out.open("wb", buffering=0) as stream:
-            yield StreamOutput(lambda line: write_line(stream.fileno(), out, line), may_change), Records()
+            write = partial(write_line, stream.fileno(), out)
+            with closing(StreamOutput(write, run.looks_again)) as output:
+                yield output, Records()
     else:
         with open_locked(out) as file:
             records = take_up_results(run, file)
@@ -244,33 +252,38 @@ def localize_all(
     return interruption
 
 
-def plan_looks(run: Run, output: Output, is_again: bool) -> list[Look]:
-    """Return which photos are to be looked at again, `is_again` if others have a result since."""
-    if run.total in (None, 1) or run.localizer.sends_photos:
-        return []
-    return list_looks(output.texts(), is_again)
+def plan_looks(run: Run, output: Output) -> list[Look]:
+    """Return which photos are to be looked at again beside others."""
+    is_possible = run.looks_again and not run.localizer.sends_photos
+    return list_looks(output.texts()) if is_possible else []
 
 
 def look_again(run: Run, looks: Sequence[Look], executor: Executor, output: Output) -> Interruption:
     """Look again at photos that are not sure, beside those that are, until a signal ends it."""
-    tasks = (run.localizer.task_again(look.first, look.beside) for look in looks)
-    values = executor.values(tasks)
+    localizer = run.localizer
+    values = executor.values(localizer.task(Path(look.pano))._replace(look=look) for look in looks)
     with interruptible() as interruption:
         pairs = show_progress(values, run.arguments.quiet, desc="second look", total=len(looks), unit="")
-        for look, (_, wait) in zip(looks, interruption.each(pairs, values.take_finished()), strict=False):
-            with suppress(WorkerLostError):
-                record_second(run, look, wait(), output)
+        for look, (task, wait) in zip(looks, interruption.each(pairs, values.take_finished()), strict=False):
+            try:
+                answer = wait()
+            except WorkerLostError as error:
+                answer = localizer.answer_of_lost(task, error, run.cloud_sha256)
+            record_second(run, look, answer, output)
     return interruption
 
 
 def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
-    """Replace a result by that of a second look, unless the photo could not be read again."""
+    """Replace a result by that of a second look; if that failed, say why."""
     result = answer.result
     replace_line = partial(output.replace, look.number)
-    if result.beside:
+    is_other = not look.first or (result.beside is not None and result.beside.photos)
+    if result.error is not None:
+        print_error(run.arguments, result.error, EXIT_BAD_INPUT)
+    elif is_other:
         run.counts[look.status] -= 1
         record(run, answer, replace_line)
-    elif result.error is None:
+    else:
         replace_line(result.to_json())
 
 
@@ -279,9 +292,8 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
     arguments = run.arguments
     counts = Counter(run.counts)
     counts.update(records.counts)
-    is_file = isinstance(output, FileOutput)
     num_dropped = 0
-    if not (is_file and interruption.number):
+    if isinstance(output, FileOutput) and not interruption.number:
         num_dropped = output.finish(keeps_others=run.total is None)
     if run.total != 1 or run.left_out or num_dropped:
         words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
@@ -292,7 +304,7 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
     if interruption.number:
         how = (
             "the same command continues from here"
-            if is_file
+            if isinstance(output, FileOutput)
             else "with --out FILE the same command would continue"
         )
         return interruption.stop(arguments, f"{counts.total()} results", how)
@@ -340,10 +352,11 @@ def main(arguments: argparse.Namespace) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        if first is None and not plan_looks(run, output, is_again=False):
+        looks = plan_looks(run, output) if first is None else []
+        if first is None and not looks:
             print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
-        num_jobs = count_jobs(arguments, num_left)
+        num_jobs = count_jobs(arguments, num_left or len(looks) or None)
         with (
             connecting(arguments, num_jobs) as cluster,
             executing(arguments, run.localizer, num_jobs, cluster, partial(open_scan, run)) as place,
@@ -354,7 +367,6 @@ def main(arguments: argparse.Namespace) -> int:
                 output.begin()
             rest = itertools.chain([first] if first else [], left)
             interruption = localize_all(run, records, rest, executor, output.write)
-            looks = [] if interruption.number else plan_looks(run, output, is_again=first is not None)
-            if looks:
+            if looks := [] if interruption.number else plan_looks(run, output):
                 interruption = look_again(run, looks, executor, output)
         return finish(run, records, output, interruption, watch.seconds["all"])

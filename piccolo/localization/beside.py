@@ -9,6 +9,9 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+import numpy as np
+
+from ..confidence.confidence import classify
 from ..confidence.localization import Localization
 from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
@@ -18,25 +21,33 @@ from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
-from .attempts import CHANCE_MATCHES, add_verified
+from .attempts import add_verified
 from .comparison import score_pose
 from .localize import finish
 from .prior import apply_prior
 from .query import Query, prepare_query
+from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
 from .verdict import judge
-from .verification import Located, locate_keypoints, match_beside
+from .verification import Located, match_beside, place_keypoints
 
 MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
+
+
+class Picture(NamedTuple):
+    """A photo that is sure."""
+
+    located: Located
+    confidence: float  # of its pose
 
 
 class Beside(NamedTuple):
     """A photo that shows what another shows."""
 
     name: str
+    confidence: float  # of its own pose
     matches: Matches
     pose: Pose  # of the other, by the matches
-    num_matches: int  # that agree with it
 
 
 @one_blas_thread
@@ -44,7 +55,7 @@ def locate(
     scan_map: ScanMap, panorama: Panorama, pose: Pose, settings: CoarseToFineSettings, workers: Workers
 ) -> Located:
     """Return the keypoints of a photo whose pose in the map is known."""
-    return locate_keypoints(prepare_query(panorama, scan_map, settings, workers), pose)
+    return place_keypoints(prepare_query(panorama, scan_map, settings, workers), pose)
 
 
 @one_blas_thread
@@ -52,7 +63,7 @@ def localize_beside(
     scan_map: ScanMap,
     panorama: Panorama,
     known: Sequence[Pose],
-    pictures: Mapping[str, Located],
+    pictures: Mapping[str, Picture],
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
@@ -60,7 +71,7 @@ def localize_beside(
     """Localize a photo of a part of the sphere by others that are sure, given by their names.
 
     `known` are poses in the map that were found for it alone. Returns the result and the names of those that
-    show the same; without any the result is empty.
+    show the same; without any the result is empty. It is no surer than the surest of them.
     """
     allowed_map = apply_prior(scan_map, settings.prior)
     with watch.stage("match"):
@@ -73,23 +84,37 @@ def localize_beside(
         query = replace(query, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
         hypotheses = add_verified(query, [score_pose(query, pose) for pose in poses])
-        return judge(*finish(query, hypotheses)), tuple(other.name for other in found)
+        result = judge(*finish(query, hypotheses))
+    certainty = max(other.confidence for other in found)
+    return weaken(result, certainty, settings.min_confidence), tuple(other.name for other in found)
 
 
-def find_beside(query: Query, pictures: Mapping[str, Located]) -> list[Beside]:
+def weaken(found: Localization, certainty: float, min_confidence: float) -> Localization:
+    """Return a result whose evidence itself is right with a probability."""
+    none = 1.0 - certainty * (1.0 - (1.0 if found.probability_none is None else found.probability_none))
+    confidence = certainty * found.confidence
+    others = tuple(replace(a, probability=certainty * (a.probability or 0.0)) for a in found.alternatives)
+    probabilities = np.array([confidence, *(a.probability or 0.0 for a in others), none])
+    status = classify(probabilities, min_confidence)
+    return replace(found, status=status, confidence=confidence, probability_none=none, alternatives=others)
+
+
+def find_beside(query: Query, pictures: Mapping[str, Picture]) -> list[Beside]:
     """Find the photos that show what a photo shows, those with the most matches first."""
     compared = query.workers.map(partial(match_picture, query), list(pictures.items()), "match")
-    found = sorted((other for other in compared if other), key=lambda other: -other.num_matches)
-    return found[:MOST_BESIDE]
+    found = [pair for pair in compared if pair]
+    ranked = sorted(found, key=lambda pair: -pair[1])
+    return [other for other, _ in ranked[:MOST_BESIDE]]
 
 
-def match_picture(query: Query, picture: tuple[str, Located]) -> Beside | None:
-    """Match a photo with another, given by its name; None if no more agree than by chance."""
-    name, located = picture
-    matches = match_beside(query, located)
-    if len(matches.query) <= CHANCE_MATCHES:
+def match_picture(query: Query, named: tuple[str, Picture]) -> tuple[Beside, int] | None:
+    """Match a photo with another, given with its name; None if fewer agree than a sure pose has.
+
+    Returns also the number of those that agree.
+    """
+    name, picture = named
+    matches = match_beside(query, picture.located)
+    found = propose_poses(matches, None, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
+    if not found or found[0].num_matches < SURE_MATCHES:
         return None
-    found = propose_poses(matches, None, 1, query.workers)
-    if not found or found[0].num_matches <= CHANCE_MATCHES:
-        return None
-    return Beside(name, matches, *found[0])
+    return Beside(name, picture.confidence, matches, found[0].pose), found[0].num_matches

@@ -4,6 +4,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from ..panorama import Panorama
 from ..views.zbuffer import visible_points
 from .covariance import estimate_covariance
 from .focal_length import FocalFit
+from .last_descent import settle
 from .prior import contradictions
 from .query import Query
 from .selection import SURE_MATCHES, Selection, assess_poses
@@ -34,10 +36,13 @@ TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
-def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Localization:
+def judge(
+    query: Query, found: Selection, fit: FocalFit | None = None, may_change: bool = True
+) -> Localization:
     """Return the result for the best pose: evidence, covariance, probabilities and status.
 
-    `fit` is the fitted focal length, if the photo's is not exact.
+    `fit` is the fitted focal length, if the photo's is not exact. If `may_change`, a copy of the best pose's
+    place that turns out likelier becomes the best.
     """
     if found.best.score < 0.0:
         return Localization()
@@ -61,6 +66,8 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
     standings = assess_poses(query, found.best, reported)
     weighed = credit_copies(query, [h.pose for h in (found.best, *reported)], standings)
     probabilities = posterior(weighed, covariance)
+    if may_change and fit is None and (likelier := int(probabilities[:-1].argmax())):
+        return judge(query, promote(query, found, reported[likelier - 1]), None, may_change=False)
     warnings = contradictions(query.scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
@@ -89,18 +96,23 @@ def judge(query: Query, found: Selection, fit: FocalFit | None = None) -> Locali
 
 
 def credit_copies(query: Query, poses: Sequence[Pose], standings: Sequence[Standing]) -> list[Standing]:
-    """Credit copies of the best pose's place with as many matches as that has: there would be as many.
+    """Give the best pose and the copies of its place all the most matches that one of them has.
 
-    How many a photo has with the scan drawn at each tells how well each was scanned.
+    How many of a photo's features agree with the scan drawn at each tells how well each was scanned.
     """
-    most = standings[0].num_matches
-    if not (query.photo.is_partial and most):
+    if not query.photo.is_partial or standings[0].num_matches is None:
         return list(standings)
-    credited = list(standings)
-    for k, is_copy in enumerate(find_copies(query, poses[0], poses[1:]), 1):
-        if is_copy:
-            credited[k] = standings[k]._replace(num_matches=max(standings[k].num_matches or 0, most))
-    return credited
+    is_copy = [True, *find_copies(query, poses[0], poses[1:])]
+    most = max(s.num_matches or 0 for s in compress(standings, is_copy))
+    pairs = zip(standings, is_copy, strict=True)
+    return [s._replace(num_matches=most) if copied else s for s, copied in pairs]
+
+
+def promote(query: Query, found: Selection, alternative: Hypothesis) -> Selection:
+    """Return the selection with an alternative, refined to the end, as the best."""
+    best = settle(query, alternative)
+    others = (found.best, *(h for h in found.alternatives if h is not alternative))
+    return Selection(best, others, max(s.ratio for s in assess_poses(query, best, others)[1:]))
 
 
 def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:

@@ -13,8 +13,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..confidence.occlusion import EXPLAINED, occlusion_mask
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
-from ..local_features.hypotheses import count_matches, exact_pose
+from ..geometry.sphere import compute_indices
+from ..local_features.hypotheses import LEAST_MATCHES, count_matches, exact_pose
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView
@@ -106,14 +108,23 @@ def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
     The scan drawn at the one is matched with the scan drawn at the other.
     """
     keypoints = find_all_drawn(query, pose).keypoints
-    matches = [match_located(keypoints, find_all_drawn(query, other)) for other in others]
-    found = [exact_pose(m, other, None) for m, other in zip(matches, others, strict=True)]
-    return [f is not None and is_near(f.pose, other) for f, other in zip(found, others, strict=True)]
+
+    def is_copy(other: Pose) -> bool:
+        found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other, None)
+        return found is not None and is_near(found.pose, other)
+
+    return query.workers.map(is_copy, others, "compare places")
 
 
-def locate_keypoints(query: Query, pose: Pose) -> Located:
-    """Give the keypoints of a photo that was taken at a pose in the map their ranges, from the scan."""
+def place_keypoints(query: Query, pose: Pose) -> Located:
+    """Give the keypoints of a photo that was taken at a pose in the map their ranges, from the scan.
+
+    Those on what the scan does not show, as people and furniture that has moved, are left out.
+    """
     views, keypoints = query.seen()
+    panorama = query.photo.panorama
+    mask = occlusion_mask(query.surroundings_at(pose)[0], panorama, pose)
+    keypoints = keypoints.take(mask[compute_indices(keypoints.rays, mask.shape[1])] == EXPLAINED)
     ranges = np.zeros(len(keypoints.rays), np.float32)
     for view in views:
         shown = view.find_own(keypoints.rays)
@@ -130,7 +141,7 @@ def match_beside(query: Query, other: Located) -> Matches:
     """
     own = query.seen().keypoints
     mine, theirs = match_pictures(own, other.keypoints)
-    if len(match_pictures(own.mirror(), other.keypoints)[0]) > len(mine):
+    if len(mine) < LEAST_MATCHES or len(match_pictures(own.mirror(), other.keypoints)[0]) > len(mine):
         return NO_MATCHES
     matches = pair(own, mine, other, theirs)
     rays_of_other = rotate_points(matches.directions.astype(np.float64), other.pose.R_cam_from_world)

@@ -24,7 +24,7 @@ from ..localization.query import Cache, Query, prepare_query
 from ..localization.refinement import descend, refine_on_middle_cells
 from ..localization.selection import SURE_SCORE, assess_poses
 from ..localization.settings import CoarseToFineSettings
-from ..localization.verification import is_near, locate_keypoints, match_beside, verify
+from ..localization.verification import is_near, match_beside, place_keypoints, verify
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .frames import (
@@ -179,7 +179,7 @@ class Tracker:
         if has_own_matches(query):
             sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= MOST_EXPECTED]
             others = [(other, pose) for k, pose in sure if (other := self.query_of(k))]
-            located = (locate_keypoints(*other) for other in others)
+            located = (place_keypoints(*other) for other in others)
             query = replace(query, beside=tuple(match_beside(query, one) for one in located))
         return find_near(query, expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion))
 
