@@ -25,6 +25,7 @@ from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import ReadOptions
+from piccolo.panorama.photo import sha256_of
 from piccolo.result import Beside, Result
 from piccolo.scenes.synthetic.world import render_picture
 
@@ -102,10 +103,13 @@ class Looked(NamedTuple):
 @pytest.fixture
 def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
-    ask, looked = OpenedScan.localize_query, Looked([], {})
+    ask, known, looked = OpenedScan.localize_query, {}, Looked([], {})
 
     def localize_query(self, panorama, *more):
-        found = ask(self, panorama, *more)
+        content = panorama.read_bytes()
+        if content not in known:
+            known[content] = ask(self, panorama, *more)
+        found = replace(known[content], pano=str(panorama))
         is_sure = panorama.name not in ("b.jpg", "d.jpg")
         found = replace(found, cameras=PHONE, status=found.status if is_sure else "ambiguous")
         looked.firsts[panorama.name] = found.to_json()
@@ -304,8 +308,9 @@ def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
     settings = opened.settings, opened.cloud_settings
     localizer = Localizer((Path("room"),), *settings, ReadOptions(focal_px=320.0), None)
     answer = localizer.answer_in(opened)
-    a, b = (answer(localizer.task(path)).result for path in paths)
+    a = answer(localizer.task(paths[0])).result
     assert a.status == "localized"
+    b = replace(a, pano=str(paths[1]), source=replace(a.source, pano_sha256=sha256_of(paths[1], None)))
     lost = replace(b, status="not_localized", confidence=0.0, best_pose=None, alternatives=())
     look = Look(0, lost.status, str(paths[1]), lost.to_json(), (a.to_json(),), "1")
     found = answer(localizer.task(paths[1])._replace(look=look)).result
@@ -314,6 +319,6 @@ def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
     assert found.beside == Beside((str(paths[0]),), "1")
     assert pose_errors(found.pose, beside)[0] < 0.05
     assert Result.from_json(found.to_json()).to_json() == found.to_json()
-    itself = look._replace(beside=(replace(a, pano=str(paths[1]), source=b.source).to_json(),))
+    itself = look._replace(beside=(b.to_json(),))
     again = answer(localizer.task(paths[1])._replace(look=itself)).result
     assert again.to_json() == replace(lost, beside=Beside((), "1")).to_json()
