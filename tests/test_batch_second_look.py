@@ -45,7 +45,7 @@ def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
     texts = [_text(f"{k}", status) for k, status in enumerate(statuses)]
     texts += [_text("5", beside={"photos": ["0"], "asked_sha256": "0"}), _text("6", camera=None)]
     texts += [_text("7", "ambiguous", camera=None), _text("8", "not_localized", NONE_ASKED)]
-    texts += [_text("9", confidence=0.89)]
+    texts += [_text("9", confidence=0.94)]
     looks = list_looks(texts)
     assert [(look.number, look.status, look.pano, look.first) for look in looks] == [
         (1, "ambiguous", "1", texts[1]),
@@ -111,7 +111,8 @@ def looked(monkeypatch):
             known[content] = ask(self, panorama, *more)
         found = replace(known[content], pano=str(panorama))
         is_sure = panorama.name not in ("b.jpg", "d.jpg")
-        found = replace(found, cameras=PHONE, status=found.status if is_sure else "ambiguous")
+        status = found.status if is_sure else "ambiguous"
+        found = replace(found, cameras=PHONE, confidence=0.95, status=status)
         looked.firsts[panorama.name] = found.to_json()
         return found
 

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from hashlib import sha256
 from typing import Any, NamedTuple
 
-from ..confidence.confidence import AMBIGUOUS, LOCALIZED, MIN_CONFIDENCE, NOT_LOCALIZED
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
+LEAST_CONFIDENCE = 0.95  # of these: about the log odds of 3 that frames of walks need
 
 
 class Line(NamedTuple):
@@ -44,7 +45,7 @@ def parse_line(text: str) -> Line:
     """Return a line of results as far as a second look needs it."""
     fields: dict[str, Any] = json.loads(text)
     beside = fields["beside"]
-    is_sure = fields["status"] == LOCALIZED and fields["confidence"] >= MIN_CONFIDENCE and beside is None
+    is_sure = fields["status"] == LOCALIZED and fields["confidence"] >= LEAST_CONFIDENCE and beside is None
     has_camera = bool(fields["camera"])
     digest = fields["pano_sha256"]
     return Line(text, fields["pano"], digest, fields["status"], is_sure, has_camera, beside)
