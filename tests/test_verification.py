@@ -4,14 +4,17 @@ import functools
 import math
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import rooms
 from measuring.confidence import mask_outside_field
 
+from piccolo.cloud.stream import Cloud
+from piccolo.cloud.voxels import morton_order
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
-from piccolo.geometry.sphere import pixel_rays
+from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import count_matches
@@ -34,7 +37,8 @@ from piccolo.localization.verification import (
     verify,
 )
 from piccolo.panorama import Panorama
-from piccolo.scenes.synthetic.world import change_light, photograph
+from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scenes.synthetic.world import change_light, photograph, scan_world
 
 NUM_POINTS = 200_000
 WIDTH = 1024
@@ -144,11 +148,41 @@ def test_the_picture_with_the_most_matches_counts(monkeypatch):
 
 
 def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
-    """A pose near another is of the same place, and where one looks elsewhere is none."""
-    near = _moved((0.05, 0.0, 0.02), math.radians(1.0))
-    others = [near, _moved((0.0, 0.0, 0.0), 2.0), _moved((1.0, -0.8, 0.0))]
-    assert find_copies(_query(), _true_pose(), others) == [True, False, False]
-    assert find_copies(_query(), _true_pose(), []) == []
+    """In a scan of a room and its twin, scanned again: not elsewhere in the twin, nor near in the room."""
+    world, cloud = rooms.room(1, NUM_POINTS)
+    apart = np.float32([6.0, 0.0, 0.0])
+    points, colors, _ = scan_world(world._replace(seed=99), NUM_POINTS, Workers(2))
+    twin = (points - cloud.origin_world).astype(np.float32) + apart
+    both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
+    order = morton_order(both.points, both.colors)
+    both = Cloud(both.points[order], both.colors[order], both.origin_world)
+    query = prepare_query(_narrow()[0], prepare_map(both, Workers(2)), SETTINGS, Workers(2))
+    here = query.scan_map.from_world(_narrow()[1])
+    moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
+    others = [step(here, np.array([0.0, 0.0, 0.02, *move])) for move in moves]
+    away = step(here, np.array([0.0, 0.0, 2.0, *apart]))
+    assert find_copies(query, here, [*others, away]) == [True, False, False, False]
+    assert find_copies(query, here, []) == []
+
+
+def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
+    rng = np.random.default_rng(0)
+    query = _asked()
+    panorama = query.photo.panorama
+    hidden = np.zeros(panorama.is_valid.shape, bool)
+    hidden[230:300, 310:390] = True
+    assert panorama.is_valid[hidden].all()
+    rgb = panorama.rgb.copy()
+    poster = cv2.resize(rng.integers(0, 255, (14, 16, 3), np.uint8), (80, 70), interpolation=cv2.INTER_CUBIC)
+    rgb[230:300, 310:390] = poster
+    given = Panorama(rgb, panorama.is_valid)
+    occluded = prepare_query(given, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    for asked, least, most in ((query, 0.5, 1.0), (occluded, 0.0, 0.1)):
+        seen = asked.seen().keypoints.rays
+        kept = place_keypoints(asked, _true_pose()).keypoints.rays
+        num_seen, num_kept = (hidden[compute_indices(rays, WIDTH)].sum() for rays in (seen, kept))
+        assert num_seen > 10
+        assert least * num_seen <= num_kept <= most * num_seen
 
 
 def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():
