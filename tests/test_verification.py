@@ -159,8 +159,8 @@ def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
     query = prepare_query(_narrow()[0], prepare_map(both, Workers(2)), SETTINGS, Workers(2))
     here = query.scan_map.from_world(_narrow()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
-    others = [step(here, np.array([0.0, 0.0, 0.02, *move])) for move in moves]
-    away = step(here, np.array([0.0, 0.0, 2.0, *apart]))
+    others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]
+    away = Pose(yaw_rotation(2.0) @ here.R_cam_from_world, here.center_world + apart)
     assert find_copies(query, here, [*others, away]) == [True, False, False, False]
     assert find_copies(query, here, []) == []
 
