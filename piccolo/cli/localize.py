@@ -196,9 +196,7 @@ def advise(result: Result) -> list[str]:
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
     if result.confidence >= MIN_FIT:
-        return [
-            "  to be sure, look at the --overlay, give --near, or localize several photos of a walk (--walk)"
-        ]
+        return ["  to be sure, look at the --overlay, give --near, or add photos that were taken beside it"]
     causes = (
         "another scan, bare walls, or a wrong focal length"
         if result.cameras
