@@ -153,7 +153,8 @@ class OpenedScan:
         if photo.sha256 != result.source.pano_sha256:
             return None
         pose = self.from_world(result.best_pose)
-        return Picture(locate(prepared, picture, pose, settings, self.workers), result.confidence)
+        located = locate(prepared, picture, pose, settings, self.workers)
+        return Picture(located, result.confidence, result.covariance)
 
     def localize_again(
         self,

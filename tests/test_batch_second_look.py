@@ -276,8 +276,9 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, ReadOptions(), None)
-    located, confidence = localizer.locate(opened, text)
+    located, confidence, covariance = localizer.locate(opened, text)
     assert confidence == json.loads(text)["confidence"]
+    assert covariance.matrix.tolist() == json.loads(text)["covariance"]
     assert located.pose.key == opened.from_world(Result.from_json(text).best_pose).key
     assert len(located.ranges) == len(located.keypoints.rays) > 50
     assert (located.ranges > 0.0).all()

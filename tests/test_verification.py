@@ -12,16 +12,19 @@ from measuring.confidence import mask_outside_field
 
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
+from piccolo.confidence.confidence import Standing
+from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
-from piccolo.local_features.hypotheses import count_matches
+from piccolo.local_features.hypotheses import count_matches, exact_pose
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.beside import Picture, localize_beside
+from piccolo.localization.beside import Beside, Picture, fuse, localize_beside, match_covariance
+from piccolo.localization.bundle import subtract
 from piccolo.localization.localize import localize
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -103,7 +106,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     nothing = replace_keypoints(_beside(), np.arange(3))
     ask = functools.partial(localize_beside, rooms.scan_map(1, NUM_POINTS), panorama, [])
     found, names = ask(
-        {"bare": Picture(nothing, 0.99), "beside": Picture(_beside(), 0.97)},
+        {"bare": Picture(nothing, 0.99, None), "beside": Picture(_beside(), 0.97, None)},
         SETTINGS,
         Workers(2),
         Stopwatch(),
@@ -114,7 +117,72 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     assert found.probability_none == pytest.approx(1.0 - found.confidence, abs=0.01)
     assert found.evidence.num_matches >= 20
     assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
-    assert ask({"bare": Picture(nothing, 0.99)}, SETTINGS, Workers(2), Stopwatch()) == (Localization(), ())
+    assert ask({"bare": Picture(nothing, 0.99, None)}, SETTINGS, Workers(2), Stopwatch()) == (
+        Localization(),
+        (),
+    )
+
+
+def _matches_of(pose, noise, rng, count=60):
+    """Matches with points around a pose, with an error of their rays [rad] along each axis."""
+    rays = rng.normal(size=(count, 3))
+    rays /= np.linalg.norm(rays, axis=1)[:, None]
+    points = pose.center_world + rng.uniform(2.0, 5.0, (count, 1)) * (rays @ pose.R_cam_from_world)
+    found = rays + noise * rng.normal(size=rays.shape)
+    found /= np.linalg.norm(found, axis=1)[:, None]
+    tangents = np.cross(found, [0.3, 0.4, 0.5])
+    tangents /= np.linalg.norm(tangents, axis=1)[:, None]
+    given = NO_MATCHES._replace(query=np.arange(count, dtype=np.int32), rays=np.float32(found))
+    sizes = np.float32(np.linalg.norm(points - pose.center_world, axis=1))
+    return given._replace(
+        ray_tangents=np.float32(tangents),
+        angles=np.ones(count, np.float32),
+        points=np.float32(points),
+        tangents=np.float32(tangents @ pose.R_cam_from_world),
+        sizes=sizes,
+        weights=np.ones(count, np.float32),
+    )
+
+
+def test_the_covariance_of_matches_is_that_of_poses_found_by_them():
+    rng = np.random.default_rng(3)
+    noise = 1e-3
+    true = _true_pose()
+    squares, expected = [], []
+    for _ in range(60):
+        matches = _matches_of(true, noise, rng)
+        found = exact_pose(matches, true, None).pose
+        covariance = match_covariance(matches, found)
+        step = subtract(true, found)
+        squares.append(step @ np.linalg.solve(covariance, step))
+        expected.append(np.sqrt(np.diag(covariance)))
+    assert 4.0 < np.mean(squares) < 9.0  # 6 parameters
+    assert 0.5e-4 < np.median(expected) < 1e-3
+
+
+def test_a_pose_is_averaged_with_that_by_a_photo_beside():
+    """By their covariances; not if it is ruled out, or of another place."""
+    rng = np.random.default_rng(1)
+    scan_map = rooms.scan_map(1, NUM_POINTS)
+    true = _true_pose()
+    here = scan_map.to_world(true)
+    off = Pose(here.R_cam_from_world, here.center_world + np.array([0.09, 0.0, 0.0]))
+    wide, narrow = (PoseCovariance(np.diag([1e-6] * 3 + [s**2] * 3), "x") for s in (0.05, 0.01))
+    found = Localization(
+        "not_localized", 0.8, 0.2, off, covariance=wide, standings=(Standing(1.0, 0.5, 40, is_drawn=True),)
+    )
+    picture = Picture(verification.Located(_beside().keypoints, _beside().ranges, true), 0.99, narrow)
+    other = Beside("b", picture, _matches_of(true, 1e-3, rng), true)
+    fused = fuse(found, other, scan_map)
+    distance = rooms.errors(fused.pose, here)[0]
+    assert distance == pytest.approx(0.09 * 0.01**2 / (0.05**2 + 0.01**2), rel=0.2)
+    assert fused.covariance.largest_std < 0.0105
+    assert fused.confidence > 0.9
+    assert fused.confidence + fused.probability_none == pytest.approx(1.0)
+    for same in (replace(found, confidence=0.0), replace(found, covariance=None)):
+        assert fuse(same, other, scan_map) is same
+    elsewhere = other._replace(pose=_moved((0.5, 0.0, 0.0)))
+    assert fuse(found, elsewhere, scan_map) is found
 
 
 def replace_keypoints(located, kept):

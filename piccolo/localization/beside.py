@@ -11,17 +11,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..confidence.confidence import classify
+from ..confidence.confidence import classify, posterior
+from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..confidence.localization import Localization
-from ..geometry.pose import Pose
+from ..geometry.pose import Array, Pose, skew
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..local_features.hypotheses import propose_poses
+from ..local_features.hypotheses import find_inliers, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
+from .bundle import differentiate, turn_positions, update
 from .comparison import score_pose
 from .localize import finish
 from .prior import apply_prior
@@ -29,8 +31,9 @@ from .query import Query, prepare_query
 from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
 from .verdict import judge
-from .verification import Located, match_beside, place_keypoints
+from .verification import COS_AGREE, Located, is_near, match_beside, place_keypoints
 
+HERE = Pose(np.eye(3), np.zeros(3))
 MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
 
 
@@ -39,13 +42,14 @@ class Picture(NamedTuple):
 
     located: Located
     confidence: float  # of its pose
+    covariance: PoseCovariance | None  # of its pose, in the world
 
 
 class Beside(NamedTuple):
     """A photo that shows what another shows."""
 
     name: str
-    confidence: float  # of its own pose
+    picture: Picture
     matches: Matches
     pose: Pose  # of the other, by the matches
 
@@ -84,9 +88,41 @@ def localize_beside(
         query = replace(query, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
         hypotheses = add_verified(query, [score_pose(query, pose) for pose in poses])
-        result = judge(*finish(query, hypotheses))
-    certainty = max(other.confidence for other in found)
+        result = fuse(judge(*finish(query, hypotheses)), found[0], scan_map)
+    certainty = max(other.picture.confidence for other in found)
     return weaken(result, certainty, settings.min_confidence), tuple(other.name for other in found)
+
+
+def fuse(found: Localization, other: Beside, scan_map: ScanMap) -> Localization:
+    """Return a result whose pose is the weighted mean of its own and of that by the photo beside.
+
+    It stays as it is if the two are not of one place, or if its own is ruled out.
+    """
+    is_ruled_out = found.confidence == 0.0
+    if found.pose is None or is_ruled_out or found.covariance is None or other.picture.covariance is None:
+        return found
+    own = scan_map.from_world(found.pose)
+    if not is_near(own, other.pose):
+        return found
+    R_map_from_world = scan_map.R_map_from_world
+    of_own = turn_positions(found.covariance.matrix, R_map_from_world)
+    of_picture = turn_positions(other.picture.covariance.matrix, R_map_from_world)
+    J = differentiate(HERE, other.pose) @ np.linalg.inv(differentiate(HERE, other.picture.located.pose))
+    of_expected = J @ of_picture @ J.T + match_covariance(other.matches, other.pose)
+    pose, covariance = update(other.pose, of_expected, own, of_own)
+    in_world = turn_positions(covariance, R_map_from_world.T)
+    words = least_constrained_direction(covariance[3:, 3:], in_world[3:, 3:])
+    known = PoseCovariance(0.5 * (in_world + in_world.T), words)
+    probabilities = posterior(found.standings, known)
+    others = zip(found.alternatives, probabilities[1:-1], strict=True)
+    return replace(
+        found,
+        confidence=float(probabilities[0]),
+        probability_none=float(probabilities[-1]),
+        pose=scan_map.to_world(pose),
+        alternatives=tuple(replace(a, probability=float(p)) for a, p in others),
+        covariance=known,
+    )
 
 
 def weaken(found: Localization, certainty: float, min_confidence: float) -> Localization:
@@ -97,6 +133,22 @@ def weaken(found: Localization, certainty: float, min_confidence: float) -> Loca
     probabilities = np.array([confidence, *(a.probability or 0.0 for a in others), none])
     status = classify(probabilities, min_confidence)
     return replace(found, status=status, confidence=confidence, probability_none=none, alternatives=others)
+
+
+def match_covariance(matches: Matches, pose: Pose) -> Array:
+    """Return the covariance (6, 6) of a pose by its matches: turns in the camera's axes, moves in the map's.
+
+    A ray u to a point at distance r changes by w x u - (I - u u^T) R d / r.
+    """
+    agreeing = find_inliers(matches, pose, COS_AGREE)
+    offsets = (matches.points[agreeing] - pose.center_world) @ pose.R_cam_from_world.T
+    ranges = np.linalg.norm(offsets, axis=1)[:, None, None]
+    rays = offsets / ranges[:, 0]
+    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
+    turns = np.array([-skew(ray) for ray in rays])
+    J = np.concatenate([turns, -across @ pose.R_cam_from_world / ranges], axis=2).reshape(-1, 6)
+    squares = np.square(rays - matches.rays[agreeing]).sum(axis=1)
+    return np.asarray(0.5 * squares.mean() * np.linalg.pinv(J.T @ J))
 
 
 def find_beside(query: Query, pictures: Mapping[str, Picture]) -> list[Beside]:
@@ -117,4 +169,4 @@ def match_picture(query: Query, named: tuple[str, Picture]) -> tuple[Beside, int
     found = propose_poses(matches, None, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
     if not found or found[0].num_matches < SURE_MATCHES:
         return None
-    return Beside(name, picture.confidence, matches, found[0].pose), found[0].num_matches
+    return Beside(name, picture, matches, found[0].pose), found[0].num_matches

@@ -284,8 +284,13 @@ def fuse_pose(
     of_expected = J @ of_rest @ J.T + RELATIVE
     if own is None:
         return expected, of_expected
-    step = subtract(own.pose, expected)
-    gain = of_expected @ weigh_robustly(step, own.covariance + of_expected)  # of Kalman
+    return update(expected, of_expected, own.pose, own.covariance)
+
+
+def update(expected: Pose, of_expected: Array, own: Pose, of_own: Array) -> tuple[Pose, Array]:
+    """Return the weighted mean of two poses by their covariances (6, 6), and its covariance."""
+    step = subtract(own, expected)
+    gain = of_expected @ weigh_robustly(step, of_own + of_expected)  # of Kalman
     return add(expected, gain @ step), of_expected - gain @ of_expected
 
 
