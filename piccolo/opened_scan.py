@@ -25,6 +25,7 @@ from .localization.beside import Picture, localize_beside, locate
 from .localization.bundle import localize_bundle
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
+from .localization.verification import is_near
 from .panorama import Panorama, ReadOptions, read_photo
 from .panorama.photo import PhotoFacts, sha256_of
 from .paper.localize import PaperMap
@@ -181,7 +182,9 @@ class OpenedScan:
         with watch.stage("read"):
             pictures = list_pictures()
         found, names = localize_beside(prepared, picture, poses, pictures, settings, self.workers, watch)
-        if not names:
+        is_surer = found.confidence > first.confidence
+        is_other = first.best_pose and found.pose and not is_near(found.pose, first.best_pose)
+        if not names or not (is_surer or is_other):
             return first, ()
         about = settings_json(settings, self.cloud_settings, read_options)
         result = self._make_result(panorama, picture, photo, found, about, watch.seconds)

@@ -208,7 +208,8 @@ def test_of_lines_that_stay_those_are_dropped_that_others_replace(
     out = tmp_path / "poses.jsonl"
     assert _run(scene, photos, "--out", out, "--quiet") == 0
     a, b, c = out.read_text().splitlines(keepends=True)
-    out.write_text(a + looked.firsts["b.jpg"] + "\n" + c + b)
+    before = json.dumps(json.loads(b) | {"seconds": {"read": 1.0}}) + "\n"
+    out.write_text(a + looked.firsts["b.jpg"] + "\n" + c + before + b)
     names = tmp_path / "names"
     names.write_text(str(photos / "a.jpg"))
     with names.open() as stdin:
@@ -259,6 +260,8 @@ def test_what_is_looked_at(scene, monkeypatch):
     found, names = look(first, {"x": None})
     assert (found.status, found.confidence, names) == ("localized", 0.7, ("x",))
     assert found.source == first.source
+    assert look(replace(first, confidence=0.8), {"x": None})[1] == (), "it is no surer"
+    del asked[1:]
     assert asked == [[opened.from_world(first.best_pose).key]]
     assert look(first, {}) == (first, ())
     assert len(asked) == 2

@@ -38,9 +38,9 @@ class StreamOutput:
 
     def close(self) -> None:
         """Write the lines that waited."""
-        for text in self._texts[self._num_written :]:
-            self._write(text)
-        self._num_written = len(self._texts)
+        while self._num_written < len(self._texts):
+            self._num_written += 1
+            self._write(self._texts[self._num_written - 1])
 
 
 class FileOutput:

@@ -89,8 +89,9 @@ class Finished(NamedTuple):
 
 def drop_replaced(lines: Sequence[Finished]) -> list[Finished]:
     """Return the lines of a photo without those that another replaces."""
-    replaced = {line.pano_sha256 for line in lines if line.is_second}
-    return [line for line in lines if line.is_second or line.pano_sha256 not in replaced]
+    if not any(line.is_second for line in lines):
+        return list(lines)
+    return list({line.pano_sha256: line for line in lines}.values())
 
 
 class Records:

@@ -196,7 +196,10 @@ def advise(result: Result) -> list[str]:
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
     if result.confidence >= MIN_FIT:
-        return ["  to be sure, look at the --overlay, give --near, or add photos that were taken beside it"]
+        others = (
+            "add photos taken beside it" if result.cameras else "localize several photos of a walk (--walk)"
+        )
+        return [f"  to be sure, look at the --overlay, give --near, or {others}"]
     causes = (
         "another scan, bare walls, or a wrong focal length"
         if result.cameras

@@ -84,6 +84,11 @@ def none_features(covariance: PoseCovariance | None) -> Array:
     return np.array([1.0, math.log10(min(max(std, LEAST_STD), MOST_STD))])
 
 
+def probability_within(covariance: PoseCovariance | None) -> float:
+    """Return the probability that a pose of the right place is right by its deviation."""
+    return 1.0 if covariance is None else math.erf(MAX_DISTANCE / (covariance.largest_std * math.sqrt(2.0)))
+
+
 def posterior(
     standings: Sequence[Standing], covariance: PoseCovariance | None, model: ChoiceModel | None = None
 ) -> Array:
@@ -98,8 +103,7 @@ def posterior(
     logits.append(float(none_features(covariance) @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))
     probabilities = odds / odds.sum()
-    if covariance is not None:
-        probabilities[:-1] *= math.erf(MAX_DISTANCE / (covariance.largest_std * math.sqrt(2.0)))
+    probabilities[:-1] *= probability_within(covariance)
     probabilities[-1] = 1.0 - probabilities[:-1].sum()
     return np.asarray(probabilities)
 

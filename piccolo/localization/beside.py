@@ -11,29 +11,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..confidence.confidence import classify, posterior
+from ..confidence.confidence import classify, probability_within
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose, skew
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..local_features.hypotheses import find_inliers, propose_poses
+from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
-from .bundle import differentiate, turn_positions, update
+from .bundle import LOOSE, ROBUST, differentiate, subtract, turn_positions, update
 from .comparison import score_pose
-from .localize import finish
-from .prior import apply_prior
+from .localize import Found, finish
+from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
 from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
 from .verdict import judge
-from .verification import COS_AGREE, Located, is_near, match_beside, place_keypoints
+from .verification import Located, is_near, match_beside, place_keypoints
 
 HERE = Pose(np.eye(3), np.zeros(3))
+LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
 
 
@@ -88,51 +89,75 @@ def localize_beside(
         query = replace(query, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
         hypotheses = add_verified(query, [score_pose(query, pose) for pose in poses])
-        result = fuse(judge(*finish(query, hypotheses)), found[0], scan_map)
-    certainty = max(other.picture.confidence for other in found)
-    return weaken(result, certainty, settings.min_confidence), tuple(other.name for other in found)
+        ended = finish(query, hypotheses)
+        judged = judge(*ended)
+        kept = list_agreeing(judged, found, ended.query.beside, scan_map)
+        if not kept:
+            return Localization(), ()
+        result = fuse(judged, kept[0], ended, scan_map)
+    certainty = max(other.picture.confidence for other in kept)
+    return weaken(result, certainty, settings.min_confidence), tuple(other.name for other in kept)
 
 
-def fuse(found: Localization, other: Beside, scan_map: ScanMap) -> Localization:
+def list_agreeing(
+    judged: Localization, found: Sequence[Beside], matches: Sequence[Matches], scan_map: ScanMap
+) -> list[Beside]:
+    """List the photos whose matches (rays by the final camera) put a photo where it is by all evidence."""
+    if judged.pose is None:
+        return []
+    own = scan_map.from_world(judged.pose)
+    agreeing = []
+    for other, turned in zip(found, matches, strict=True):
+        exact = exact_pose(turned, own, None)
+        if exact and exact.num_matches >= SURE_MATCHES and is_near(exact.pose, own):
+            agreeing.append(other._replace(matches=turned, pose=exact.pose))
+    return agreeing
+
+
+def fuse(judged: Localization, other: Beside, ended: Found, scan_map: ScanMap) -> Localization:
     """Return a result whose pose is the weighted mean of its own and of that by the photo beside.
 
-    It stays as it is if the two are not of one place, or if its own is ruled out.
+    It stays as it is if it is ruled out, if the two contradict each other, or if the mean contradicts the
+    prior. An error of the focal length is common to both. How likely the place is does not change.
     """
-    is_ruled_out = found.confidence == 0.0
-    if found.pose is None or is_ruled_out or found.covariance is None or other.picture.covariance is None:
-        return found
-    own = scan_map.from_world(found.pose)
-    if not is_near(own, other.pose):
-        return found
+    of_photo = other.picture.covariance
+    if judged.pose is None or judged.covariance is None or of_photo is None or judged.confidence == 0.0:
+        return judged
+    common = np.zeros((6, 6)) if ended.fit is None else ended.fit.pose_covariance
     R_map_from_world = scan_map.R_map_from_world
-    of_own = turn_positions(found.covariance.matrix, R_map_from_world)
-    of_picture = turn_positions(other.picture.covariance.matrix, R_map_from_world)
+    own = scan_map.from_world(judged.pose)
+    of_own = turn_positions(judged.covariance.matrix, R_map_from_world) - common
     J = differentiate(HERE, other.pose) @ np.linalg.inv(differentiate(HERE, other.picture.located.pose))
-    of_expected = J @ of_picture @ J.T + match_covariance(other.matches, other.pose)
+    of_expected = J @ turn_positions(of_photo.matrix, R_map_from_world) @ J.T
+    of_expected += match_covariance(other.matches, other.pose)
+    step = subtract(own, other.pose)
+    if step @ np.linalg.solve(of_own + of_expected, step) > ROBUST:
+        return judged
     pose, covariance = update(other.pose, of_expected, own, of_own)
+    if contradictions(scan_map, pose, ended.query.settings.prior):
+        return judged
+    covariance += common
     in_world = turn_positions(covariance, R_map_from_world.T)
     words = least_constrained_direction(covariance[3:, 3:], in_world[3:, 3:])
     known = PoseCovariance(0.5 * (in_world + in_world.T), words)
-    probabilities = posterior(found.standings, known)
-    others = zip(found.alternatives, probabilities[1:-1], strict=True)
-    return replace(
-        found,
-        confidence=float(probabilities[0]),
-        probability_none=float(probabilities[-1]),
-        pose=scan_map.to_world(pose),
-        alternatives=tuple(replace(a, probability=float(p)) for a, p in others),
-        covariance=known,
-    )
+    gain = probability_within(known) / probability_within(judged.covariance)
+    return scale(replace(judged, pose=scan_map.to_world(pose), covariance=known), gain)
 
 
 def weaken(found: Localization, certainty: float, min_confidence: float) -> Localization:
-    """Return a result whose evidence itself is right with a probability."""
-    none = 1.0 - certainty * (1.0 - (1.0 if found.probability_none is None else found.probability_none))
-    confidence = certainty * found.confidence
-    others = tuple(replace(a, probability=certainty * (a.probability or 0.0)) for a in found.alternatives)
-    probabilities = np.array([confidence, *(a.probability or 0.0 for a in others), none])
-    status = classify(probabilities, min_confidence)
-    return replace(found, status=status, confidence=confidence, probability_none=none, alternatives=others)
+    """Return a result whose evidence itself is right with a probability, and its status."""
+    found = scale(found, certainty)
+    others = [a.probability or 0.0 for a in found.alternatives]
+    probabilities = np.array([found.confidence, *others, found.probability_none])
+    return replace(found, status=classify(probabilities, min_confidence))
+
+
+def scale(found: Localization, factor: float) -> Localization:
+    """Return a result with the probabilities of all its poses multiplied."""
+    confidence = factor * found.confidence
+    others = tuple(replace(a, probability=factor * (a.probability or 0.0)) for a in found.alternatives)
+    none = 1.0 - confidence - sum(a.probability or 0.0 for a in others)
+    return replace(found, confidence=confidence, probability_none=none, alternatives=others)
 
 
 def match_covariance(matches: Matches, pose: Pose) -> Array:
@@ -140,15 +165,18 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
 
     A ray u to a point at distance r changes by w x u - (I - u u^T) R d / r.
     """
-    agreeing = find_inliers(matches, pose, COS_AGREE)
+    agreeing = find_inliers(matches, pose, COS_EXACT)
     offsets = (matches.points[agreeing] - pose.center_world) @ pose.R_cam_from_world.T
-    ranges = np.linalg.norm(offsets, axis=1)[:, None, None]
-    rays = offsets / ranges[:, 0]
-    across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    turns = np.array([-skew(ray) for ray in rays])
-    J = np.concatenate([turns, -across @ pose.R_cam_from_world / ranges], axis=2).reshape(-1, 6)
-    squares = np.square(rays - matches.rays[agreeing]).sum(axis=1)
-    return np.asarray(0.5 * squares.mean() * np.linalg.pinv(J.T @ J))
+    ranges = np.linalg.norm(offsets, axis=1)
+    rays = offsets / ranges[:, None]
+    J = np.empty((len(rays), 3, 6))
+    for k, (ray, distance) in enumerate(zip(rays, ranges, strict=True)):
+        J[k, :, :3] = -skew(ray)
+        J[k, :, 3:] = -(np.eye(3) - np.outer(ray, ray)) @ pose.R_cam_from_world / distance
+    information = np.einsum("kai,kaj->ij", J, J)
+    squares = np.square(rays - matches.rays[agreeing]).sum()
+    variance = max(squares / max(2 * len(rays) - 6, 1), LEAST_ERROR**2)
+    return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
 
 
 def find_beside(query: Query, pictures: Mapping[str, Picture]) -> list[Beside]:

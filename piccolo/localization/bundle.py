@@ -94,7 +94,7 @@ def localize_bundle(
     members: dict[int, Member] = {}
     for k, panorama in enumerate(panoramas):
         found = find_pose(scan_map, panorama, settings, workers, watch)
-        alone.append(found if isinstance(found, Localization) else judge(*found))
+        alone.append(found if isinstance(found, Localization) else judge(*found, may_change=False))
         if not isinstance(found, Localization) and alone[k].pose is not None:
             members[k] = Member(found, alone[k], cams_from_bundle[k])
     bundles = propose_bundles(list(members.values()))

@@ -66,7 +66,8 @@ def judge(
     standings = assess_poses(query, found.best, reported)
     weighed = credit_copies(query, [h.pose for h in (found.best, *reported)], standings)
     probabilities = posterior(weighed, covariance)
-    if may_change and fit is None and (likelier := int(probabilities[:-1].argmax())):
+    likelier = int(probabilities[:-1].argmax())
+    if may_change and fit is None and weighed[likelier] is not standings[likelier] and likelier:
         return judge(query, promote(query, found, reported[likelier - 1]), None, may_change=False)
     warnings = contradictions(query.scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, found.best):

@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
-from ..confidence.confidence import LOCALIZED
+from ..confidence.confidence import LOCALIZED, probability_within
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
-from ..geometry.pose import MAX_DISTANCE, Array, Pose, pose_errors
+from ..geometry.pose import Array, Pose, pose_errors
 from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
@@ -89,11 +89,6 @@ def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
     )
     others = (State(scan_map.from_world(a.pose), odds(a.probability or 0.0)) for a in found.alternatives)
     return [best, *others]
-
-
-def probability_within(covariance: PoseCovariance | None) -> float:
-    """Return the probability that a pose of the right place is right by its deviation."""
-    return 1.0 if covariance is None else math.erf(MAX_DISTANCE / (covariance.largest_std * math.sqrt(2.0)))
 
 
 def log_odds_of_place(probability: float, total: float, covariance: PoseCovariance | None) -> float:

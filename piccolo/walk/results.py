@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import classify
+from ..confidence.confidence import classify, probability_within
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Array, Pose, exp_so3
 from .beliefs import Belief
-from .frames import Frame, probability_within
+from .frames import Frame
 from .motion import Motion
 from .path import EVEN, Gap, Path
 from .tracker import Tracker
