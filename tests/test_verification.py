@@ -160,7 +160,7 @@ def test_the_covariance_of_matches_is_that_of_poses_found_by_them(noise, count):
 
 
 def test_a_pose_is_averaged_with_that_by_a_photo_beside():
-    """By their covariances; not if it is ruled out, nor if they or a prior contradict each other."""
+    """By their covariances; not if it is ruled out, nor against a prior."""
     rng = np.random.default_rng(1)
     scan_map = rooms.scan_map(1, NUM_POINTS)
     true = _true_pose()
@@ -177,8 +177,12 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert fused.covariance.largest_std < 0.0105
     assert fused.confidence == pytest.approx(0.8 * math.erf(10.0 / 2**0.5) / math.erf(2.0 / 2**0.5), rel=1e-3)
     assert fused.confidence + fused.probability_none == pytest.approx(1.0)
-    far = replace(judged, pose=Pose(off.R_cam_from_world, off.center_world + np.array([0.15, 0.0, 0.0])))
-    for same in (replace(judged, confidence=0.0), replace(judged, covariance=None), far):
+    sure = PoseCovariance(np.diag([1e-6] * 3 + [0.01**2] * 3), "x")
+    apart = fuse(replace(judged, covariance=sure), other, ended, scan_map)
+    assert rooms.errors(apart.pose, here)[0] == pytest.approx(0.045, abs=0.004)
+    assert apart.covariance.largest_std == pytest.approx(0.09 / 12.0**0.5, rel=0.1)
+    assert apart.confidence < 0.8
+    for same in (replace(judged, confidence=0.0), replace(judged, covariance=None)):
         assert fuse(same, other, ended, scan_map) is same
     away = replace(SETTINGS, prior=Prior(near_world=(*(here.center_world[:2] + 5.0), None), radius=0.5))
     against = Found(replace(_query(), settings=away), NOTHING, None)
