@@ -23,7 +23,7 @@ from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
 from piccolo.localization.beside import Beside, Picture, fuse, localize_beside, match_covariance
-from piccolo.localization.bundle import subtract
+from piccolo.localization.bundle import ROBUST, subtract
 from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found, localize
 from piccolo.localization.query import prepare_query
@@ -180,7 +180,8 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     sure = PoseCovariance(np.diag([1e-6] * 3 + [0.01**2] * 3), "x")
     apart = fuse(replace(judged, covariance=sure), other, ended, scan_map)
     assert rooms.errors(apart.pose, here)[0] == pytest.approx(0.045, abs=0.004)
-    assert apart.covariance.largest_std == pytest.approx(0.09 / 12.0**0.5, rel=0.1)
+    excess = 0.09**2 / (2.0 * 0.01**2) - ROBUST + 1.0
+    assert apart.covariance.largest_std == pytest.approx(0.01 * (excess / 2.0) ** 0.5, rel=0.1)
     assert apart.confidence < 0.8
     for same in (replace(judged, confidence=0.0), replace(judged, covariance=None)):
         assert fuse(same, other, ended, scan_map) is same

@@ -23,7 +23,7 @@ from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
-from .bundle import LOOSE, differentiate, subtract, turn_positions, update
+from .bundle import LOOSE, ROBUST, differentiate, subtract, turn_positions, update
 from .comparison import score_pose
 from .localize import Found, finish
 from .prior import apply_prior, contradictions
@@ -117,8 +117,8 @@ def list_agreeing(
 def fuse(judged: Localization, other: Beside, ended: Found, scan_map: ScanMap) -> Localization:
     """Return a result whose pose is the weighted mean of its own and of that by the photo beside.
 
-    If they differ by more than their covariances say, these grow until they agree (Birge, 1932). An error of
-    the focal length is common to both. How likely the place is does not change. A result that is ruled out
+    If they contradict each other, their covariances grow by as much. An error of the focal length is common
+    to both. How likely the place is does not change. A result that is ruled out
     stays as it is, and one whose mean would contradict the prior.
     """
     of_photo = other.picture.covariance
@@ -132,7 +132,7 @@ def fuse(judged: Localization, other: Beside, ended: Found, scan_map: ScanMap) -
     of_expected = J @ turn_positions(of_photo.matrix, R_map_from_world) @ J.T
     of_expected += match_covariance(other.matches, other.pose)
     step = subtract(own, other.pose)
-    excess = max(float(step @ np.linalg.solve(of_own + of_expected, step)) / len(step), 1.0)
+    excess = max(float(step @ np.linalg.solve(of_own + of_expected, step)) - ROBUST, 0.0) + 1.0
     pose, covariance = update(other.pose, excess * of_expected, own, excess * of_own)
     if contradictions(scan_map, pose, ended.query.settings.prior):
         return judged
