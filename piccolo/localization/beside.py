@@ -118,8 +118,8 @@ def fuse(judged: Localization, other: Beside, ended: Found, scan_map: ScanMap) -
     """Return a result whose pose is the weighted mean of its own and of that by the photo beside.
 
     If they contradict each other, their covariances grow by as much. An error of the focal length is common
-    to both. How likely the place is does not change. A result that is ruled out
-    stays as it is, and one whose mean would contradict the prior.
+    to both. How likely the place is does not change. A result that is ruled out stays as it is, and one whose
+    mean would contradict the prior.
     """
     of_photo = other.picture.covariance
     if judged.pose is None or judged.covariance is None or of_photo is None or judged.confidence == 0.0:
