@@ -7,10 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
-import numpy as np
 import pytest
-from test_localize_cameras import place, scan
 
 from piccolo import open_scan, opened_scan
 from piccolo.batch.localizer import Localizer
@@ -21,13 +18,9 @@ from piccolo.camera.model import pinhole
 from piccolo.cli import localize
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
-from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import ReadOptions
-from piccolo.panorama.photo import sha256_of
-from piccolo.result import Beside, Result
-from piccolo.scenes.synthetic.world import render_picture
+from piccolo.result import Result
 
 CAMERA = {"model": "PINHOLE"}
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
@@ -299,31 +292,3 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     assert localizer.locate(opened, text) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
         opened.require_default_method("photos beside others", None)
-
-
-def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
-    """From pictures to results; a copy of itself is none beside it."""
-    this, pose = place(1)
-    beside = Pose(yaw_rotation(0.15) @ pose.R_cam_from_world, pose.center_world + np.array([0.2, 0.15, 0.0]))
-    paths = [tmp_path / "a.png", tmp_path / "b.png"]
-    for path, taken_at in zip(paths, (pose, beside), strict=True):
-        rgb = render_picture(Mount(pinhole(640, 480, 320.0)), this, taken_at, Workers(2))
-        cv2.imwrite(str(path), rgb[..., ::-1])
-    opened = scan()._opened
-    settings = opened.settings, opened.cloud_settings
-    localizer = Localizer((Path("room"),), *settings, ReadOptions(focal_px=320.0), None)
-    answer = localizer.answer_in(opened)
-    a = answer(localizer.task(paths[0])).result
-    assert a.status == "localized"
-    b = replace(a, pano=str(paths[1]), source=replace(a.source, pano_sha256=sha256_of(paths[1], None)))
-    lost = replace(b, status="not_localized", confidence=0.0, best_pose=None, alternatives=())
-    look = Look(0, lost.status, str(paths[1]), lost.to_json(), (a.to_json(),), "1")
-    found = answer(localizer.task(paths[1])._replace(look=look)).result
-    assert found.status == "localized"
-    assert found.confidence <= a.confidence
-    assert found.beside == Beside((str(paths[0]),), "1")
-    assert pose_errors(found.pose, beside)[0] < 0.05
-    assert Result.from_json(found.to_json()).to_json() == found.to_json()
-    itself = look._replace(beside=(b.to_json(),))
-    again = answer(localizer.task(paths[1])._replace(look=itself)).result
-    assert again.to_json() == replace(lost, beside=Beside((), "1")).to_json()

@@ -15,17 +15,20 @@ from PIL.ExifTags import IFD, Base
 from rooms import room, scan_map, write_room
 
 import piccolo
+from piccolo.batch.localizer import Localizer
+from piccolo.batch.second_look import Look
 from piccolo.camera import Mount
 from piccolo.camera.files import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.cloud.settings import CloudSettings
-from piccolo.geometry.pose import Pose, exp_so3, pose_errors
+from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import ReadOptions, read_panorama
-from piccolo.result import Result, read_results
+from piccolo.panorama.photo import sha256_of
+from piccolo.result import Beside, Result, read_results
 from piccolo.scan import Scan
 from piccolo.scenes.synthetic.world import (
     make_query,
@@ -194,3 +197,31 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
     assert results[0].settings["panorama"]["calibration"] == str(cameras)
     assert results[2].status == "unreadable"
     assert f"found no calibration of it in {cameras}, wanted c.camera.json or c.json" in results[2].error
+
+
+def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
+    """From pictures to results; a copy of itself is none beside it."""
+    this, pose = place(1)
+    beside = Pose(yaw_rotation(0.15) @ pose.R_cam_from_world, pose.center_world + np.array([0.2, 0.15, 0.0]))
+    paths = [tmp_path / "a.png", tmp_path / "b.png"]
+    for path, taken_at in zip(paths, (pose, beside), strict=True):
+        rgb = render_picture(Mount(pinhole(640, 480, 320.0)), this, taken_at, Workers(2))
+        cv2.imwrite(str(path), rgb[..., ::-1])
+    opened = scan()._opened
+    settings = opened.settings, opened.cloud_settings
+    localizer = Localizer((Path("room"),), *settings, ReadOptions(focal_px=320.0), None)
+    answer = localizer.answer_in(opened)
+    a = answer(localizer.task(paths[0])).result
+    assert a.status == "localized"
+    b = replace(a, pano=str(paths[1]), source=replace(a.source, pano_sha256=sha256_of(paths[1], None)))
+    lost = replace(b, status="not_localized", confidence=0.0, best_pose=None, alternatives=())
+    look = Look(0, lost.status, str(paths[1]), lost.to_json(), (a.to_json(),), "1")
+    found = answer(localizer.task(paths[1])._replace(look=look)).result
+    assert found.status == "localized"
+    assert found.confidence <= a.confidence
+    assert found.beside == Beside((str(paths[0]),), "1")
+    assert pose_errors(found.pose, beside)[0] < 0.05
+    assert Result.from_json(found.to_json()).to_json() == found.to_json()
+    itself = look._replace(beside=(b.to_json(),))
+    again = answer(localizer.task(paths[1])._replace(look=itself)).result
+    assert again.to_json() == replace(lost, beside=Beside((), "1")).to_json()
