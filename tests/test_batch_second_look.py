@@ -194,6 +194,21 @@ def test_a_second_look_is_of_the_photos_that_there_are(scene, photos, tmp_path, 
     capsys.readouterr()
 
 
+def test_a_photo_named_twice_keeps_its_lines(scene, photos, tmp_path, looked, capsys):
+    """A run with nothing left to do leaves the file as it is."""
+    out = tmp_path / "poses.jsonl"
+    names = [str(photos / f"{name}.jpg") for name in "aabb"]
+    for asked in (4, 0):
+        looked.firsts.clear()
+        assert _run(scene, names[0], "--pano", *names, "--out", out) == 0
+        assert len(_lines(out.read_text())) == 4
+        assert bool(looked.firsts) == bool(asked)
+        before = out.stat().st_ino, out.read_bytes()
+    assert _run(scene, names[0], "--pano", *names, "--out", out) == 0
+    assert (out.stat().st_ino, out.read_bytes()) == before
+    assert "nothing is left to do" in capsys.readouterr().err
+
+
 def test_of_lines_that_stay_those_are_dropped_that_others_replace(
     scene, photos, tmp_path, looked, monkeypatch, capsys
 ):

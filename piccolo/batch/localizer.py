@@ -126,7 +126,9 @@ class Localizer:
         locate = lru_cache(MOST_PICTURES)(partial(self.locate, scan))
 
         def answer(task: Task) -> Answer:
-            return self.answer(scan, task) if task.look is None else self.answer_again(scan, task, locate)
+            if task.look is None:
+                return self.answer(scan, task)
+            return self.answer_again(scan, task, task.look, locate)
 
         return answer
 
@@ -147,11 +149,10 @@ class Localizer:
 
         return self._answer(scan, task, localize)
 
-    def answer_again(self, scan: OpenedScan, task: Task, locate: Callable[[str], Picture | None]) -> Answer:
+    def answer_again(
+        self, scan: OpenedScan, task: Task, look: Look, locate: Callable[[str], Picture | None]
+    ) -> Answer:
         """Look at a photo again, beside others; `locate` returns one of these by its result's JSON."""
-        look = task.look
-        if look is None:
-            return self.answer(scan, task)
 
         def list_pictures() -> dict[str, Picture]:
             found = ((json.loads(line)["pano"], locate(line)) for line in look.beside)

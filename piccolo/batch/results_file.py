@@ -159,7 +159,8 @@ class Records:
             if lines:
                 self._named.add(str(pano))
                 digest = compute_digest(pano)
-                same = (line for line in lines[::-1] if digest in (None, line.pano_sha256))
+                newest = sorted(lines, key=lambda line: not line.is_second)
+                same = (line for line in newest if digest in (None, line.pano_sha256))
                 taken = next((line for line in same if line.status != FAILED), None)
             self.order.append(taken)
             if taken is None:
