@@ -167,7 +167,7 @@ def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things(
         assert selection.is_sure(query, [at(0.0, score), at(3.0, other)]) == is_sure
 
 
-def test_copies_are_credited_with_the_matches_of_the_best(monkeypatch):
+def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
     """Of a photo of a part of the sphere; how many a copy has by itself says how it was scanned."""
     asked = []
     copies = {1.0: True, 2.0: False, 3.0: True}
@@ -177,17 +177,17 @@ def test_copies_are_credited_with_the_matches_of_the_best(monkeypatch):
         return [copies[place(other)] for other in others]
 
     monkeypatch.setattr(verdict, "find_copies", find_copies)
-    poses = [at(x, 0.0).pose for x in (0.0, 1.0, 2.0, 3.0)]
+    best, *others = (at(x, 0.0) for x in (0.0, 1.0, 2.0, 3.0))
     standings = [Standing(1.0, 0.5, n, is_drawn=True) for n in (12, 3, 4, 20)]
-    for is_partial, most, expected in ((True, 20, [20, 20, 4, 20]), (False, 12, [12, 3, 4, 20])):
-        query = SimpleNamespace(photo=SimpleNamespace(is_partial=is_partial))
-        found = verdict.credit_copies(query, poses, standings)
+    for is_partial, num_parts, expected in (
+        (True, 2, [20, 20, 4, 20]),
+        (False, 2, [12, 3, 4, 20]),
+        (True, 0, [12, 3, 4, 20]),
+    ):
+        query = SimpleNamespace(photo=SimpleNamespace(is_partial=is_partial), num_parts=num_parts)
+        found = verdict.credit_copies(standings, verdict.list_copies(query, best, others))
         assert [s.num_matches for s in found] == expected
-        assert found[0].num_matches == most
     assert asked == [0.0]
-    without = [s._replace(num_matches=None) for s in standings]
-    whole = SimpleNamespace(photo=SimpleNamespace(is_partial=True))
-    assert verdict.credit_copies(whole, poses, without) == without
 
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):

@@ -13,7 +13,6 @@ from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..geometry.pose import Pose
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
@@ -64,11 +63,12 @@ def judge(
     evidence = collect_evidence(query, found, agreement, fractions)
     reported = found.alternatives[:MAX_ALTERNATIVES]
     standings = assess_poses(query, found.best, reported)
-    weighed = credit_copies(query, [h.pose for h in (found.best, *reported)], standings)
+    is_copy = list_copies(query, found.best, reported)
+    weighed = credit_copies(standings, is_copy)
     probabilities = posterior(weighed, covariance)
-    likelier = int(probabilities[:-1].argmax())
-    if may_change and fit is None and weighed[likelier] is not standings[likelier] and likelier:
-        return judge(query, promote(query, found, reported[likelier - 1]), None, may_change=False)
+    likeliest = int(probabilities[:-1].argmax())
+    if likeliest and is_copy[likeliest] and may_change and fit is None:
+        return judge(query, promote(query, found, reported[likeliest - 1]), None, may_change=False)
     warnings = contradictions(query.scan_map, pose, settings.prior)
     if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
@@ -96,15 +96,19 @@ def judge(
     )
 
 
-def credit_copies(query: Query, poses: Sequence[Pose], standings: Sequence[Standing]) -> list[Standing]:
-    """Give the best pose and the copies of its place all the most matches that one of them has.
+def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:
+    """Return True for the best pose and for copies of its place; of a photo without matches there False."""
+    if not query.photo.is_partial or not query.num_parts:
+        return [False] * (1 + len(others))
+    return [True, *find_copies(query, best.pose, [h.pose for h in others])]
+
+
+def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:
+    """Give copies of a place all the most matches that one of them has.
 
     How many of a photo's features agree with the scan drawn at each tells how well each was scanned.
     """
-    if not query.photo.is_partial or standings[0].num_matches is None:
-        return list(standings)
-    is_copy = [True, *find_copies(query, poses[0], poses[1:])]
-    most = max(s.num_matches or 0 for s in compress(standings, is_copy))
+    most = max((s.num_matches or 0 for s in compress(standings, is_copy)), default=0)
     pairs = zip(standings, is_copy, strict=True)
     return [s._replace(num_matches=most) if copied else s for s, copied in pairs]
 
