@@ -345,11 +345,6 @@ def test_a_video_is_a_walk(building, tmp_path):
     _assert_right(results, queries[: 2 * len(results) : 2])
     assert [r.pano for r in results] == [f"{video}#t={k}.000" for k in range(len(results))]
     assert len(results) == (len(queries) + 1) // 2
-    plan = tmp_path / "plan.svg"
-    assert _command(folder, "--video", str(video), "1s", "--out", str(out), "--plan", str(plan)) == 0
-    text = plan.read_text()  # of the results that are there
-    assert text.count('id="walk.mp4#t=') == len(results)
-    assert _command(folder, "--video", str(video), "--plan", str(tmp_path / "none" / "a.png")) == 3
     assert _command(folder, "--video", str(video), "0.5m", "--out", str(out), "--overwrite") == 0
     centers = [r.pose.center_world for r in read_results([out])]
     assert 2 <= len(centers) < len(queries)
@@ -377,12 +372,6 @@ REFUSED = {
         "missing.tum: cannot be read (No such file or directory)",
     ),
     "no step": (["--walk", "--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: found 0.0, wanted"),
-    "plan alone": (["--pano", "a.jpg", "--plan", "a.png"], 2, "--plan: only with --walk or --video"),
-    "plan of a kind": (
-        ["--walk", "--pano", "a.jpg", "--plan", "a.jpg"],
-        2,
-        "--plan a.jpg: wanted a name that ends with .png, .svg, .pdf, .dxf",
-    ),
     "no video": (["--video", "missing.mp4"], 3, "missing.mp4: no such file, wanted a video that PyAV reads"),
     "none of a video": (["--video", "broken.mp4"], 3, "wanted a video that PyAV reads, such as MP4"),
     "no table": (["--walk", "--pano", "a.jpg", "--times", "missing.csv"], 3, "missing.csv"),

@@ -53,7 +53,7 @@ from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, locali
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
-from .walking import check_plan, check_walk_options, run_walk, walk_inputs
+from .walking import check_walk_options, run_walk, walk_inputs
 
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
@@ -86,11 +86,9 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
     given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative, a.odometry))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
-    outputs = {"--out": a.out or STDOUT, "--plan": a.plan, "--color-scan": a.color_scan, **pictures}
+    outputs = {"--out": a.out or STDOUT, "--color-scan": a.color_scan, **pictures}
     check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
     check_output(arguments.out or STDOUT)
-    if arguments.plan:
-        check_plan(arguments.plan)
     if arguments.color_scan:
         check_output(arguments.color_scan)
     for option, path in pictures.items():

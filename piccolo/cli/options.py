@@ -198,8 +198,6 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
         "odometry of the camera [m], by which a walk tells identical places apart: TUM or KITTI trajectory, "
     )
     option(group, "--odometry FILE", text + "or transforms.json (ARKit)")
-    text = "write the path on a plan of the scan, coloured by confidence: .png, .svg, .pdf or .dxf"
-    option(group, "--plan FILE", text)
 
 
 def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | None = None) -> None:

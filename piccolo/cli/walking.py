@@ -18,7 +18,7 @@ from ..batch.relative_poses import read_odometry
 from ..batch.results_file import WAYS, Records, write_results
 from ..camera import Calibration
 from ..errors import InputError
-from ..files.atomic import check_output, is_stream
+from ..files.atomic import is_stream
 from ..files.line_file import LineFile, open_locked, whole_lines, whole_size
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
@@ -26,22 +26,19 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
-from ..optional import import_optional
 from ..panorama import ReadOptions
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
-from ..result import FAILED, Result, read_results
-from ..scan_map.scan_map import ScanMap
+from ..result import FAILED, Result
 from ..scan_walk import Walk
 from ..walk.motion import Motion
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY, check_alone
-from .outputs import check_suffix
 from .progress import progress_bar, show_progress
 
 STEP = re.compile(r"(\d+(?:\.\d+)?)(s|m)")
-ONLY_WITH = ("times", "max_speed", "odometry", "plan")
+ONLY_WITH = ("times", "max_speed", "odometry")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 KEY_BEGINS = b'{"'
 
@@ -147,7 +144,6 @@ def run_walk(
     key = make_key(walk, arguments.odometry)
     if (counts := count_finished(arguments, key, inputs, read_options.rig)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
-        write_plan(arguments.plan, scan, read_results([arguments.out]) if arguments.plan else [])
         return choose_exit_code(counts)
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, inputs.frames, json.dumps(key))
@@ -160,7 +156,6 @@ def run_walk(
             return interruption.stop(arguments, f"{len(walk.taken)} frames", how)
         results = keep_spaced(walk.finish(progress_bar(arguments.quiet)), inputs.min_distance)
     write_results(arguments.out, results)
-    write_plan(arguments.plan, scan, results)
     counts = Counter(result.status for result in results)
     if (path := frames_file(arguments.out)) and not counts[FAILED]:
         path.unlink(missing_ok=True)
@@ -168,26 +163,6 @@ def run_walk(
     gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
     print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
     return choose_exit_code(counts)
-
-
-def check_plan(path: Path) -> None:
-    """Refuse, before any work, a plan that could not be written."""
-    from ..report.plan_file import DXF, SUFFIXES  # noqa: PLC0415  # only walks with a plan wait for it
-
-    check_suffix("--plan", path, SUFFIXES)
-    check_output(path)
-    import_optional("--plan", "ezdxf" if path.suffix.lower() == DXF else "matplotlib", "tools")
-
-
-def write_plan(path: Path | None, scan: OpenedScan, results: Sequence[Result]) -> None:
-    """Draw the path on the scan from above, if asked for."""
-    if path is None or not isinstance(scan.prepared, ScanMap):
-        return
-    from ..report.build import ReportSettings  # noqa: PLC0415  # only walks with a plan wait for it
-    from ..report.entries import entries_of_walk  # noqa: PLC0415
-    from ..report.plan_file import write_plan_file  # noqa: PLC0415
-
-    write_plan_file(entries_of_walk(results), scan.prepared, path, ReportSettings())
 
 
 def make_key(walk: Walk, odometry: Path | None) -> dict[str, Any]:

@@ -46,12 +46,6 @@ def collect_entries(items: Sequence[Path | Result]) -> list[Entry]:
     return entries
 
 
-def entries_of_walk(results: Sequence[Result]) -> list[Entry]:
-    """Return the results of one walk."""
-    times = [float(k) if r.walk is None else r.walk.time for k, r in enumerate(results)]
-    return [Entry(r, 0, time) for r, time in zip(results, times, strict=True)]
-
-
 def unique_names(entries: Sequence[Entry]) -> list[str]:
     """Return a name for each, which no other has: its path below the folder that all share."""
     paths = [Path(entry.result.pano) for entry in entries]
