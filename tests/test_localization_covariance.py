@@ -81,6 +81,16 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
     np.testing.assert_allclose(found, np.linalg.inv(hessian), atol=0.05)
 
 
+def test_errors_weighed_by_a_covariance_of_few_blocks_are_right_in_the_mean():
+    rng = np.random.default_rng(0)
+    squares = []
+    for _ in range(4000):
+        known = covariance.sandwich_covariance(np.eye(6), rng.normal(size=(20, 6)))
+        error = np.sqrt(20.0) * rng.normal(size=6)
+        squares.append(error @ np.linalg.solve(known, error))
+    assert np.mean(squares) == pytest.approx(6.0, rel=0.05)
+
+
 def test_no_covariance_without_a_minimum_or_with_few_blocks():
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     assert covariance.sandwich_covariance(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
@@ -131,7 +141,19 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     if num_rough == 3:
         assert matrix is None
     else:
-        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
+        known = covariance.sandwich_covariance(np.eye(6), gradients)
+        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * known)
+
+
+def test_the_information_of_two_images_is_their_mean(found, monkeypatch):
+    prepared, pose, _ = found
+    gradients = np.random.default_rng(0).normal(size=(100, 6))
+    monkeypatch.setattr(covariance, "compute_hessian", lambda *_: np.eye(6))
+    monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
+    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose)
+    one, two = (steps.inflation for steps in covariance.STEPS)
+    known = covariance.sandwich_covariance(np.eye(6), gradients)
+    np.testing.assert_allclose(matrix, 2.0 / (1.0 / one + 1.0 / two) * known)
 
 
 @pytest.mark.parametrize("kind", REPEATED_KINDS)

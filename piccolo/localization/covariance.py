@@ -19,6 +19,7 @@ from .query import Query
 from .refinement import FULL_LOSS, to_levels
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
+LEAST_BLOCKS = 13  # fewer do not tell six dimensions
 MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
@@ -134,18 +135,20 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, for errors correlated within blocks.
 
-    It is the sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the
-    points do not fix the pose.
+    It is the sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters), by B / (B - 7)
+    larger, so that errors weighed by it are right in the mean although few blocks tell it (the mean of the
+    inverse of a Wishart matrix in six dimensions). None where the points do not fix the pose.
     """
     variances, axes = np.linalg.eigh(hessian)
-    if len(gradients) <= 12 or variances[0] <= 1e-9 * variances[-1]:
+    num = len(gradients)
+    if num < LEAST_BLOCKS or variances[0] <= 1e-9 * variances[-1]:
         return None
     inverse = (axes / variances) @ axes.T
-    return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
+    return np.asarray(num / (num - 7.0) * inverse @ (gradients.T @ gradients) @ inverse)
 
 
 def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
-    """Return the covariance (6, 6) [rad, m] in the camera's frame, by the image that determines it best.
+    """Return the covariance (6, 6) [rad, m] in the camera's frame, by the mean information of two images.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
     rough, a third is used. The points are around the pose.
@@ -165,7 +168,7 @@ def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
     found = [c for c in query.workers.map(by, steps, "covariance") if c is not None]
     if not found:
         return by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
-    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
+    return np.asarray(np.linalg.inv(np.mean(np.linalg.inv(found), axis=0)))
 
 
 def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
