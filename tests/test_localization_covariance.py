@@ -1,3 +1,4 @@
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from rooms import as_panorama, errors, query
 
 from piccolo.cloud import stream_points
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.geometry.pose import exp_so3, log_so3, step
+from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization import covariance
@@ -19,6 +20,7 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import World, make_query, scan_world
+from piccolo.views.view import Cells
 
 SETTINGS = CoarseToFineSettings(gravity="known")
 
@@ -87,7 +89,7 @@ def test_errors_weighed_by_a_covariance_of_few_blocks_are_right_in_the_mean():
     for _ in range(4000):
         known = covariance.sandwich_covariance(np.eye(6), rng.normal(size=(20, 6)))
         error = np.sqrt(20.0) * rng.normal(size=6)
-        squares.append(error @ np.linalg.solve(known, error))
+        squares.append(error @ np.linalg.solve(covariance.merge_covariances([known], 20), error))
     assert np.mean(squares) == pytest.approx(6.0, rel=0.05)
 
 
@@ -136,24 +138,39 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "compute_hessian", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose)
+    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose, False)
     assert asked == ways[: 2 if num_rough == 1 else 3]
     if num_rough == 3:
         assert matrix is None
     else:
-        known = covariance.sandwich_covariance(np.eye(6), gradients)
-        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * known)
+        np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
 
 
-def test_the_information_of_two_images_is_their_mean(found, monkeypatch):
+@pytest.mark.parametrize(("is_partial", "factor"), [(False, 0.36), (True, 2.0 / (1.0 / 1.1 + 1.0 / 0.36))])
+def test_two_images_count_for_a_part_of_the_sphere_and_the_better_one_for_the_whole(
+    found, monkeypatch, is_partial, factor
+):
     prepared, pose, _ = found
+    points = _points(prepared, pose)
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "compute_hessian", lambda *_: np.eye(6))
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose)
-    one, two = (steps.inflation for steps in covariance.STEPS)
-    known = covariance.sandwich_covariance(np.eye(6), gradients)
-    np.testing.assert_allclose(matrix, 2.0 / (1.0 / one + 1.0 / two) * known)
+    matrix = covariance.compute_covariance(prepared, points, pose, is_partial)
+    num = np.count_nonzero(np.diff(covariance.sort_by_block(points)[1]))
+    expected = factor * gradients.T @ gradients
+    np.testing.assert_allclose(matrix, num / (num - 7.0) * expected if is_partial else expected)
+
+
+def test_points_that_occluders_hide_are_removed():
+    offsets = np.float32([[2.0, 0.0, -3.0, 0.0], [0.1, 1.0, 0.2, -1.0], [0.0, 0.1, 0.5, 0.2]])
+    points = Cells(offsets, offsets + 1.0, np.ones(4, np.float32), np.zeros(3))
+    is_valid = np.ones((8, 16), bool)
+    is_valid[:, :8] = False  # the left half, which shows y < 0 to a camera that looks along -x
+    pose = Pose(yaw_rotation(math.pi), np.zeros(3))
+    left = covariance.remove_hidden(points, is_valid, pose)
+    np.testing.assert_array_equal(left.offsets, offsets[:, :3])
+    np.testing.assert_array_equal(left.channels, offsets[:, :3] + 1.0)
+    assert left.weights.shape == (3,)
 
 
 @pytest.mark.parametrize("kind", REPEATED_KINDS)

@@ -1,14 +1,15 @@
 """Covariance of a pose from blocks of the sphere."""
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
-from ..geometry.pose import Array, Pose, step
-from ..geometry.sphere import find_cell
+from ..geometry.pose import Array, Pose, rotate_points, step
+from ..geometry.sphere import compute_indices, find_cell
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
@@ -69,13 +70,23 @@ def fill_symmetric(upper: Array) -> Array:
     return matrix
 
 
+def take(points: Cells, which: NDArray[np.bool_] | NDArray[np.intp]) -> Cells:
+    """Return some of the points, by a mask or by their indices in a new order."""
+    offsets, channels, weights = (np.ascontiguousarray(values[..., which]) for values in points[:3])
+    return Cells(offsets, channels, weights, points.center_map)
+
+
 def remove_poles(points: Cells, pose: Pose) -> Cells:
     """Remove the points around a pose that lie within POLE_DEG of the photo's poles."""
     heights = pose.R_cam_from_world[2] @ points.offsets
     ranges = np.linalg.norm(points.offsets, axis=0)
-    is_kept = np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges
-    offsets, channels, weights = (np.ascontiguousarray(values[..., is_kept]) for values in points[:3])
-    return Cells(offsets, channels, weights, points.center_map)
+    return take(points, np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges)
+
+
+def remove_hidden(points: Cells, is_valid: NDArray[np.bool_], pose: Pose) -> Cells:
+    """Remove the points around a pose that lie in pixels (H, W) of the photo that are not valid."""
+    rays_cam = rotate_points(points.offsets.T.astype(np.float64), pose.R_cam_from_world)
+    return take(points, is_valid[compute_indices(rays_cam, is_valid.shape[1])])
 
 
 def compute_hessian(problem: ChannelProblem, pose: Pose, steps: DifferenceSteps) -> Array:
@@ -101,10 +112,8 @@ def sort_by_block(points: Cells) -> tuple[Cells, NDArray[np.int64]]:
     """
     ranges = np.linalg.norm(points.offsets, axis=0)
     blocks = find_cell(points.offsets.T / ranges[:, None], ERROR_RINGS)
-    order = np.argsort(blocks, kind="stable")
-    offsets, channels, weights = (np.ascontiguousarray(values[..., order]) for values in points[:3])
     begins = np.concatenate([[0], np.cumsum(np.bincount(blocks))])
-    return Cells(offsets, channels, weights, points.center_map), begins
+    return take(points, np.argsort(blocks, kind="stable")), begins
 
 
 def sum_by_block(problem: ChannelProblem, pose: Pose, begins: NDArray[np.int64]) -> Array:
@@ -135,40 +144,51 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame, for errors correlated within blocks.
 
-    It is the sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters), by B / (B - 7)
-    larger, so that errors weighed by it are right in the mean although few blocks tell it (the mean of the
-    inverse of a Wishart matrix in six dimensions). None where the points do not fix the pose.
+    It is the sandwich H^-1 (sum g g^T) H^-1 (Huber 1967; Liang and Zeger 1986 for clusters). None where the
+    points do not fix the pose.
     """
     variances, axes = np.linalg.eigh(hessian)
-    num = len(gradients)
-    if num < LEAST_BLOCKS or variances[0] <= 1e-9 * variances[-1]:
+    if len(gradients) < LEAST_BLOCKS or variances[0] <= 1e-9 * variances[-1]:
         return None
     inverse = (axes / variances) @ axes.T
-    return np.asarray(num / (num - 7.0) * inverse @ (gradients.T @ gradients) @ inverse)
+    return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
 
 
-def compute_covariance(query: Query, points: Cells, pose: Pose) -> Array | None:
-    """Return the covariance (6, 6) [rad, m] in the camera's frame, by the mean information of two images.
+def merge_covariances(found: Sequence[Array], num_blocks: int) -> Array:
+    """Return the covariance (6, 6) of a pose that few blocks tell, from those by several images.
+
+    The least of them may be so by chance: it has the mean of their information. It is by B / (B - 7) larger,
+    so that errors weighed by it are right in the mean (the inverse of a Wishart matrix in six dimensions).
+    """
+    merged = np.linalg.inv(np.mean(np.linalg.inv(found), axis=0))
+    return np.asarray(num_blocks / (num_blocks - 7.0) * merged)
+
+
+def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
+    """Return the covariance (6, 6) [rad, m] in the camera's frame, by the image that determines it best.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used. The points are around the pose.
+    rough, a third is used. Of a photo that `is_partial` even without occluders, both count. The points are
+    around the pose.
     """
     (offsets, channels, weights, _), begins = sort_by_block(points)
     levels = to_levels(channels)
 
     def by(steps: DifferenceSteps) -> Array | None:
-        image = query.photo.images[steps.scale]()
+        image = shown.photo.images[steps.scale]()
         problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
         hessian = compute_hessian(problem, pose, steps)
         covariance = sandwich_covariance(hessian, block_gradients(problem, pose, begins))
         return covariance if covariance is None else steps.inflation * covariance
 
-    has_shape = query.scan_map.has_shape
+    has_shape = shown.scan_map.has_shape
     steps = SHAPE_STEPS if has_shape else STEPS
-    found = [c for c in query.workers.map(by, steps, "covariance") if c is not None]
+    found = [c for c in shown.workers.map(by, steps, "covariance") if c is not None]
     if not found:
         return by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
-    return np.asarray(np.linalg.inv(np.mean(np.linalg.inv(found), axis=0)))
+    if is_partial:
+        return merge_covariances(found, int(np.count_nonzero(np.diff(begins))))
+    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
 def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
@@ -199,9 +219,13 @@ def estimate_covariance(
     so near that it sees the same points, those behind occluders among them.
     """
     shown = mask_occluders(query, pose)
-    seen = shown.points_at(pose) if seen_from is None else query.points_at(seen_from)
-    points = remove_poles(seen.around(pose.center_world), pose)
-    covariance = compute_covariance(shown, points, pose)
+    if seen_from is None:
+        points = remove_poles(shown.points_at(pose).around(pose.center_world), pose)
+    else:
+        seen = remove_poles(query.points_at(seen_from).around(pose.center_world), pose)
+        points = remove_hidden(seen, shown.photo.panorama.is_valid, pose)
+        shown = query
+    covariance = compute_covariance(shown, points, pose, query.photo.is_partial)
     if covariance is None:
         return None
     J = np.eye(6)

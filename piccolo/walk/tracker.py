@@ -232,12 +232,13 @@ class Tracker:
             is_likely = probabilities >= EVEN * probabilities.max()
             likeliest = max(compress(frame.states, is_likely), key=lambda state: state.log_odds)
             if likeliest.is_refined:
-                frame.states = put_state(frame.states, likeliest)
-                frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
                 break
             frame.states = refine_state(query, frame.states, likeliest)
             self.lattice.change_last()
-        self.lattice.change_last()
+        frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
+        if likeliest is not frame.states[0]:
+            frame.states = put_state(frame.states, likeliest)
+            self.lattice.change_last()
 
 
 def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -> list[State]:
