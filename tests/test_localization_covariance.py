@@ -1,6 +1,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -18,11 +19,18 @@ from piccolo.localization.localize import localize
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import ChannelProblem
+from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import World, make_query, scan_world
 from piccolo.views.view import Cells
 
 SETTINGS = CoarseToFineSettings(gravity="known")
+
+
+class Photo(NamedTuple):
+    """A photo whose images must not be asked for."""
+
+    panorama: Panorama
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +97,7 @@ def test_errors_weighed_by_a_covariance_of_few_blocks_are_right_in_the_mean():
     for _ in range(4000):
         known = covariance.sandwich_covariance(np.eye(6), rng.normal(size=(20, 6)))
         error = np.sqrt(20.0) * rng.normal(size=6)
-        squares.append(error @ np.linalg.solve(covariance.merge_covariances([known], 20), error))
+        squares.append(error @ np.linalg.solve(covariance.few_blocks_factor(20) * known, error))
     assert np.mean(squares) == pytest.approx(6.0, rel=0.05)
 
 
@@ -156,9 +164,14 @@ def test_two_images_count_for_a_part_of_the_sphere_and_the_better_one_for_the_wh
     monkeypatch.setattr(covariance, "compute_hessian", lambda *_: np.eye(6))
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.compute_covariance(prepared, points, pose, is_partial)
-    num = np.count_nonzero(np.diff(covariance.sort_by_block(points)[1]))
     expected = factor * gradients.T @ gradients
-    np.testing.assert_allclose(matrix, num / (num - 7.0) * expected if is_partial else expected)
+    np.testing.assert_allclose(matrix, 100.0 / 93.0 * expected if is_partial else expected)
+
+
+def test_a_direction_that_one_image_does_not_tell_is_told_by_the_other():
+    blind = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1e12])
+    merged = covariance.merge_covariances([blind, np.eye(6)])
+    np.testing.assert_allclose(merged, np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 2.0]), rtol=1e-9)
 
 
 def test_points_that_occluders_hide_are_removed():
@@ -171,6 +184,26 @@ def test_points_that_occluders_hide_are_removed():
     np.testing.assert_array_equal(left.offsets, offsets[:, :3])
     np.testing.assert_array_equal(left.channels, offsets[:, :3] + 1.0)
     assert left.weights.shape == (3,)
+
+
+def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(found, monkeypatch):
+    prepared, pose, _ = found
+    own = covariance.estimate_covariance(prepared, pose)
+    assert (
+        covariance.estimate_covariance(prepared, pose, seen_from=pose).matrix.tobytes()
+        == own.matrix.tobytes()
+    )
+    rgb = query(2).rgb.copy()
+    rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
+    hidden = prepare_query(as_panorama(rgb), prepared.scan_map, SETTINGS, Workers(2))
+    shown = covariance.mask_occluders(hidden, pose)
+    assert shown is not hidden
+    masked = covariance.estimate_covariance(hidden, pose)
+    monkeypatch.setattr(
+        covariance, "mask_occluders", lambda *_: replace(shown, photo=Photo(shown.photo.panorama))
+    )
+    left_out = covariance.estimate_covariance(hidden, pose, seen_from=pose)  # by the images that are there
+    np.testing.assert_allclose(left_out.std_mm, masked.std_mm, rtol=0.1)
 
 
 @pytest.mark.parametrize("kind", REPEATED_KINDS)

@@ -9,9 +9,10 @@ from ..errors import InputError
 from ..files.atomic import check_output
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers, num_cores
+from ..optional import import_optional
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import collect_entries
-from ..report.plan_file import SUFFIXES, write_plan_file
+from ..report.plan_file import DXF, SUFFIXES, write_plan_file
 from ..report.plan_image import OwnPlan
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = "show this image as the plan of storey K (1: the lowest); control points in CSV, see below"
     option(parser, "--own-plan K IMAGE CSV", text, type=str, nargs=3, action="append", default=[])
     option(parser, "--crs EPSG", "coordinate system of a scan that names none, for the north arrow")
-    option(parser, "--plan FILE", "write the camera positions on the plans: .png, .svg, .pdf or .dxf")
+    option(parser, "--plan FILE", "write camera positions and walks on the plans: .png, .svg, .pdf or .dxf")
     option(parser, "--force", "show results of another scan too, with a note on the page")
     option(parser, "--jobs N", "photos that are processed at the same time", default=num_cores())
     option(parser, "--cache FOLDER", CACHE_TEXT)
@@ -85,6 +86,7 @@ def check_files(arguments: argparse.Namespace) -> None:
     check_distinct({"--out": arguments.out, "--plan": arguments.plan}, inputs)
     if arguments.plan:
         check_output(arguments.plan)
+        import_optional("--plan", "ezdxf" if arguments.plan.suffix.lower() == DXF else "matplotlib", "tools")
     if arguments.out:
         (check_output if arguments.self_contained else check_folder)(arguments.out)
     if arguments.images and not arguments.images.is_dir():

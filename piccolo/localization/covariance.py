@@ -20,6 +20,7 @@ from .query import Query
 from .refinement import FULL_LOSS, to_levels
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
+LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
 LEAST_BLOCKS = 13  # fewer do not tell six dimensions
 MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
@@ -154,22 +155,30 @@ def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
 
 
-def merge_covariances(found: Sequence[Array], num_blocks: int) -> Array:
-    """Return the covariance (6, 6) of a pose that few blocks tell, from those by several images.
+def few_blocks_factor(num_blocks: int) -> float:
+    """Return the factor by which errors weighed by a covariance of so many blocks are right in the mean.
 
-    The least of them may be so by chance: it has the mean of their information. It is by B / (B - 7) larger,
-    so that errors weighed by it are right in the mean (the inverse of a Wishart matrix in six dimensions).
+    It is that of the mean of the inverse of a Wishart matrix in six dimensions.
     """
-    merged = np.linalg.inv(np.mean(np.linalg.inv(found), axis=0))
-    return np.asarray(num_blocks / (num_blocks - 7.0) * merged)
+    return num_blocks / (num_blocks - 7.0)
+
+
+def merge_covariances(found: Sequence[Array]) -> Array:
+    """Return the covariance (6, 6) that has the mean information of some.
+
+    The least of them may be so by chance, if few blocks tell it.
+    """
+    information, axes = np.linalg.eigh(np.mean(np.linalg.inv(found), axis=0))
+    return np.asarray((axes / np.maximum(information, LEAST_INFORMATION * information[-1])) @ axes.T)
 
 
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
-    """Return the covariance (6, 6) [rad, m] in the camera's frame, by the image that determines it best.
+    """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used. Of a photo that `is_partial` even without occluders, both count. The points are
-    around the pose.
+    rough, a third is used. The image that determines the pose best counts. If the photo shows a part of the
+    sphere, whatever occluders hide, they count alike, and the covariance is larger, as it is known from the
+    few blocks shown (`few_blocks_factor`). The points are around the pose.
     """
     (offsets, channels, weights, _), begins = sort_by_block(points)
     levels = to_levels(channels)
@@ -178,8 +187,12 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
         image = shown.photo.images[steps.scale]()
         problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
         hessian = compute_hessian(problem, pose, steps)
-        covariance = sandwich_covariance(hessian, block_gradients(problem, pose, begins))
-        return covariance if covariance is None else steps.inflation * covariance
+        gradients = block_gradients(problem, pose, begins)
+        covariance = sandwich_covariance(hessian, gradients)
+        if covariance is None:
+            return None
+        factor = few_blocks_factor(len(gradients)) if is_partial else 1.0
+        return steps.inflation * factor * covariance
 
     has_shape = shown.scan_map.has_shape
     steps = SHAPE_STEPS if has_shape else STEPS
@@ -187,7 +200,7 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     if not found:
         return by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
     if is_partial:
-        return merge_covariances(found, int(np.count_nonzero(np.diff(begins))))
+        return merge_covariances(found)
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
@@ -216,22 +229,23 @@ def estimate_covariance(
     """Estimate the covariance of a pose, in world axes; None where the points do not fix it.
 
     `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration. `seen_from` is a pose
-    so near that it sees the same points, those behind occluders among them.
+    so near that it sees the same points; of a whole photo those behind occluders are then left out, which
+    takes less time than to normalise a masked photo.
     """
     shown = mask_occluders(query, pose)
-    if seen_from is None:
-        points = remove_poles(shown.points_at(pose).around(pose.center_world), pose)
-    else:
-        seen = remove_poles(query.points_at(seen_from).around(pose.center_world), pose)
-        points = remove_hidden(seen, shown.photo.panorama.is_valid, pose)
+    seen = shown.points_at(pose) if seen_from is None else query.points_at(seen_from)
+    points = remove_poles(seen.around(pose.center_world), pose)
+    is_partial = query.photo.is_partial
+    if seen_from is not None and shown is not query and not is_partial:
+        points = remove_hidden(points, shown.photo.panorama.is_valid, pose)
         shown = query
-    covariance = compute_covariance(shown, points, pose, query.photo.is_partial)
+    covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return None
     J = np.eye(6)
     J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
     pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
-    covariance_map = J @ covariance @ J.T + source_covariance(shown, points, pixel_share)
+    covariance_map = J @ covariance @ J.T + source_covariance(query, points, pixel_share)
     std_of_fit = None
     if of_camera is not None:
         std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))

@@ -1,6 +1,7 @@
 """Walking distances from place to place, through free space and never through a wall."""
 
 import math
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,11 +20,46 @@ class FreeSpace:
     """A map's candidates as a graph, with edges between neighbours along free ways."""
 
     def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
+        self.scan_map = scan_map
+        self.workers = workers
+        self._graph: Any = None
+
+    def prepare(self) -> None:
+        """Build the graph, a second of work in a large building, before somebody waits for a distance."""
+        if self._graph is None:
+            self._graph = self._make_graph()
+
+    @cached_property
+    def _tree(self) -> Any:
         from scipy.spatial import cKDTree  # noqa: PLC0415  # only walks wait for it
 
-        self.num_places = len(scan_map.centers)
-        self.tree = cKDTree(scan_map.centers)
-        self.graph = make_graph(scan_map, self.tree, workers)
+        return cKDTree(self.scan_map.centers)
+
+    def _make_graph(self) -> Any:
+        """Return a sparse matrix (candidates, candidates) of the edges' lengths [m].
+
+        A way is free if a tube around it fits into the empty balls around its ends and its middle.
+        """
+        from scipy.sparse import coo_matrix  # noqa: PLC0415  # only walks wait for it
+        from scipy.spatial import cKDTree  # noqa: PLC0415
+
+        centers = self.scan_map.centers
+        points = self.scan_map.octree.level(CLEARANCE_VOXEL)[:, :3]
+        surfaces = cKDTree(points, balanced_tree=False, compact_nodes=False)
+
+        def covered(places: Array) -> Array:
+            """Return half the length (N,) [m] of the longest tube in the ball around each place (N, 3)."""
+            distance = nearest_distances(surfaces, places, self.workers)
+            return np.sqrt(np.maximum(distance**2 - TUBE_RADIUS**2, 0.0))
+
+        pairs = self._tree.query_pairs(REACH, output_type="ndarray")
+        length = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
+        uncovered = length - covered(centers)[pairs].sum(axis=1)
+        some = uncovered > 0.0
+        uncovered[some] -= 2.0 * covered(centers[pairs[some]].mean(axis=1))
+        is_free = uncovered <= 0.0
+        one_way = coo_matrix((length[is_free], pairs[is_free].T), (len(centers), len(centers)))
+        return (one_way + one_way.T).tocsr()
 
     def distances(self, starts: Array, ends: Array, limit: float) -> Array:
         """Return distances (S, N) [m] from places (S, 3) to others (N, 3) in the map; inf beyond a limit."""
@@ -34,9 +70,10 @@ class FreeSpace:
         far = (straight > 2.0 * MIN_CLEARANCE) & (straight <= limit)
         rows = np.flatnonzero(far.any(axis=1))
         if len(rows):
-            _, end = self.tree.query(ends)
-            nodes, node = np.unique(self.tree.query(starts[rows])[1], return_inverse=True)
-            along = dijkstra(self.graph, indices=nodes, limit=DETOUR * (limit + 2.0 * COARSE_SPACING))[node][
+            _, end = self._tree.query(ends)
+            nodes, node = np.unique(self._tree.query(starts[rows])[1], return_inverse=True)
+            self.prepare()
+            along = dijkstra(self._graph, indices=nodes, limit=DETOUR * (limit + 2.0 * COARSE_SPACING))[node][
                 :, end
             ]
             walked[rows] = np.where(
@@ -47,32 +84,5 @@ class FreeSpace:
 
     def fraction_within(self, center: Array, radius: float) -> float:
         """Return the fraction of candidates within a radius [m] of a place (3,), counting at least one."""
-        near = self.tree.query_ball_point(center, radius, return_length=True)
-        return max(int(near), 1) / max(self.num_places, 1)
-
-
-def make_graph(scan_map: ScanMap, tree: Any, workers: Workers) -> Any:
-    """Return the lengths [m] of the edges between candidates, as a sparse matrix; `tree` is of their centers.
-
-    A way is free if a tube around it fits into the empty balls around its ends and its middle.
-    """
-    from scipy.sparse import coo_matrix  # noqa: PLC0415  # only walks wait for it
-    from scipy.spatial import cKDTree  # noqa: PLC0415
-
-    centers = scan_map.centers
-    points = scan_map.octree.level(CLEARANCE_VOXEL)[:, :3]
-    surfaces = cKDTree(points, balanced_tree=False, compact_nodes=False)
-
-    def covered(places: Array) -> Array:
-        """Return half the length (N,) [m] of the longest tube in the ball around each place (N, 3)."""
-        distance = nearest_distances(surfaces, places, workers)
-        return np.sqrt(np.maximum(distance**2 - TUBE_RADIUS**2, 0.0))
-
-    pairs = tree.query_pairs(REACH, output_type="ndarray")
-    length = np.linalg.norm(centers[pairs[:, 0]] - centers[pairs[:, 1]], axis=1)
-    uncovered = length - covered(centers)[pairs].sum(axis=1)
-    some = uncovered > 0.0
-    uncovered[some] -= 2.0 * covered(centers[pairs[some]].mean(axis=1))
-    is_free = uncovered <= 0.0
-    one_way = coo_matrix((length[is_free], pairs[is_free].T), (len(centers), len(centers)))
-    return (one_way + one_way.T).tocsr()
+        near = self._tree.query_ball_point(center, radius, return_length=True)
+        return max(int(near), 1) / max(len(self.scan_map.centers), 1)

@@ -118,10 +118,14 @@ class Tracker:
 
     @one_blas_thread
     def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
-        """Localize the next frame, whose query is prepared."""
+        """Localize the next frame, whose query is prepared.
+
+        The first one waits until free space is known.
+        """
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             self._keep(len(self.frames), query)
+            self.lattice.space.prepare()
             is_known = odometry is not None or not self.frames
             is_far = not is_known and self.motion.reach(time - self.frames[-1].time) > ELSEWHERE
             if not is_far:
