@@ -176,9 +176,9 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used. The image that determines the pose best counts. If the photo shows a part of the
-    sphere, whatever occluders hide, they count alike, and the covariance is larger, as it is known from the
-    few blocks shown (`few_blocks_factor`). The points are around the pose.
+    rough, a third is used. The image that determines the pose best counts. `is_partial` says that the photo
+    shows a part of the sphere, even without occluders: then both images count alike, and the covariance is
+    larger, as few blocks tell it (`few_blocks_factor`). The points are around the pose.
     """
     (offsets, channels, weights, _), begins = sort_by_block(points)
     levels = to_levels(channels)
