@@ -62,9 +62,10 @@ Scenes are folders with a queries.json, a cloud and images, at any depth below -
 --out localizes the queries that the run lacks, and appends a line for each: repeat the command to resume a
 stopped run. --results are lines of localize.py instead; each belongs to the query with the same path, or else
 with the same file name. Tables are Markdown on stdout (on stderr if one of the files is stdout).
-For walks (make_room.py --walk) there is a table with a line per walk. ATE and RPE are defined as in evo, over
-localized frames, without alignment; RPE leaves out steps across other frames. A query with
-"answerable": false is correct if it is not localized.
+For walks (make_room.py --walk) there is a table with a line per walk, and one of the frames that were
+searched alone, by themselves and with the others. A query with "answerable": false is correct if it is not
+localized.
+Errors of a path as evo defines them: tools/export_poses.py --format tum, then evo_ape and evo_rpe.
 Queries that can't be read and --results without a query are named on stderr; the others are still evaluated,
 and the exit code is 3.
 """
