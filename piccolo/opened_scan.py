@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from .camera import Calibration
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
-from .confidence.confidence import LOCALIZED
+from .confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from .confidence.localization import Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
@@ -27,17 +27,14 @@ from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
 from .localization.verification import is_near
 from .panorama import Panorama, ReadOptions, read_photo
-from .panorama.photo import PhotoFacts, sha256_of
+from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
-from .result import Result, Source, describe_failure, result_of, unreadable_result
+from .result import Result, Source, describe_failure, unreadable_result, with_localization
 from .scan_map.named_scans import add_places, check_within
 from .scan_map.prior import GpsPrior, Prior, gps_prior
 from .scan_map.scan_map import ScanMap
-from .scan_walk import Walk, WalkAbout, photo_facts
-from .walk.motion import Motion
-from .walk.tracker import Tracker
 
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
@@ -71,23 +68,6 @@ class OpenedScan:
         """Transform a pose from the scan's own coordinates to the frame of `points`."""
         return self.prepared.from_world(pose)
 
-    def walk(self, read_options: ReadOptions, settings: Settings, motion: Motion) -> Walk:
-        """Start a walk, to which frames are then added.
-
-        Raises InputError for the preset paper, and for a focal length that is to be refined.
-        """
-        prepared, settings = self.require_default_method("walks", settings)
-        if read_options.refine_focal:
-            raise InputError(
-                "`refine_focal`: not an option of walks; refine the focal length with a single photo"
-            )
-        check_within(prepared, settings.prior.within)
-        quiet = Workers(self.workers.num_threads, warn=self.workers.warn)
-        tracker = Tracker(prepared, settings, quiet, motion)
-        repeated = settings_json(settings, self.cloud_settings, read_options)
-        about = WalkAbout(self.name, self.warnings, {**repeated, "walk": motion.to_settings()})
-        return Walk(tracker, read_options, about)
-
     def occlusion_mask(
         self,
         panorama: File | NDArray[np.uint8],
@@ -119,7 +99,7 @@ class OpenedScan:
             read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"), reading_once():
             picture = read_photo(panorama, read_options, is_masked)
-            photo = photo_facts(panorama, read_options.rig)
+            photo = read_photo_facts(panorama, read_options.rig)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
@@ -136,9 +116,7 @@ class OpenedScan:
         else:
             raise InputError(OTHER_METHOD)
         about = settings_json(settings, self.cloud_settings, asked)
-        return replace(
-            self._make_result(panorama, picture, photo, found, about, watch.seconds), gps_prior=gps
-        )
+        return replace(self.make_result(panorama, picture, photo, found, about, watch.seconds), gps_prior=gps)
 
     def locate(
         self, panorama: File, result: Result, read_options: ReadOptions, settings: Settings
@@ -150,7 +128,7 @@ class OpenedScan:
         with reading_once():
             read_options = read_options.with_refined_camera(result.cameras, Path(panorama))
             picture = read_photo(panorama, read_options)
-            photo = photo_facts(panorama, read_options.rig)
+            photo = read_photo_facts(panorama, read_options.rig)
         if photo.sha256 != result.source.pano_sha256:
             return None
         pose = self.from_world(result.best_pose)
@@ -174,7 +152,7 @@ class OpenedScan:
         prepared, settings = self.require_default_method("photos beside others", settings)
         with watch.stage("read"), reading_once():
             picture = read_photo(panorama, read_options)
-            photo = photo_facts(panorama, read_options.rig)
+            photo = read_photo_facts(panorama, read_options.rig)
         if has_guessed_focal(picture) or prepared.has_shape or photo.sha256 != first.source.pano_sha256:
             return first, ()
         known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
@@ -187,7 +165,7 @@ class OpenedScan:
         if not names or not (is_surer or is_other):
             return first, ()
         about = settings_json(settings, self.cloud_settings, read_options)
-        result = self._make_result(panorama, picture, photo, found, about, watch.seconds)
+        result = self.make_result(panorama, picture, photo, found, about, watch.seconds)
         return replace(result, gps_prior=first.gps_prior), names
 
     def require_default_method(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
@@ -217,18 +195,18 @@ class OpenedScan:
         watch = Stopwatch()
         with watch.stage("read"), reading_once():
             pictures = [read_photo(panorama, read_options, is_masked) for panorama in panoramas]
-            photos = [photo_facts(panorama, read_options.rig) for panorama in panoramas]
+            photos = [read_photo_facts(panorama, read_options.rig) for panorama in panoramas]
         if any(map(has_guessed_focal, pictures)):
             raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
         found = localize_bundle(prepared, pictures, cams_from_bundle, settings, self.workers, watch)
         about = settings_json(settings, self.cloud_settings, read_options)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
         return [
-            self._make_result(*parts, about, seconds)
+            self.make_result(*parts, about, seconds)
             for parts in zip(panoramas, pictures, photos, found, strict=True)
         ]
 
-    def _make_result(
+    def make_result(
         self,
         panorama: File | NDArray[np.uint8],
         picture: Panorama,
@@ -241,10 +219,11 @@ class OpenedScan:
         has_labels = self.cloud_settings.labels is not None
         if isinstance(self.prepared, ScanMap):
             found = add_places(self.prepared, found)
-        return result_of(
-            found,
-            cloud=self.name,
-            pano="array" if isinstance(panorama, np.ndarray) else str(panorama),
+        blank = Result(
+            NOT_LOCALIZED,
+            0.0,
+            self.name,
+            "array" if isinstance(panorama, np.ndarray) else str(panorama),
             seconds=seconds,
             settings=settings,
             warnings=self.warnings + picture.warnings + ((LABELS_WARNING,) if has_labels else ()),
@@ -253,6 +232,7 @@ class OpenedScan:
             ),
             cameras=found.cameras or picture.cameras,
         )
+        return with_localization(blank, found)
 
     def check_options(self, read_options: ReadOptions, settings: Settings) -> None:
         """Raise InputError for options that this scan or its method does not have."""

@@ -4,7 +4,7 @@ import json
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -112,13 +112,13 @@ class Result:
     confidence: float
     cloud: str | tuple[str, ...]
     pano: str
-    best_pose: Pose | None
-    loss: float | None
-    evidence: Evidence | None
-    alternatives: tuple[Alternative, ...]
-    covariance: PoseCovariance | None
-    seconds: dict[str, float]
-    settings: dict[str, object]
+    best_pose: Pose | None = None
+    loss: float | None = None
+    evidence: Evidence | None = None
+    alternatives: tuple[Alternative, ...] = ()
+    covariance: PoseCovariance | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    settings: dict[str, object] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     source: Source = Source()
     error: str | None = None
@@ -249,14 +249,11 @@ class Result:
             return cls(**given, **plain)
 
 
-def result_of(found: Localization, warnings: tuple[str, ...] = (), **about: Any) -> Result:
-    """Return the result of a localization.
-
-    `about` are the fields of Result that say what it is of and how made.
-    """
+def with_localization(result: Result, found: Localization) -> Result:
+    """Return a result with what was found, and its warnings added."""
     apart = "pose", "warnings", "cameras", "standings"
     values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in apart}
-    return Result(best_pose=found.pose, warnings=warnings + found.warnings, **values, **about)
+    return replace(result, best_pose=found.pose, warnings=result.warnings + found.warnings, **values)
 
 
 class Failure(NamedTuple):
@@ -280,7 +277,7 @@ def unreadable_result(
 ) -> Result:
     """Return the result of a photo that can't be read, or could not at the moment; `more` as in Result."""
     status = FAILED if is_passing else UNREADABLE
-    return Result(status, 0.0, cloud, pano, None, None, None, (), None, {}, error=error, **more)
+    return Result(status, 0.0, cloud, pano, error=error, **more)
 
 
 def _rotation_and_center(pose: Pose) -> dict[str, object]:

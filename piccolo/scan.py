@@ -375,7 +375,7 @@ class Scan:
     def _track(self, given: dict[str, Any]) -> Walk:
         motion = Motion(given.pop("max_speed", None), given.pop("max_acceleration"))
         read_options, settings, _ = self._parse(given)
-        return self._opened.walk(read_options, settings, motion)
+        return Walk(self._opened, read_options, settings, motion)
 
     def _parse(self, given: Mapping[str, Any]) -> tuple[ReadOptions, Settings, Mask | None]:
         """Return the options as objects, and the mask if it is an array."""

@@ -9,20 +9,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .camera import Calibration
 from .confidence.localization import Localization
+from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose
 from .jobs.stopwatch import Stopwatch
-from .jobs.threads import Progress, no_progress
+from .jobs.threads import Progress, Workers, no_progress
 from .localization.query import Query
+from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama, ReadOptions, read_photo
-from .panorama.photo import PhotoFacts, photo_of_array, read_photo_facts, sha256_of
-from .result import Failure, Result, Source, describe_failure, result_of, unreadable_result
-from .scan_map.named_scans import add_places
+from .panorama.photo import read_photo_facts, sha256_of
+from .result import FAILED, Result, with_localization
+from .scan_map.named_scans import add_places, check_within
 from .walk.beliefs import believe
 from .walk.frames import Frame
-from .walk.motion import check_times
+from .walk.motion import Motion, check_times
 from .walk.results import WalkFrame, make_localization, make_localizations, result_alone
 from .walk.second_look import finish
 from .walk.tracker import Tracker
@@ -31,31 +32,10 @@ Picture = str | PathLike[str] | NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
-class WalkAbout:
-    """Fields that all results of a walk repeat."""
-
-    cloud: str | tuple[str, ...]
-    warnings: tuple[str, ...]
-    settings: dict[str, object]
-
-
-@dataclass(frozen=True)
-class Taken:
-    """Facts of a frame besides its poses."""
-
-    name: str
-    photo: PhotoFacts | None  # None of one that can't be read
-    seconds: dict[str, float]
-    warnings: tuple[str, ...] = ()
-    sha256: str | None = None  # of the file or files
-    failure: Failure | None = None  # why it can't be read
-
-
-@dataclass(frozen=True)
 class Kept:
     """A frame as it is kept on disk until the walk is finished."""
 
-    taken: Taken
+    blank: str  # its result without a pose, as JSON
     frame: Frame
 
 
@@ -63,28 +43,35 @@ class Prepared(NamedTuple):
     """A frame that is ready to be tracked."""
 
     picture: Picture
-    taken: Taken
+    blank: Result  # without a pose
     panorama: Panorama | None  # None of one that can't be read
     query: Query | None
 
 
-def photo_facts(picture: Picture, rig: Calibration | None) -> PhotoFacts:
-    """Return the facts of a photo besides its pixels: digest, size, time, place."""
-    return (
-        photo_of_array(picture) if isinstance(picture, np.ndarray) else read_photo_facts(Path(picture), rig)
-    )
-
-
 class Walk:
-    """A camera tracked through a scan: `add` frames in order; `finish` uses all frames together."""
+    """A camera tracked through a scan: `add` frames in order; `finish` uses all frames together.
 
-    def __init__(self, tracker: Tracker, read_options: ReadOptions, about: WalkAbout) -> None:
-        self.tracker = tracker
-        tracker.read = self._panorama
+    Raises InputError for the preset paper, and for a focal length that is to be refined.
+    """
+
+    def __init__(
+        self, scan: OpenedScan, read_options: ReadOptions, settings: Settings, motion: Motion
+    ) -> None:
+        scan_map, settings = scan.require_default_method("walks", settings)
+        if read_options.refine_focal:
+            raise InputError(
+                "`refine_focal`: not an option of walks; refine the focal length with a single photo"
+            )
+        check_within(scan_map, settings.prior.within)
+        quiet = Workers(scan.workers.num_threads, warn=scan.workers.warn)
+        self.scan = scan
         self.read_options = read_options
-        self.about = about
+        self.tracker = Tracker(scan_map, settings, quiet, motion)
+        self.tracker.read = self._read_again
+        about = settings_json(settings, scan.cloud_settings, read_options)
+        self.settings: dict[str, object] = {**about, "walk": motion.to_settings()}
         self.pictures: list[Picture] = []
-        self.taken: list[Taken] = []
+        self.blanks: list[Result] = []  # of the frames so far, without poses
 
     def add(
         self,
@@ -112,46 +99,47 @@ class Walk:
         with reading_once():
             try:
                 with watch.stage("read"):
-                    panorama = replace(read_photo(frame, self.read_options), focal_prior=None)  # as exact
-                    photo = photo_facts(frame, self.read_options.rig)
+                    panorama = self._read(frame)
+                    photo = read_photo_facts(frame, self.read_options.rig)
             except Exception as error:
-                text, is_passing = describe_failure(error)
                 if isinstance(frame, np.ndarray):
                     raise
-                failure = Failure(text.replace(str(frame), name), is_passing)
-                digest = self._digest(frame)
-                return Prepared(frame, Taken(name, None, watch.seconds, (), digest, failure), None, None)
+                settings = self.tracker.settings
+                failed = make_failed_result(self.scan, frame, error, self.read_options, settings, name)
+                return Prepared(frame, replace(failed, settings=self.settings), None, None)
         with watch.stage("prepare"):
             query = self.tracker.prepare(panorama)
-        warnings = tuple(warning.replace(str(frame), name) for warning in panorama.warnings)
-        taken = Taken(name, photo, watch.seconds, warnings, photo.sha256)
-        return Prepared(frame, taken, panorama, query)
+        result = self.scan.make_result(frame, panorama, photo, Localization(), self.settings, watch.seconds)
+        warnings = tuple(warning.replace(str(frame), name) for warning in result.warnings)
+        return Prepared(frame, replace(result, pano=name, warnings=warnings), panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
         """Localize a prepared frame, as `add` does."""
-        number = len(self.taken)
-        picture, taken, panorama, query = prepared
+        number = len(self.blanks)
+        picture, blank, panorama, query = prepared
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
             check_times([self.tracker.frames[-1].time, when])
         elif time is None:
             self.tracker.forget_times()
-            self.about.settings["walk"] = self.tracker.motion.to_settings()
-        watch = Stopwatch(taken.seconds)
+            self.settings["walk"] = self.tracker.motion.to_settings()
         if panorama is None or query is None:
             self.tracker.accept(Frame(when, odometry=odometry))
         else:
-            with watch.stage("track"):
+            with Stopwatch(blank.seconds).stage("track"):
                 self.tracker.add(panorama, query, when, odometry)
         self.pictures.append(picture)
-        self.taken.append(taken)
-        return self._now(self.tracker.frames[-1], number)
+        self.blanks.append(blank)
+        path = self.tracker.lattice.filter_path()
+        frame = self.tracker.frames[-1]
+        found = make_localization(self.tracker, frame, believe(self.tracker.frames, path, number))
+        return self._result(blank, found, WalkFrame(frame.time, number, frame.how, result_alone(frame), None))
 
     def last_to_json(self) -> str:
         """Return what is known of the last frame on one line, for `restore`."""
         from msgspec import to_builtins  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = Kept(self.taken[-1], self.tracker.frames[-1])
+        kept = Kept(self.blanks[-1].to_json(), self.tracker.frames[-1])
         return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
 
     def restore(self, line: bytes, picture: Path, time: float, name: str) -> bool:
@@ -162,60 +150,41 @@ class Walk:
         from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
 
         kept = convert(json.loads(line), Kept, dec_hook=lambda _, rows: np.array(rows))
-        taken = kept.taken
-        found = taken.name, kept.frame.time, taken.sha256
-        is_same = found == (name, time, self._digest(picture))
-        if not is_same or (taken.failure and taken.failure.is_passing):
+        blank = replace(Result.from_json(kept.blank), settings=self.settings)
+        is_expected = (blank.pano, kept.frame.time) == (name, time)
+        if blank.status == FAILED or not is_expected or not self._is_of(picture, blank):
             return False
         self.pictures.append(picture)
-        self.taken.append(taken)
+        self.blanks.append(blank)
         self.tracker.accept(kept.frame)
         return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""
-        path, beliefs = finish(self.tracker, show)
-        found = make_localizations(self.tracker, path, beliefs)
-        return [
-            self._result(taken, add_places(self.tracker.scan_map, f), walk)
-            for taken, (f, walk) in zip(self.taken, found, strict=True)
-        ]
+        found = make_localizations(self.tracker, *finish(self.tracker, show))
+        return [self._result(blank, *parts) for blank, parts in zip(self.blanks, found, strict=True)]
 
-    def _now(self, frame: Frame, number: int) -> Result:
-        path = self.tracker.lattice.filter_path()
-        found = make_localization(self.tracker, frame, believe(self.tracker.frames, path, number))
-        walk = WalkFrame(frame.time, number, frame.how, result_alone(frame), None)
-        return self._result(self.taken[number], add_places(self.tracker.scan_map, found), walk)
-
-    def _panorama(self, k: int) -> Panorama | None:
-        """Return the picture of an earlier frame; None if it can't be read, or is another now."""
-        picture = self.pictures[k]
-        taken = self.taken[k]
-        with reading_once():
-            is_same = isinstance(picture, np.ndarray) or self._digest(picture) == taken.sha256
-            if taken.failure is not None or not is_same:
-                return None
-            return replace(read_photo(picture, self.read_options), focal_prior=None)
-
-    def _digest(self, picture: str | PathLike[str]) -> str | None:
-        return sha256_of(Path(picture), self.read_options.rig)
-
-    def _result(self, taken: Taken, found: Localization, walk: WalkFrame | None) -> Result:
+    def _result(self, blank: Result, found: Localization, walk: WalkFrame) -> Result:
         """Return the result of a frame; a frame that can't be read keeps its place in the walk."""
-        about = self.about
-        photo = taken.photo
-        digest = self.tracker.scan_map.scan_sha256 or None
-        if photo is None:
-            text, is_passing = taken.failure or ("", False)
-            more = {"settings": about.settings, "source": Source(digest, taken.sha256)}
-            return unreadable_result(text, about.cloud, taken.name, is_passing, walk=walk, **more)
-        return result_of(
-            found,
-            cloud=about.cloud,
-            pano=taken.name,
-            seconds=taken.seconds,
-            settings=about.settings,
-            warnings=about.warnings + taken.warnings,
-            source=Source(digest, photo.sha256, photo.image_size, photo.capture_time),
-            walk=walk,
-        )
+        result = replace(blank, walk=walk)
+        if blank.error is not None:
+            return result
+        return with_localization(result, add_places(self.tracker.scan_map, found))
+
+    def _read(self, picture: Picture) -> Panorama:
+        """Read a picture; its focal length counts as exact."""
+        return replace(read_photo(picture, self.read_options), focal_prior=None)
+
+    def _read_again(self, k: int) -> Panorama | None:
+        """Read the picture of an earlier frame; None if it can't be read, or is another now."""
+        picture = self.pictures[k]
+        blank = self.blanks[k]
+        with reading_once():
+            is_readable = blank.error is None and self._is_of(picture, blank)
+            return self._read(picture) if is_readable else None
+
+    def _is_of(self, picture: Picture, result: Result) -> bool:
+        """Return True if a result is of what a picture shows now."""
+        if isinstance(picture, np.ndarray):
+            return True
+        return sha256_of(Path(picture), self.read_options.rig) == result.source.pano_sha256

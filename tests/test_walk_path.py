@@ -280,5 +280,5 @@ def test_refusals():
         check_times([0.0, 2.0, 1.0])
     with pytest.raises(InputError, match=r"^times: found one that is no finite number, wanted seconds$"):
         check_times([0.0, np.nan])
-    with pytest.raises(InputError, match=r"^max_speed: found -1.0, wanted a number above 0$"):
+    with pytest.raises(InputError, match=r"^`max_speed`: found -1.0, wanted a number above 0$"):
         Motion(max_speed=-1.0)

@@ -79,11 +79,11 @@ def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more
     group.add_argument(name, help=text, **more)
 
 
-def check_least(arguments: argparse.Namespace, **limits: int) -> None:
+def check_least(arguments: argparse.Namespace, **limits: float) -> None:
     """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
     for name, limit in limits.items():
         value = getattr(arguments, name, None)
-        if value is not None and value < limit:
+        if value is not None and not value >= limit:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
 
 

@@ -35,6 +35,7 @@ from ..panorama.photo import sha256_of
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
+from ..scan_walk import Walk
 from .bundle import check_bundle_options, run_bundle
 from .coloring import check_coloring_options, run_coloring
 from .command import command
@@ -53,7 +54,7 @@ from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, locali
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
-from .walking import check_walk_options, run_walk, walk_inputs
+from .walking import check_walk_options, run_walk, walk_frames
 
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
@@ -318,11 +319,11 @@ def run_frames(run: Run) -> int:
     settings = run.localizer.settings
     if not isinstance(settings, CoarseToFineSettings):
         raise UsageError("--walk, --video: not options of the preset paper")
-    with walk_inputs(arguments, list(run.panoramas)) as inputs:
-        opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
+    with walk_frames(arguments, list(run.panoramas)) as (frames, motion):
         if run.left_out:
             print_note(arguments, describe_left_out(run.left_out))
-        return run_walk(arguments, inputs, settings, run.localizer.read_options, opening)
+        scan = open_scan(run, run.localizer, arguments.threads or num_cores())
+        return run_walk(arguments, frames, Walk(scan, run.localizer.read_options, settings, motion))
 
 
 @command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")

@@ -33,7 +33,7 @@ examples:
   python localize.py --cloud scan.ply --pano query.jpg --near 12 3 1.5 4
   python localize.py --cloud scan.ply --pano photos --relative transforms.json --out poses.jsonl
   python localize.py --cloud scan.ply --walk --pano frames --out walk.jsonl
-  python localize.py --cloud scan.ply --video walk.mp4 0.5s --out walk.jsonl
+  python localize.py --cloud scan.ply --video walk.mp4 --out walk.jsonl
   python localize.py --cloud bare.e57 --pano photos --color-scan colored.ply --out poses.jsonl
   python localize.py --cloud scan.ply --pano query.jpg --preset paper solver=lbfgs
 
@@ -45,7 +45,8 @@ ONLY_DEFAULT = ("near", "height", "heading", "within", "gravity_vector", "refine
 NONE = "none"
 CACHE_TEXT = f"folder of prepared maps (default: in the user's cache); {NONE}: prepare the map again"
 PHOTOS_OF_A_JOB = 8  # as many are localized while a process starts and opens a map
-DEFAULT_EVERY = "0.5s"
+DEFAULT_EVERY = 0.5  # [s]
+MIN_EVERY = 0.01  # [s]
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -182,11 +183,9 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
-    text = (
-        "video of a walk, instead of --pano, and the step from one frame to the next, of which the sharpest "
-    )
-    text += f"is taken: 0.5s or 1m for example (default {DEFAULT_EVERY})"
-    option(group, "--video FILE", text, nargs="+", metavar=("FILE", "STEP"))
+    option(group, "--video FILE", "video of a walk, instead of --pano")
+    text = f"seconds from one frame of a video to the next; the sharpest is taken (default {DEFAULT_EVERY})"
+    option(group, "--every S", text, type=float)
     text = (
         f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file with "
     )
@@ -329,6 +328,6 @@ def check_alone(arguments: argparse.Namespace, option: str, others: Sequence[str
 
 def check_arguments(arguments: argparse.Namespace) -> None:
     """Refuse values that are wrong whatever the files hold."""
-    check_least(arguments, threads=1, jobs=1)
+    check_least(arguments, threads=1, jobs=1, every=MIN_EVERY)
     if arguments.overwrite and not arguments.out:
         raise InputError("--overwrite: only with --out")

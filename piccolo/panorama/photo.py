@@ -10,6 +10,7 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping
+from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat, cast
 
@@ -73,12 +74,18 @@ def _digest(files: list[Path]) -> str:
     return digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def read_photo_facts(path: Path, rig: Calibration | None = None) -> PhotoFacts:
+def read_photo_facts(
+    photo: str | PathLike[str] | NDArray[np.uint8], rig: Calibration | None = None
+) -> PhotoFacts:
     """Return the facts that a photo's file gives, or the first file of a folder of cube faces or of a rig.
 
-    InputError if the file is missing or no picture. Metadata that are damaged count as missing.
+    Pixels (H, W, 3) have a digest and a size. InputError if the file is missing or no picture. Metadata that
+    are damaged count as missing.
     """
-    files = _files_of(path, rig)
+    if isinstance(photo, np.ndarray):
+        height, width = photo.shape[:2]
+        return PhotoFacts(sha256_of_arrays(photo), (width, height), None, None)
+    files = _files_of(Path(photo), rig)
     with reading_once(), open_picture(files[0], content := read_bytes(files[0], WANTED)) as image:
         exif: Mapping[int, Any]
         try:
@@ -105,12 +112,6 @@ def _exif_chunk(content: bytes) -> bytes:
             return content[begin + 8 : end]
         begin = end + 4  # behind its checksum
     return b""
-
-
-def photo_of_array(rgb: NDArray[np.uint8]) -> PhotoFacts:
-    """Return the facts of pixels (H, W, 3): their digest and size."""
-    height, width = rgb.shape[:2]
-    return PhotoFacts(sha256_of_arrays(rgb), (width, height), None, None)
 
 
 def _capture_time(exif: Mapping[int, Any]) -> str | None:

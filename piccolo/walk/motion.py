@@ -29,7 +29,7 @@ class Motion:
         for name in ("max_speed", "max_acceleration"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:
-                raise InputError(f"{name}: found {value}, wanted a number above 0")
+                raise InputError(f"`{name}`: found {value}, wanted a number above 0")
 
     @property
     def speed(self) -> float:

@@ -91,10 +91,7 @@ class Selection(NamedTuple):
 def true_results(scene: Scene) -> list[Result]:
     """Return true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
     cloud = str(scene.cloud)
-    return [
-        Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose, None, None, (), None, {}, {})
-        for query in scene.queries
-    ]
+    return [Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose) for query in scene.queries]
 
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
