@@ -12,7 +12,7 @@ from piccolo.geometry.pose import exp_so3, is_correct
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import attempts, query
+from piccolo.localization import attempts, brief, query
 from piccolo.localization import localize as method
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
@@ -100,7 +100,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
-    mirror = attempts.mirror_query(tilted)
+    mirror = brief.mirror_query(tilted)
     other = _query(_turned_over(panorama))
     own, expected = (q.photo.images.search().rgbx.view(np.uint8).astype(int) for q in (mirror, other))
     assert np.abs(own - expected).max() <= 1  # level
@@ -121,15 +121,15 @@ def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = attempts.mirror_query(asked)
-    own, other = (attempts.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
+    mirror = brief.mirror_query(asked)
+    own, other = (brief.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
 
 
 @pytest.mark.parametrize(
-    ("gravity", "brief"), [("auto", {"num_rotations": 1000, "max_starts": 300}), ("unknown", {})]
+    ("gravity", "changes"), [("auto", {"num_rotations": 1000, "max_starts": 300}), ("unknown", {})]
 )
-def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, gravity, brief):
+def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, gravity, changes):
     """With the gravity `auto`, where the upright search came first, by a brief search."""
     made = []
 
@@ -144,8 +144,8 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
     assert is_correct(found.pose, taken.pose)
     how, asked, num_searched = made[-1]
     num_candidates = len(rooms.scan_map(1).sparse)
-    assert (how, asked) == ("unknown", replace(settings, **brief))
-    assert 0.3 < num_searched / num_candidates < 0.7 if brief else num_searched == num_candidates
+    assert (how, asked) == ("unknown", replace(settings, **changes))
+    assert 0.3 < num_searched / num_candidates < 0.7 if changes else num_searched == num_candidates
 
 
 def test_a_brief_search_keeps_what_little_a_prior_leaves():

@@ -13,6 +13,7 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
+from piccolo.localization import verdict
 from piccolo.localization.comparison import (
     CONTRADICTS,
     Comparison,
@@ -203,3 +204,12 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg):
     assert not is_mirrored(right, doubtful)
     assert not is_mirrored(turned_over, plain)
     assert not is_mirrored(dataclasses.replace(turned_over, num_parts=0), doubtful)
+
+
+def test_a_photo_that_views_explain_better_is_not_mirrored_by_a_few_matches(monkeypatch):
+    """A mirrored photo has more features that agree, as of a scan that looks alike in a mirror."""
+    turned_over = _query(rooms.query(1).rgb[:, ::-1].copy())
+    doubtful = Hypothesis(_clean()[1], 0.5)
+    for score, expected in ((0.49, False), (0.51, True)):
+        monkeypatch.setattr(verdict, "refine_matches", lambda query, poses: [Hypothesis(poses[0], score)])  # noqa: B023
+        assert is_mirrored(turned_over, doubtful) == expected

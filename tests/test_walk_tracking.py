@@ -11,14 +11,15 @@ from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization import refinement, verification
-from piccolo.localization.attempts import CHANCE_MATCHES, brief_query
+from piccolo.localization.attempts import CHANCE_MATCHES
+from piccolo.localization.brief import brief_query, score_briefly, score_mirror
 from piccolo.localization.comparison import score_pose
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
-from piccolo.walk.places import Place, descend_briefly, find_places, is_mirrored, query_near
+from piccolo.walk.places import Place, find_places, query_near
 from piccolo.walk.tracker import Expected, expect, find_near, predict, refine_state, track
 
 SEED = 1
@@ -120,12 +121,8 @@ def test_another_place_is_taken_if_it_looks_better_than_a_copy(seen, monkeypatch
     query, true = seen
     elsewhere = _off(true, 3.0, 0.0)
 
-    def places(query, ends, best_score):
-        is_other = len(ends.scores) > 1  # of the search
-        own = behind if is_other else -behind
-        return [Place(elsewhere if is_other else true, min(own, 0.0))]
-
-    monkeypatch.setattr(tracker, "list_places", places)
+    monkeypatch.setattr(tracker, "list_places", lambda *_: [Place(elsewhere, min(behind, 0.0))])
+    monkeypatch.setattr(tracker, "log_behind", lambda *_: min(-behind, 0.0))
     monkeypatch.setattr(tracker, "track", lambda query, start: State(start, 3.5, 0.5))
     found = find_near(query, _expected(true, 2.0))
     assert found.state.pose is {"expected": true, "elsewhere": elsewhere}[at]
@@ -135,11 +132,8 @@ def test_another_place_is_taken_if_it_looks_better_than_a_copy(seen, monkeypatch
 def test_the_best_place_near_is_tried_if_nothing_is_found_where_it_was_expected(seen, monkeypatch):
     query, true = seen
     elsewhere = _off(true, 3.0, 0.0)
-    monkeypatch.setattr(
-        tracker,
-        "list_places",
-        lambda query, ends, best_score: [Place(elsewhere if len(ends.scores) > 1 else true, 0.0)],
-    )
+    monkeypatch.setattr(tracker, "list_places", lambda *_: [Place(elsewhere, 0.0)])
+    monkeypatch.setattr(tracker, "log_behind", lambda *_: 0.0)
     monkeypatch.setattr(
         tracker, "track", lambda query, start: None if start is true else State(start, odds, 0.5)
     )
@@ -167,7 +161,7 @@ def test_a_mirrored_photo_is_told_near_a_pose_and_anywhere(seen):
     mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
     for taken, wanted in ((query, False), (mirrored, True)):
         for some in (query_near(taken, true, 2.0), brief_query(taken)):
-            assert is_mirrored(some, descend_briefly(some)) == wanted
+            assert (score_mirror(some) > score_briefly(some)) == wanted
 
 
 def test_a_rough_place_is_refined_or_dropped(seen):

@@ -15,25 +15,23 @@ from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, propose_poses
-from ..panorama.texels import Texels
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
+from .brief import brief_query, score_mirror, score_starts
 from .comparison import score_pose
 from .prior import contradictions
 from .query import Query
-from .refinement import FIRST_ITERATIONS, descend_all, refine, refine_matches
-from .search import SearchedGravity, Starts, search_poses
+from .refinement import refine, refine_matches
+from .search import SearchedGravity, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
 from .verification import verify
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
-FIRST_STARTS = 300  # few are enough for a clear photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
-NUM_SCORED = 64  # starts, if only the best score is needed
 NUM_VERIFIED = 7  # alternatives of the best pose that are verified
 ENOUGH_MATCHES = 40  # of a part of the features: the others are not asked
 CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
@@ -163,12 +161,6 @@ def is_whole(query: Query) -> bool:
     return query.settings.gravity != "unknown" and not query.photo.is_partial
 
 
-def brief_query(query: Query, most: int = FIRST_STARTS) -> Query:
-    """Return the query with fewer starts, at most so many."""
-    settings = replace(query.settings, max_starts=min(most, FIRST_STARTS, query.settings.max_starts))
-    return replace(query, settings=settings)
-
-
 def tilt_query(query: Query) -> Query:
     """Return a brief query with any tilt, for a whole photo that was searched as upright.
 
@@ -180,30 +172,3 @@ def tilt_query(query: Query) -> Query:
     is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
     settings = replace(brief.settings, num_rotations=min(FIRST_ROTATIONS, query.settings.num_rotations))
     return replace(brief, scan_map=query.scan_map.narrow(is_even), settings=settings)
-
-
-def score_mirror(query: Query) -> float:
-    """Search the mirrored photo, and return its first score."""
-    mirror = mirror_query(query)
-    return score_starts(mirror, search_poses(mirror, "known"))
-
-
-def score_starts(query: Query, starts: Starts) -> float:
-    """Return the best score after short descents from the best starts on prepared views."""
-    best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
-    image = query.photo.images.search()
-    _, scores = descend_all(query.scan_map, image, best, FIRST_ITERATIONS, query.workers)
-    return float(scores.max(initial=0.0))
-
-
-def mirror_query(query: Query) -> Query:
-    """Return the query of the photo mirrored left to right, without the prior's heading."""
-    search = query.photo.images.search()
-    rgbx = np.ascontiguousarray(search.rgbx.reshape(-1, search.width + 2)[:, ::-1]).reshape(-1)
-    images = query.photo.images._replace(search=Once(lambda: Texels(rgbx, search.width)))
-    across = np.diag([1.0, -1.0, 1.0])
-    level = across @ query.photo.R_cam_from_level @ across
-    photo = replace(query.photo, images=images, R_cam_from_level=level)
-    prior = replace(query.settings.prior, heading_deg=None)
-    settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
-    return replace(query, photo=photo, settings=settings)

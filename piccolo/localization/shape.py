@@ -10,7 +10,7 @@ from ..geometry.pose import Array, yaw_rotation
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
-from .attempts import brief_query, score_starts
+from .brief import brief_query, score_starts
 from .query import find_tilt, prepare_query
 from .search import search_poses
 from .selection import CLEAR_MARGIN, CLEAR_SHAPE, Selection

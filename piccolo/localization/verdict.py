@@ -19,16 +19,17 @@ from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
 from ..panorama import Panorama
 from ..views.zbuffer import visible_points
+from .brief import mirror_query
 from .covariance import estimate_covariance
 from .focal_length import FocalFit
 from .last_descent import settle
 from .prior import contradictions
 from .query import Query
+from .refinement import refine_matches
 from .selection import SURE_MATCHES, Selection, assess_poses
 from .verification import count_agreeing, find_copies
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
-MIRROR_RATIO = 1.2  # least ratio of matches, mirrored photo to photo
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
@@ -151,7 +152,7 @@ def collect_evidence(
 
 
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
-    """Return True if the mirrored photo's features agree with a pose better than the photo's.
+    """Return True if the mirrored photo fits a pose better than the photo: by features and by whole views.
 
     Symmetric scenes match in a mirror too, but no better. The test is skipped for a pose that explains nearly
     all of the photo, and after a first look, which has compared the mirrored photo itself.
@@ -161,4 +162,6 @@ def is_mirrored(query: Query, best: Hypothesis) -> bool:
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
     found = propose_poses(matches, None, 1, query.workers)
     num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
-    return len(found) > 0 and found[0].num_matches > max(MIRROR_RATIO * num_matches, SURE_MATCHES)
+    if not found or found[0].num_matches <= max(num_matches, SURE_MATCHES):
+        return False
+    return refine_matches(mirror_query(query), [found[0].pose])[0].score > best.score

@@ -32,6 +32,11 @@ class Texels(NamedTuple):
     width: int  # W [px], H = W / 2
     valid_share: float = 1.0  # of the sphere
 
+    def mirror(self) -> "Texels":
+        """Return the image mirrored left for right."""
+        rows = self.rgbx.reshape(-1, self.width + 2)
+        return self._replace(rgbx=np.ascontiguousarray(rows[:, ::-1]).reshape(-1))
+
 
 def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> Texels:
     """Pack an image (H, W, 3), W = 2 H, into texels; those of `is_valid` (H, W) count, all if it is None."""

@@ -14,7 +14,8 @@ from ..geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
-from ..localization.attempts import brief_query, is_whole
+from ..localization.attempts import is_whole
+from ..localization.brief import brief_query, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.comparison import score_pose
 from ..localization.covariance import estimate_covariance
 from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY, settle
@@ -46,11 +47,9 @@ from .motion import REACH_SLACK, Motion, carry
 from .path import COPY_LOG_ODDS, EVEN, Lattice
 from .places import (
     MOST_PLACES,
-    descend_briefly,
-    descend_near,
     find_places,
-    is_mirrored,
     list_places,
+    log_behind,
     query_near,
 )
 
@@ -221,8 +220,8 @@ class Tracker:
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         is_sure = frame.is_localized_alone
         brief = brief_query(query)
-        is_wrong = not is_sure and is_whole(query) and is_mirrored(brief, descend_briefly(brief))
-        if found := [] if is_wrong else list_states(self.scan_map, frame.alone):
+        is_mirrored = not is_sure and is_whole(query) and score_mirror(brief) > score_briefly(brief)
+        if found := [] if is_mirrored else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
             frame.make_key(list_key_states(query, found[:1] if is_sure else found, is_sure))
 
@@ -313,11 +312,11 @@ def find_near(query: Query, expected: Expected) -> Found | None:
     """
     near = query_near(query, expected.last, expected.reach)
     ends = descend_briefly(near)
-    if is_mirrored(near, ends):
+    if not query.photo.is_partial and score_mirror(near) > ends.best_score:
         return None
-    here = descend_near(query, expected.pose)
-    best_score = max(ends.best_score, here.best_score)
-    is_alike = list_places(query, here, best_score)[0].behind > -COPY_LOG_ODDS
+    score = score_near(query, expected.pose)
+    best_score = max(ends.best_score, score)
+    is_alike = log_behind(query, score, best_score) > -COPY_LOG_ODDS
     places = [p.pose for p in list_places(query, ends, best_score) if p.behind > -COPY_LOG_ODDS]
     alike = [pose for pose in places if distance(pose, expected.last) <= expected.reach]
     starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
