@@ -10,7 +10,7 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
-from piccolo.localization import refinement, verification
+from piccolo.localization import near, refinement, verification
 from piccolo.localization.attempts import CHANCE_MATCHES
 from piccolo.localization.brief import brief_query, score_briefly, score_mirror
 from piccolo.localization.comparison import score_pose
@@ -198,7 +198,7 @@ def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkey
         starts.append(start)
         return start, start
 
-    monkeypatch.setattr(tracker, "refine_on_middle_cells", stay)
+    monkeypatch.setattr(near, "refine_on_middle_cells", stay)
     end = tracker.track(taken, _off(true, 0.25, 4.0))
     assert pose_errors(starts[1], true)[0] < 0.1
     assert pose_errors(end.pose, true)[0] < 0.05
@@ -209,14 +209,14 @@ def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkey
 def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
     taken = _narrow(seen[0])
     true = seen[1]
-    here = tracker.assess_end(taken, Hypothesis(true, 0.5))
+    here = near.assess_end(taken, Hypothesis(true, 0.5))
     assert here.num_matches > CHANCE_MATCHES
     for metres, degrees in ((0.25, 0.0), (0.0, 6.0)):
-        elsewhere = tracker.assess_end(taken, Hypothesis(_off(true, metres, degrees), 0.5))
+        elsewhere = near.assess_end(taken, Hypothesis(_off(true, metres, degrees), 0.5))
         assert elsewhere.num_matches == 0
     assert log_odds(here) > log_odds(elsewhere)
-    assert tracker.assess_end(seen[0], Hypothesis(true, 0.5)).num_matches is None
-    assert tracker.assess_end(replace(taken, num_parts=0), Hypothesis(true, 0.5)).num_matches is None
+    assert near.assess_end(seen[0], Hypothesis(true, 0.5)).num_matches is None
+    assert near.assess_end(replace(taken, num_parts=0), Hypothesis(true, 0.5)).num_matches is None
 
 
 @pytest.mark.parametrize(
@@ -224,7 +224,7 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
 )
 def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, odds, score, is_found):
     query, true = seen
-    monkeypatch.setattr(tracker, "descend_last", lambda query, start, seen_from: State(start, odds, score))
+    monkeypatch.setattr(tracker, "refine", lambda query, start: State(start, odds, score))
     assert (track(query, true) is not None) == is_found
 
 
@@ -281,10 +281,10 @@ def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
     query, true = seen
     taken = _narrow(query)
     here = Hypothesis(true, 0.5)
-    alone = tracker.assess_end(taken, here).num_matches
+    alone = near.assess_end(taken, here).num_matches
     more = taken.seen().keypoints.take(np.arange(2 * alone))
     located = verification.Located(more, np.full(2 * alone, 2.0, np.float32), true)
     others = verification.match_located(taken.seen().keypoints, located)
-    assert tracker.assess_end(replace(taken, beside=(others,)), here).num_matches > alone
+    assert near.assess_end(replace(taken, beside=(others,)), here).num_matches > alone
     away = others._replace(points=others.points + np.float32(0.5))
-    assert tracker.assess_end(replace(taken, beside=(away,)), here).num_matches == alone
+    assert near.assess_end(replace(taken, beside=(away,)), here).num_matches == alone

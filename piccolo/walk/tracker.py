@@ -9,23 +9,20 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import Standing, posterior
-from ..geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3
+from ..confidence.confidence import posterior
+from ..geometry.pose import Pose, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..localization.attempts import is_whole
 from ..localization.brief import brief_query, descend_briefly, score_briefly, score_mirror, score_near
-from ..localization.comparison import score_pose
-from ..localization.covariance import estimate_covariance
-from ..localization.last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY, settle
 from ..localization.localize import localize
+from ..localization.near import has_own_matches, refine_near
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
-from ..localization.refinement import descend, refine_on_middle_cells
 from ..localization.selection import SURE_SCORE, assess_poses
 from ..localization.settings import CoarseToFineSettings
-from ..localization.verification import is_near, match_beside, place_keypoints, verify
+from ..localization.verification import match_beside, place_keypoints, verify
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .frames import (
@@ -350,48 +347,20 @@ def distance(pose: Pose, other: Pose) -> float:
 
 
 def track(query: Query, start: Pose) -> State | None:
-    """Descend from a pose and around; None if the end more likely is wrong than right, or explains nothing.
+    """Refine a pose; None if the end more likely is wrong than right, or explains nothing.
 
     A narrow photo is tracked again from where its matches put it.
     """
-    end = descend_last(query, *refine_on_middle_cells(query, start))
+    end = refine(query, start)
     if has_own_matches(query):
-        again = descend_last(query, *refine_on_middle_cells(query, verify(query, end.pose).pose))
+        again = refine(query, verify(query, end.pose).pose)
         end = max(end, again, key=lambda state: state.log_odds)
     is_wrong = end.log_odds < 0.0 or end.score is None or end.score < SURE_SCORE
     return None if is_wrong else end
 
 
-def descend_last(query: Query, start: Pose, seen_from: Pose) -> State:
-    """Descend on the points themselves; return the end, with its odds by whole views.
-
-    `seen_from` is a pose nearby, whose view is known. A narrow photo converges slowly: its descent goes on.
-    """
-    pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
-    end = score_pose(query, pose, seen_from if distance(pose, seen_from) < NEARLY else None)
-    end = settle(query, end) if query.photo.is_partial else end
-    sees_same = distance(end.pose, start) < NEARLY
-    covariance = None
-    if end.score >= HOPELESS_SCORE:
-        covariance = estimate_covariance(query, end.pose, seen_from=start if sees_same else None)
-    probability = float(posterior([assess_end(query, end)], covariance)[0])
-    log_odds = log_odds_of_place(probability, probability, covariance)
-    return State(end.pose, log_odds, end.score, covariance)
-
-
-def has_own_matches(query: Query) -> bool:
-    """Return True for a narrow photo whose features can be matched with the scan drawn at a pose."""
-    return query.photo.is_partial and query.num_parts > 0
-
-
-def assess_end(query: Query, end: Hypothesis) -> Standing:
-    """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
-
-    Matches do not count if they put the photo elsewhere, with photos beside or without.
-    """
-    standing = assess_poses(replace(query, num_parts=0), end, [])[0]
-    if not has_own_matches(query):
-        return standing
-    found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
-    own = [v.num_matches for v in found if is_near(v.pose, end.pose, MAX_DISTANCE)]
-    return standing._replace(num_matches=max(own, default=0), is_drawn=True)
+def refine(query: Query, start: Pose) -> State:
+    """Refine a pose, whatever it is; return the end with its odds by the photo alone."""
+    end = refine_near(query, start)
+    log_odds = log_odds_of_place(end.probability, end.probability, end.covariance)
+    return State(end.pose, log_odds, end.score, end.covariance)

@@ -1,0 +1,62 @@
+"""A photo near a pose that is known from elsewhere: its own pose there, and how likely that is."""
+
+import math
+from dataclasses import replace
+from typing import NamedTuple
+
+from ..confidence.alternatives import Hypothesis
+from ..confidence.confidence import Standing, posterior
+from ..confidence.covariance import PoseCovariance
+from ..geometry.pose import MAX_DISTANCE, Pose
+from .comparison import score_pose
+from .covariance import estimate_covariance
+from .last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY, settle
+from .query import Query
+from .refinement import descend, refine_on_middle_cells
+from .selection import assess_poses
+from .verification import is_near, verify
+
+
+class Near(NamedTuple):
+    """A pose near one that was given, judged by the photo alone."""
+
+    pose: Pose  # in the map
+    score: float  # as of Evidence
+    covariance: PoseCovariance | None  # in the world
+    probability: float  # that the pose is right
+
+
+def has_own_matches(query: Query) -> bool:
+    """Return True for a narrow photo whose features can be matched with the scan drawn at a pose."""
+    return query.photo.is_partial and query.num_parts > 0
+
+
+def refine_near(query: Query, start: Pose) -> Near:
+    """Descend from a pose and around, then on the points themselves, and judge the end by whole views.
+
+    A narrow photo converges slowly: its descent goes on.
+    """
+    start, seen_from = refine_on_middle_cells(query, start)
+    pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
+    sees_same = math.dist(pose.center_world, seen_from.center_world) < NEARLY
+    end = score_pose(query, pose, seen_from if sees_same else None)
+    end = settle(query, end) if query.photo.is_partial else end
+    covariance = None
+    if end.score >= HOPELESS_SCORE:
+        sees_same = math.dist(end.pose.center_world, start.center_world) < NEARLY
+        covariance = estimate_covariance(query, end.pose, seen_from=start if sees_same else None)
+    probability = float(posterior([assess_end(query, end)], covariance)[0])
+    return Near(end.pose, end.score, covariance, probability)
+
+
+def assess_end(query: Query, end: Hypothesis) -> Standing:
+    """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
+
+    Matches do not count if they put the photo elsewhere, with photos beside or without.
+    """
+    standing = assess_poses(replace(query, num_parts=0), end, [])[0]
+    if not has_own_matches(query):
+        return standing
+    found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
+    own = [v.num_matches for v in found if is_near(v.pose, end.pose, MAX_DISTANCE)]
+    return standing._replace(num_matches=max(own, default=0), is_drawn=True)
