@@ -6,9 +6,9 @@ import rooms
 
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.jobs.threads import Workers
+from piccolo.scan_map.free_space import FreeSpace
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scenes.synthetic.world import make_world, scan_world
-from piccolo.walk.free_space import FreeSpace
 
 
 @pytest.fixture(scope="module")

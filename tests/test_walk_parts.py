@@ -10,10 +10,10 @@ from piccolo.batch.frame_times import times_of
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.walk.motion import Motion
-from piccolo.walk.results import smooth_positions
+from piccolo.optimize.smoothing import smooth_positions
 
-MOTION = Motion(2.0, 0.5)
+MAX_ACCELERATION = 0.5  # [m/s^2]
+MAX_SPEED = 2.0  # [m/s]
 TURN = exp_so3(np.array([0.1, -0.3, 1.0]))
 
 
@@ -46,8 +46,8 @@ def test_positions_and_deviations_are_those_of_dense_least_squares():
     rng = np.random.default_rng(3)
     times = np.cumsum(rng.uniform(0.3, 0.8, 12))
     located = _located(rng.normal(0.0, 0.3, (12, 3)) + times[:, None], rng.uniform(0.01, 0.4, 12))
-    centers, covariance = _dense(located, times, MOTION.max_acceleration)
-    found = smooth_positions(located, times, MOTION)
+    centers, covariance = _dense(located, times, MAX_ACCELERATION)
+    found = smooth_positions(located, times, MAX_ACCELERATION, MAX_SPEED)
     np.testing.assert_allclose([pose.center_world for pose, _ in found], centers, atol=1e-8)
     variances = [c.matrix[4, 4] for _, c in found]
     np.testing.assert_allclose(variances, np.diag(covariance), rtol=1e-8)
@@ -58,7 +58,7 @@ def test_an_uncertain_frame_comes_to_the_others_and_turns_with_its_place():
     centers = np.outer(times, [1.0, 0.0, 0.0])
     centers[2, 1] += 0.2
     located = _located(centers, [0.005, 0.005, 0.3, 0.005, 0.005], coupling=0.9)
-    pose, covariance = smooth_positions(located, times, MOTION)[2]
+    pose, covariance = smooth_positions(located, times, MAX_ACCELERATION, MAX_SPEED)[2]
     assert abs(pose.center_world[1]) < 0.02
     assert covariance.std_mm[1] < 40.0
     turn = log_so3(pose.R_cam_from_world @ TURN.T)
@@ -69,12 +69,12 @@ def test_an_uncertain_frame_comes_to_the_others_and_turns_with_its_place():
 @pytest.mark.parametrize("count", [0, 1, 2])
 def test_few_frames_stay_as_they_are(count):
     located = _located(np.zeros((count, 3)), [0.1] * count)
-    assert smooth_positions(located, np.arange(count), MOTION) == located
+    assert smooth_positions(located, np.arange(count), MAX_ACCELERATION, MAX_SPEED) == located
 
 
 def test_frames_far_apart_say_nothing_of_each_other():
     located = _located([[0, 0, 0], [0, 1, 0], [0, 0, 0]], [0.1] * 3)
-    found = smooth_positions(located, [0.0, 10.0, 20.0], MOTION)
+    found = smooth_positions(located, [0.0, 10.0, 20.0], MAX_ACCELERATION, MAX_SPEED)
     np.testing.assert_allclose([pose.center_world[1] for pose, _ in found], [0, 1, 0], atol=1e-12)
 
 

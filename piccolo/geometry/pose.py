@@ -218,3 +218,14 @@ def transform_points(points: Array, T_target_from_source: Array) -> Array:
     """Transform points (N, 3) by an affine transform (4, 4) for column vectors."""
     x, y, z = points.T
     return np.stack([a * x + b * y + c * z + d for a, b, c, d in T_target_from_source[:3]], axis=1)
+
+
+def carry(pose: Pose, beside: Pose, to: Pose) -> Pose:
+    """Return the pose that lies to `to` as `pose` does to `beside`: the same motion of the camera, elsewhere.
+
+    Poses are in any one frame each: pose and beside in that of an odometry, say, and to in the map.
+    """
+    R_to_from_world = to.R_cam_from_world
+    offset_cam = beside.R_cam_from_world @ (pose.center_world - beside.center_world)
+    R = pose.R_cam_from_world @ beside.R_cam_from_world.T @ R_to_from_world
+    return Pose(R, to.center_world + R_to_from_world.T @ offset_cam)

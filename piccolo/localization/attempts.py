@@ -24,7 +24,7 @@ from .prior import contradictions
 from .query import Query
 from .refinement import refine, refine_matches
 from .search import SearchedGravity, search_poses
-from .selection import is_clear, is_sure, rank
+from .selection import SURE_MARGIN, is_clear, is_sure, rank
 from .settings import Beam
 from .verification import verify
 
@@ -118,7 +118,9 @@ def search_views(
     with watch.stage("refine"):
         found = refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         found = known + add_verified(query, found)
-        return found, is_sure(query, found)
+        # a narrow photo looks like many places: its features tell which
+        least_margin = -1.0 if query.photo.is_partial else SURE_MARGIN
+        return found, is_sure(query, found, least_margin)
 
 
 def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Array, Pose, carry
 from .frames import Frame, State, is_same
-from .motion import carry
 from .path import EVEN, Path
 
 

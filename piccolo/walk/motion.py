@@ -6,7 +6,6 @@ from dataclasses import asdict, dataclass
 from itertools import pairwise
 
 from ..errors import InputError
-from ..geometry.pose import Pose
 from ..scan_map.camera_positions import COARSE_SPACING
 
 MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
@@ -57,14 +56,3 @@ def check_times(times: Sequence[float]) -> None:
     for k, (before, after) in enumerate(pairwise(times)):
         if after <= before:
             raise InputError(f"times: found {after} after {before} at frame {k + 1}, wanted them to rise")
-
-
-def carry(pose: Pose, beside: Pose, to: Pose) -> Pose:
-    """Return the pose that lies to `to` as `pose` does to `beside`: the same motion of the camera, elsewhere.
-
-    Poses are in any one frame each: pose and beside in that of an odometry, say, and to in the map.
-    """
-    R_to_from_world = to.R_cam_from_world
-    offset_cam = beside.R_cam_from_world @ (pose.center_world - beside.center_world)
-    R = pose.R_cam_from_world @ beside.R_cam_from_world.T @ R_to_from_world
-    return Pose(R, to.center_world + R_to_from_world.T @ offset_cam)

@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Array, Pose, carry
+from ..scan_map.free_space import FreeSpace
 from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
-from .free_space import FreeSpace
-from .motion import JUMP_LOG, REACH_SLACK, Motion, carry
+from .motion import JUMP_LOG, REACH_SLACK, Motion
 
 EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better

@@ -8,13 +8,12 @@ from itertools import islice
 import numpy as np
 
 from ..confidence.confidence import MIN_CONFIDENCE
-from ..geometry.pose import Pose
+from ..geometry.pose import Pose, carry
 from ..jobs.blas import one_blas_thread
 from ..jobs.threads import Progress, no_progress
 from ..localization.query import Query
 from .beliefs import Belief, believe
 from .frames import Frame
-from .motion import carry
 from .path import EVEN, Path, build_lattice
 from .tracker import Expected, Found, Tracker, distance, find_near, refine_state
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import posterior
-from ..geometry.pose import Pose, exp_so3, log_so3
+from ..geometry.pose import Pose, carry, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -24,6 +24,7 @@ from ..localization.selection import SURE_SCORE, assess_poses
 from ..localization.settings import CoarseToFineSettings
 from ..localization.verification import match_beside, place_keypoints, verify
 from ..panorama import Panorama
+from ..scan_map.free_space import FreeSpace
 from ..scan_map.scan_map import ScanMap
 from .frames import (
     MOST_EXPECTED,
@@ -39,8 +40,7 @@ from .frames import (
     log_ratio,
     put_state,
 )
-from .free_space import FreeSpace
-from .motion import REACH_SLACK, Motion, carry
+from .motion import REACH_SLACK, Motion
 from .path import COPY_LOG_ODDS, EVEN, Lattice
 from .places import (
     MOST_PLACES,

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..geometry.pose import Array
 from ..jobs.threads import Workers
-from ..scan_map.camera_positions import CLEARANCE_VOXEL, COARSE_SPACING, MIN_CLEARANCE, nearest_distances
-from ..scan_map.scan_map import ScanMap
+from .camera_positions import CLEARANCE_VOXEL, COARSE_SPACING, MIN_CLEARANCE, nearest_distances
+from .scan_map import ScanMap
 
 REACH = math.sqrt(2.5) * COARSE_SPACING  # [m] to neighbours in the grid: across edges (sqrt 2), not corners
 TUBE_RADIUS = MIN_CLEARANCE / 2.0  # [m] of a free way
