@@ -24,7 +24,7 @@ from .scan_map.named_scans import add_places, check_within
 from .walk.beliefs import believe
 from .walk.frames import Frame
 from .walk.motion import Motion, check_times
-from .walk.results import WalkFrame, make_localization, make_localizations, result_alone
+from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
 from .walk.second_look import finish
 from .walk.tracker import Tracker
 
@@ -130,10 +130,9 @@ class Walk:
                 self.tracker.add(panorama, query, when, odometry)
         self.pictures.append(picture)
         self.blanks.append(blank)
-        path = self.tracker.lattice.filter_path()
-        frame = self.tracker.frames[-1]
-        found = make_localization(self.tracker, frame, believe(self.tracker.frames, path, number))
-        return self._result(blank, found, WalkFrame(frame.time, number, frame.how, result_alone(frame), None))
+        belief = believe(self.tracker.frames, self.tracker.lattice.filter_path(), number)
+        found = make_localization(self.tracker, self.tracker.frames[number], belief)
+        return self._result(blank, found, describe_frame(self.tracker.frames, number, None))
 
     def last_to_json(self) -> str:
         """Return what is known of the last frame on one line, for `restore`."""

@@ -2,7 +2,7 @@
 
 import argparse
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -85,6 +85,13 @@ def check_least(arguments: argparse.Namespace, **limits: float) -> None:
         value = getattr(arguments, name, None)
         if value is not None and not value >= limit:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+
+
+def check_only_with(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
+    """Refuse options that mean something only with one that is not given."""
+    for name in others:
+        if getattr(arguments, name) not in (None, False):
+            raise UsageError(f"--{name.replace('_', '-')}: only with {option}")
 
 
 def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:

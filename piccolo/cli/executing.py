@@ -170,8 +170,10 @@ class Interruption:
         finally:
             self.is_at_work = False
 
-    def stop(self, arguments: argparse.Namespace, done: str, how: str) -> int:
+    def stop(self, arguments: argparse.Namespace, done: str, is_kept: bool) -> int:
         """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
+        same = "the same command"
+        how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
         text = f"ended by {SIGNALS[self.number]} after {done}; {how}"
         return print_error(arguments, text, 128 + self.number)
 

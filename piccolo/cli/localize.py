@@ -302,12 +302,7 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
         dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
     if interruption.number:
-        how = (
-            "the same command continues from here"
-            if isinstance(output, FileOutput)
-            else "with --out FILE the same command would continue"
-        )
-        return interruption.stop(arguments, f"{counts.total()} results", how)
+        return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
     if run.total is None:
         note_unused_priors(arguments, run.localizer)
     return choose_exit_code(+counts)

@@ -31,7 +31,7 @@ from ..scenes.synthetic.world import (
     scan_world,
 )
 from ..views.pictures import encode_image
-from .command import check_least, command, option
+from .command import check_least, check_only_with, command, option
 from .errors import UsageError, checking_options
 from .outputs import check_folder_name
 from .progress import progress_bar
@@ -127,9 +127,8 @@ def check_usage(arguments: argparse.Namespace) -> None:
         raise UsageError("--variants: found change, wanted others in a building")
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
-    given = [name for name in OF_WALKS if getattr(arguments, name)]
-    if given and not arguments.walk:
-        raise UsageError(f"--{given[0].replace('_', '-')}: only with --walk")
+    if not arguments.walk:
+        check_only_with(arguments, "--walk", OF_WALKS)
     if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
     if arguments.walk and (arguments.labels or arguments.camera):

@@ -26,6 +26,7 @@ from ..panorama.video import frames_of
 from ..result import FAILED
 from ..scan_walk import Walk
 from ..walk.motion import Motion
+from .command import check_only_with
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY, check_alone
@@ -51,7 +52,7 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
     if not (arguments.walk or is_video):
         if not arguments.pano:
             raise UsageError("the following arguments are required: --pano")
-        check_without(arguments, "--walk or --video", ONLY_WITH)
+        check_only_with(arguments, "--walk or --video", ONLY_WITH)
         return
     if is_video == bool(arguments.pano):
         raise UsageError("--walk, --video: wanted --walk with --pano, or --video alone")
@@ -61,15 +62,8 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
     if is_video:
         check_alone(arguments, "a video", ("times",))
     else:
-        check_without(arguments, "--video", ("every",))
+        check_only_with(arguments, "--video", ("every",))
     Motion(arguments.max_speed)
-
-
-def check_without(arguments: argparse.Namespace, what: str, names: Sequence[str]) -> None:
-    """Refuse options that are only for something else."""
-    for name in names:
-        if getattr(arguments, name) is not None:
-            raise UsageError(f"--{name.replace('_', '-')}: only with {what}")
 
 
 @contextmanager
@@ -80,11 +74,9 @@ def walk_frames(
     if arguments.video is None:
         times = times_of(panoramas, arguments.times)
         numbers = times or [float(k) for k in range(len(panoramas))]
-        frames = [WalkInput(p, t, str(p)) for p, t in zip(panoramas, numbers, strict=True)]
-        yield (
-            add_odometry(frames, arguments.odometry),
-            Motion(arguments.max_speed, is_timed=times is not None),
-        )
+        frames = [WalkInput(path, time, str(path)) for path, time in zip(panoramas, numbers, strict=True)]
+        motion = Motion(arguments.max_speed, is_timed=times is not None)
+        yield add_odometry(frames, arguments.odometry), motion
         return
     with temporary_folder() as folder:
         found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
@@ -112,12 +104,8 @@ def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: W
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, frames, json.dumps(key))
         if interruption.number:
-            how = (
-                "the same command continues"
-                if frames_file(arguments.out)
-                else "with --out FILE it would continue"
-            )
-            return interruption.stop(arguments, f"{len(walk.blanks)} frames", how)
+            is_kept = frames_file(arguments.out) is not None
+            return interruption.stop(arguments, f"{len(walk.blanks)} frames", is_kept)
         results = walk.finish(progress_bar(arguments.quiet))
     write_results(arguments.out, results)
     counts = Counter(result.status for result in results)
@@ -197,7 +185,7 @@ def count_finished(
     It is if there are none, one has failed, or frames were others. InputError for results of something else.
     """
     out = arguments.out
-    if arguments.overwrite or out is None or is_stream(out) or not out.exists() or not out.stat().st_size:
+    if arguments.overwrite or out is None or is_stream(out):
         return None
     paths = {frame.name: frame.path for frame in frames}
     records = Records(out)

@@ -62,6 +62,11 @@ class Frame:
         return max((state.log_odds for state in self.states), default=-math.inf)
 
     @property
+    def known(self) -> Pose | None:
+        """Where it was tracked to, or the frames after it were tracked from."""
+        return self.departed or self.arrived
+
+    @property
     def is_localized_alone(self) -> bool:
         """True if the photo is sure without the others."""
         return self.alone is not None and self.alone.status == LOCALIZED

@@ -224,10 +224,6 @@ class Lattice:
                 return n, [carry(arrived, departed, state.pose) for state in states]
         return m, [state.pose for state in states]
 
-    def filter_last(self) -> Array:
-        """Return the probability (S,) of each state of the last key frame, given all frames so far."""
-        return np.asarray(np.exp(self.columns[-1].forward - self.ended[-1])) if self.columns else np.empty(0)
-
     def filter_path(self) -> Path:
         """Return the path of the last key frames, back to one from which frames are tracked.
 
@@ -265,12 +261,9 @@ class Lattice:
             column = self.columns[n]
             log = next((s.log[i, j] for s in column.steps if s.begin == m), 0.0)
             if self.motion.is_timed and log <= self.motion.jump_log:
-                path.gaps[column.number] = self._gap(self.columns[m].number, i, column.number, j)
-
-    def _gap(self, m: int, i: int, k: int, j: int) -> Gap:
-        begin, end = self.frames[m].states[i].pose, self.frames[k].states[j].pose
-        metres = float(np.linalg.norm(end.center_world - begin.center_world))
-        return Gap(metres, self.frames[k].time - self.frames[m].time)
+                before, after = self.frames[self.columns[m].number], self.frames[column.number]
+                metres = math.dist(before.states[i].pose.center_world, after.states[j].pose.center_world)
+                path.gaps[column.number] = Gap(metres, after.time - before.time)
 
 
 def build_lattice(

@@ -52,16 +52,15 @@ def make_localizations(
         parts = smooth_positions(located[lo:hi], times, motion.max_acceleration, motion.speed)
         for k, (pose, covariance) in zip(sure[lo:hi], parts, strict=True):
             found[k] = replace(found[k], pose=pose, covariance=covariance)
-    return [
-        (f, WalkFrame(frame.time, k, frame.how, result_alone(frame), gap))
-        for k, (f, frame, gap) in enumerate(zip(found, frames, path.gaps, strict=True))
-    ]
+    return [(f, describe_frame(frames, k, path.gaps[k])) for k, f in enumerate(found)]
 
 
-def result_alone(frame: Frame) -> Alone | None:
-    """Return the result of a frame that was localized alone, else None."""
-    a = frame.alone
-    return None if a is None else Alone(a.status, a.confidence, a.pose)
+def describe_frame(frames: Sequence[Frame], k: int, gap: Gap | None) -> WalkFrame:
+    """Return a frame's place in the walk, after a gap if there is one."""
+    frame = frames[k]
+    own = frame.alone
+    alone = Alone(own.status, own.confidence, own.pose) if own else None
+    return WalkFrame(frame.time, k, frame.how, alone, gap)
 
 
 def make_localization(tracker: Tracker, frame: Frame, belief: Belief) -> Localization:

@@ -102,8 +102,7 @@ class Tracker:
 
         Call it before the first frame.
         """
-        self.motion = replace(self.motion, is_timed=False)
-        self.lattice = Lattice(self.lattice.space, self.motion)
+        self.motion = self.lattice.motion = replace(self.motion, is_timed=False)
 
     def prepare(self, panorama: Panorama) -> Query:
         """Prepare the query of a frame, with the images that its descents need."""
@@ -152,9 +151,8 @@ class Tracker:
 
     def _is_telling(self, frame: Frame) -> bool:
         """Return True if the camera has moved so far since the last key frame that it sees another place."""
-        if frame.key is None or frame.arrived is None:
-            return True
-        return distance(frame.arrived, self._pose_since(frame.key)) >= SAME_PLACE
+        begin = None if frame.key is None else self.frames[frame.key].known
+        return begin is None or frame.arrived is None or distance(frame.arrived, begin) >= SAME_PLACE
 
     def _follow(self, query: Query, frame: Frame) -> None:
         """Find a frame from the last one that was found."""
@@ -162,7 +160,7 @@ class Tracker:
         if key is None:
             return
         since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
-        found = self.find(query, frame, [(k, self._pose_since(k)) for k in since[:-3:-1]])
+        found = self.find(query, frame, [(k, pose) for k in since[:-3:-1] if (pose := self.frames[k].known)])
         if found is None:
             return
         frame.states = [found.state]
@@ -206,12 +204,6 @@ class Tracker:
         numbers = (column.number for column in reversed(self.lattice.columns))
         return next((k for k in numbers if self.frames[k].departed is not None), None)
 
-    def _pose_since(self, k: int) -> Pose:
-        pose = self.frames[k].departed or self.frames[k].arrived
-        if pose is None:
-            raise ValueError("a frame that was not found")
-        return pose
-
     def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan for a frame, which is then a key frame."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
@@ -228,7 +220,7 @@ class Tracker:
         Of places about as likely, as copies are, it is the one that looks best.
         """
         while True:
-            probabilities = self.lattice.filter_last()
+            probabilities = self.lattice.filter_path().probabilities[-1]
             is_likely = probabilities >= EVEN * probabilities.max()
             likeliest = max(compress(frame.states, is_likely), key=lambda state: state.log_odds)
             if likeliest.is_refined:
