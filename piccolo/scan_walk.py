@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from . import __version__
 from .confidence.localization import Localization
 from .errors import InputError
 from .files.json_file import reading_once
@@ -28,6 +29,7 @@ from .walk.results import WalkFrame, describe_frame, make_localization, make_loc
 from .walk.second_look import finish
 from .walk.tracker import Tracker
 
+NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
 Picture = str | PathLike[str] | NDArray[np.uint8]
 
 
@@ -59,9 +61,7 @@ class Walk:
     ) -> None:
         scan_map, settings = scan.require_default_method("walks", settings)
         if read_options.refine_focal:
-            raise InputError(
-                "`refine_focal`: not an option of walks; refine the focal length with a single photo"
-            )
+            raise InputError(NO_REFINING)
         check_within(scan_map, settings.prior.within)
         quiet = Workers(scan.workers.num_threads, warn=scan.workers.warn)
         self.scan = scan
@@ -72,6 +72,13 @@ class Walk:
         self.settings: dict[str, object] = {**about, "walk": motion.to_settings()}
         self.pictures: list[Picture] = []
         self.blanks: list[Result] = []  # of the frames so far, without poses
+
+    @property
+    def key(self) -> dict[str, object]:
+        """Settings, scan and version, which must be the same where a walk goes on."""
+        settings = json.loads(json.dumps(self.settings))
+        digest = self.tracker.scan_map.scan_sha256 or None
+        return {"settings": settings, "cloud_sha256": digest, "version": __version__}
 
     def add(
         self,

@@ -106,7 +106,8 @@ def test_probabilities_are_those_of_all_ways_there_are(seed):
     for found, wanted in zip(path.probabilities, probabilities, strict=True):
         np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12)
     assert _chosen(path) == [int(p.argmax()) if p.sum() > 0.5 else None for p in probabilities]
-    np.testing.assert_allclose(lattice.filter_path().probabilities[-1], probabilities[-1], rtol=1e-9, atol=1e-12)
+    last = lattice.filter_path().probabilities[-1]
+    np.testing.assert_allclose(last, probabilities[-1], rtol=1e-9, atol=1e-12)
 
 
 def test_places_that_look_alike_share_the_evidence():

@@ -14,12 +14,13 @@ from piccolo.localization import near, refinement, verification
 from piccolo.localization.attempts import CHANCE_MATCHES
 from piccolo.localization.brief import brief_query, score_briefly, score_mirror
 from piccolo.localization.comparison import score_pose
+from piccolo.localization.near import Near
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
-from piccolo.walk.places import Place, find_places, query_near
+from piccolo.walk.places import find_places, query_near
 from piccolo.walk.tracker import Expected, expect, find_near, predict, refine_state, track
 
 SEED = 1
@@ -121,7 +122,7 @@ def test_another_place_is_taken_if_it_looks_better_than_a_copy(seen, monkeypatch
     query, true = seen
     elsewhere = _off(true, 3.0, 0.0)
 
-    monkeypatch.setattr(tracker, "list_places", lambda *_: [Place(elsewhere, min(behind, 0.0))])
+    monkeypatch.setattr(tracker, "list_places", lambda *_: [(elsewhere, min(behind, 0.0))])
     monkeypatch.setattr(tracker, "log_behind", lambda *_: min(-behind, 0.0))
     monkeypatch.setattr(tracker, "track", lambda query, start: State(start, 3.5, 0.5))
     found = find_near(query, _expected(true, 2.0))
@@ -132,7 +133,7 @@ def test_another_place_is_taken_if_it_looks_better_than_a_copy(seen, monkeypatch
 def test_the_best_place_near_is_tried_if_nothing_is_found_where_it_was_expected(seen, monkeypatch):
     query, true = seen
     elsewhere = _off(true, 3.0, 0.0)
-    monkeypatch.setattr(tracker, "list_places", lambda *_: [Place(elsewhere, 0.0)])
+    monkeypatch.setattr(tracker, "list_places", lambda *_: [(elsewhere, 0.0)])
     monkeypatch.setattr(tracker, "log_behind", lambda *_: 0.0)
     monkeypatch.setattr(
         tracker, "track", lambda query, start: None if start is true else State(start, odds, 0.5)
@@ -148,11 +149,12 @@ def test_the_places_that_look_like_a_photo(seen):
     """Its own is the best, in a heading that was not asked; others in the room are behind."""
     query, true = seen
     places = find_places(query, true)
-    assert pose_errors(places[0].pose, true)[0] < 0.1
-    assert max(place.behind for place in places[1:]) < places[0].behind <= 0.0
+    assert pose_errors(places[0][0], true)[0] < 0.1
+    assert max(behind for _, behind in places[1:]) < places[0][1] <= 0.0
     off = _off(true, 1.0, 90.0)
-    assert find_places(query, off)[0].behind == 0.0  # what explains more than the pose given
-    assert pose_errors(find_places(query, off)[0].pose, true)[0] < 0.1
+    pose, behind = find_places(query, off)[0]
+    assert behind == 0.0  # what explains more than the pose given
+    assert pose_errors(pose, true)[0] < 0.1
 
 
 def test_a_mirrored_photo_is_told_near_a_pose_and_anywhere(seen):
@@ -224,7 +226,8 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
 )
 def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, odds, score, is_found):
     query, true = seen
-    monkeypatch.setattr(tracker, "refine", lambda query, start: State(start, odds, score))
+    probability = 1.0 / (1.0 + np.exp(-odds))
+    monkeypatch.setattr(tracker, "refine_near", lambda query, start: Near(start, score, None, probability))
     assert (track(query, true) is not None) == is_found
 
 

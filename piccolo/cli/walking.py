@@ -7,9 +7,8 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-from .. import __version__
 from ..batch.frame_times import times_of
 from ..batch.inputs import is_from_stdin
 from ..batch.relative_poses import read_odometry
@@ -97,15 +96,17 @@ def add_odometry(frames: list[WalkInput], path: Path | None) -> list[WalkInput]:
 def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: Walk) -> int:
     """Localize a walk, write its results, return the exit code."""
     watch = Stopwatch()
-    key = make_key(walk, arguments.odometry)
-    if (counts := count_finished(arguments, key, frames, walk)) is not None:
+    if arguments.odometry:
+        walk.settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
+    if (counts := count_finished(None if arguments.overwrite else arguments.out, walk, frames)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
         return choose_exit_code(counts)
     with watch.stage("all"):
-        interruption = follow_all(arguments, walk, frames, json.dumps(key))
+        interruption = follow_all(arguments, walk, frames)
         if interruption.number:
-            is_kept = frames_file(arguments.out) is not None
-            return interruption.stop(arguments, f"{len(walk.blanks)} frames", is_kept)
+            return interruption.stop(
+                arguments, f"{len(walk.blanks)} frames", bool(frames_file(arguments.out))
+            )
         results = walk.finish(progress_bar(arguments.quiet))
     write_results(arguments.out, results)
     counts = Counter(result.status for result in results)
@@ -117,28 +118,17 @@ def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: W
     return choose_exit_code(counts)
 
 
-def make_key(walk: Walk, odometry: Path | None) -> dict[str, Any]:
-    """Return what must be the same where a walk goes on."""
-    if odometry is not None:
-        walk.settings["odometry_sha256"] = sha256_of(odometry, None)
-    digest = walk.tracker.scan_map.scan_sha256 or None
-    settings = json.loads(json.dumps(walk.settings))
-    return {"settings": settings, "cloud_sha256": digest, "version": __version__}
-
-
 def frames_file(out: Path | None) -> Path | None:
     """Return where what was found of each frame is kept until the walk is finished; None for a stream."""
     return None if out is None or is_stream(out) else out.with_name(f"{out.name}.frames")
 
 
-def follow_all(
-    arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkInput], key: str
-) -> Interruption:
+def follow_all(arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkInput]) -> Interruption:
     """Follow the frames, and keep what was found of each; say why one can't be read."""
     path = frames_file(arguments.out)
     with open_locked(path) if path else nullcontext() as file, ThreadPoolExecutor(1) as pool:
         if file is not None:
-            take_up(walk, frames, file, key, arguments.overwrite)
+            take_up(walk, frames, file, arguments.overwrite)
         bar = {"desc": "frames", "total": len(frames), "initial": len(walk.blanks), "unit": ""}
         left = iter(frames[len(walk.blanks) :])
         # each is prepared while the one before it is followed
@@ -155,9 +145,10 @@ def follow_all(
     return interruption
 
 
-def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, key: str, is_new: bool) -> None:
+def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, is_new: bool) -> None:
     """Restore the frames that an earlier run of the same walk has left, and cut off the rest of the file."""
     path = file.path
+    key = json.dumps(walk.key)
     size = 0 if is_new else whole_size(path, KEY_BEGINS, f"frames of a walk: {WAYS}")
     lines = whole_lines(path, size)
     first = next(lines, b"")
@@ -177,18 +168,15 @@ def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, key: str, i
         file.append(key)
 
 
-def count_finished(
-    arguments: argparse.Namespace, key: dict[str, Any], frames: Sequence[WalkInput], walk: Walk
-) -> Counter[str] | None:
+def count_finished(out: Path | None, walk: Walk, frames: Sequence[WalkInput]) -> Counter[str] | None:
     """Return the results that an earlier run of this walk has left, by status; None if it is to be done.
 
     It is if there are none, one has failed, or frames were others. InputError for results of something else.
     """
-    out = arguments.out
-    if arguments.overwrite or out is None or is_stream(out):
+    if out is None or is_stream(out):
         return None
     paths = {frame.name: frame.path for frame in frames}
     records = Records(out)
-    records.read(lambda name: key, paths)
+    records.read(lambda name: walk.key, paths)
     left = list(records.remaining(paths, lambda name: sha256_of(paths[name], walk.read_options.rig)))
     return None if left or not records.is_in_order else records.counts

@@ -61,6 +61,10 @@ class Pose:
         """Unit quaternion (4,) of `R_cam_from_world`, scalar first and not negative."""
         return quaternion_wxyz(self.R_cam_from_world)
 
+    def distance(self, other: "Pose") -> float:
+        """Return the distance [m] of two cameras."""
+        return math.dist(self.center_world, other.center_world)
+
     def inverse(self) -> "Pose":
         """Return the inverse transform, which takes camera coordinates to the world's."""
         return Pose(self.R_cam_from_world.T, -self.R_cam_from_world @ self.center_world)

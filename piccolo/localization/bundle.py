@@ -163,7 +163,7 @@ def vote(member: Member, bundle: Pose) -> float:
 def is_same(pose: Pose, other: Pose) -> bool:
     """Return True if two poses may be one, with the errors of relative poses."""
     turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
-    return bool(turn < SAME_TURN and math.dist(pose.center_world, other.center_world) < SAME_PLACE)
+    return bool(turn < SAME_TURN and pose.distance(other) < SAME_PLACE)
 
 
 def find_support(member: Member, bundle: Pose) -> Support:

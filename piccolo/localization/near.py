@@ -1,6 +1,5 @@
 """A photo near a pose that is known from elsewhere: its own pose there, and how likely that is."""
 
-import math
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -38,12 +37,12 @@ def refine_near(query: Query, start: Pose) -> Near:
     """
     start, seen_from = refine_on_middle_cells(query, start)
     pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
-    sees_same = math.dist(pose.center_world, seen_from.center_world) < NEARLY
+    sees_same = pose.distance(seen_from) < NEARLY
     end = score_pose(query, pose, seen_from if sees_same else None)
     end = settle(query, end) if query.photo.is_partial else end
     covariance = None
     if end.score >= HOPELESS_SCORE:
-        sees_same = math.dist(end.pose.center_world, start.center_world) < NEARLY
+        sees_same = end.pose.distance(start) < NEARLY
         covariance = estimate_covariance(query, end.pose, seen_from=start if sees_same else None)
     probability = float(posterior([assess_end(query, end)], covariance)[0])
     return Near(end.pose, end.score, covariance, probability)

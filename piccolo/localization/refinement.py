@@ -146,7 +146,7 @@ def refine_on_middle_cells(query: Query, pose: Pose) -> tuple[Pose, Pose]:
     fit = descend_fine(query, end)
     for _ in range(MAX_PERTURBATIONS):
         other = perturb_middle(query, end).pose
-        if math.dist(other.center_world, end.center_world) < PLACE_SPACING:
+        if other.distance(end) < PLACE_SPACING:
             break
         around = descend_fine(query, other)
         gain = around.score - fit.score

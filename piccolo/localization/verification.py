@@ -76,7 +76,7 @@ def verify(query: Query, pose: Pose) -> Verified:
 def is_near(pose: Pose, other: Pose, most: float = NEAR) -> bool:
     """Return True if two poses are so near each other, at most so far [m], that they are one place."""
     turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
-    return bool(turn < NEAR_TURN and math.dist(pose.center_world, other.center_world) < most)
+    return bool(turn < NEAR_TURN and pose.distance(other) < most)
 
 
 def matches_near(query: Query, pose: Pose) -> Matches:

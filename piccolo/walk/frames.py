@@ -7,7 +7,7 @@ wherever the key frame was, they are as far from there.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -62,19 +62,14 @@ class Frame:
         return max((state.log_odds for state in self.states), default=-math.inf)
 
     @property
-    def known(self) -> Pose | None:
-        """Where it was tracked to, or the frames after it were tracked from."""
+    def tracking_pose(self) -> Pose | None:
+        """Pose from which the next frames are tracked; None if the frame was not found."""
         return self.departed or self.arrived
 
     @property
     def is_localized_alone(self) -> bool:
         """True if the photo is sure without the others."""
         return self.alone is not None and self.alone.status == LOCALIZED
-
-    def make_key(self, states: list[State]) -> None:
-        """Make the frame a key frame with these states."""
-        self.states = states
-        self.is_key = True
 
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
@@ -85,15 +80,10 @@ def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     total = 1.0 - found.probability_none
-
-    def odds(probability: float) -> float:
-        return log_odds_of_place(probability, total, found.covariance)
-
-    best = State(
-        scan_map.from_world(found.pose), odds(found.confidence), found.evidence.score, found.covariance
-    )
-    others = (State(scan_map.from_world(a.pose), odds(a.probability or 0.0)) for a in found.alternatives)
-    return [best, *others]
+    known = [(found.pose, found.confidence), *((a.pose, a.probability or 0.0) for a in found.alternatives)]
+    odds = [log_odds_of_place(probability, total, found.covariance) for _, probability in known]
+    best, *others = [State(scan_map.from_world(pose), o) for (pose, _), o in zip(known, odds, strict=True)]
+    return [replace(best, score=found.evidence.score, covariance=found.covariance), *others]
 
 
 def log_odds_of_place(probability: float, total: float, covariance: PoseCovariance | None) -> float:

@@ -262,7 +262,7 @@ class Lattice:
             log = next((s.log[i, j] for s in column.steps if s.begin == m), 0.0)
             if self.motion.is_timed and log <= self.motion.jump_log:
                 before, after = self.frames[self.columns[m].number], self.frames[column.number]
-                metres = math.dist(before.states[i].pose.center_world, after.states[j].pose.center_world)
+                metres = after.states[j].pose.distance(before.states[i].pose)
                 path.gaps[column.number] = Gap(metres, after.time - before.time)
 
 

@@ -6,7 +6,6 @@ they explain of the photo is compared with what the frame's own pose explains th
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,11 +20,7 @@ from ..localization.query import Cache, Query
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 
 
-class Place(NamedTuple):
-    """A pose that may be a frame's, as rough as the grid of candidates."""
-
-    pose: Pose  # in the map
-    behind: float  # [log] of its odds to those of the frame's own pose
+Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds to the frame's own pose
 
 
 def query_near(query: Query, pose: Pose, radius: float) -> Query:
@@ -52,7 +47,7 @@ def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
     R, centers = ends.poses.R_cam_from_map, ends.poses.center_map
     kept = non_maximum_suppression(R, centers, MOST_PLACES, MIN_DISTANCE, MIN_ANGLE)
     found = zip(ends.poses.take(kept).poses(), ends.scores[kept], strict=True)
-    return [Place(pose, log_behind(query, float(score), own_score)) for pose, score in found]
+    return [(pose, log_behind(query, float(score), own_score)) for pose, score in found]
 
 
 def log_behind(query: Query, score: float, own_score: float) -> float:

@@ -15,7 +15,7 @@ from ..localization.query import Query
 from .beliefs import Belief, believe
 from .frames import Frame
 from .path import EVEN, Path, build_lattice
-from .tracker import Expected, Found, Tracker, distance, find_near, refine_state
+from .tracker import Expected, Found, Tracker, find_near, refine_state
 
 Find = Callable[[Query], Found | None]
 
@@ -94,7 +94,7 @@ def _is_walked(tracker: Tracker, beliefs: Sequence[Belief], k: int, pose: Pose) 
     frames = tracker.frames
     nearest = [side[0] for side in _list_sure(frames, beliefs, k)]
     reaches = [tracker.motion.reach(frames[k].time - frames[m].time) for m in nearest]
-    distances = [distance(pose, beliefs[m].states[0].pose) for m in nearest]
+    distances = [pose.distance(beliefs[m].states[0].pose) for m in nearest]
     return all(d <= reach for d, reach in zip(distances, reaches, strict=True))
 
 

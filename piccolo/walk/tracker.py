@@ -42,13 +42,7 @@ from .frames import (
 )
 from .motion import REACH_SLACK, Motion
 from .path import COPY_LOG_ODDS, EVEN, Lattice
-from .places import (
-    MOST_PLACES,
-    find_places,
-    list_places,
-    log_behind,
-    query_near,
-)
+from .places import MOST_PLACES, find_places, list_places, log_behind, query_near
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 NUM_QUERIES = 4  # are kept, of the frames that were asked for last
@@ -75,18 +69,13 @@ class Tracker:
     """The forward half of a walk: `add` uses past frames only, and keeps their poses."""
 
     def __init__(
-        self,
-        scan_map: ScanMap,
-        settings: CoarseToFineSettings,
-        workers: Workers,
-        motion: Motion,
-        space: FreeSpace | None = None,
+        self, scan_map: ScanMap, settings: CoarseToFineSettings, workers: Workers, motion: Motion
     ) -> None:
         self.scan_map: ScanMap = apply_prior(scan_map, settings.prior)
         self.settings = settings
         self.workers = workers
         self.motion: Motion = motion
-        self.lattice: Lattice = Lattice(space or FreeSpace(scan_map, workers), motion)
+        self.lattice: Lattice = Lattice(FreeSpace(scan_map, workers), motion)
         self.read: Read = lambda k: None  # until somebody keeps the pictures
         self.queries: dict[int, Query] = {}  # by the number of the frame
         self.found_at: float = -math.inf  # time when the camera was found last, or searched first
@@ -98,10 +87,7 @@ class Tracker:
         return self.lattice.frames
 
     def forget_times(self) -> None:
-        """Use the numbers of frames as times, as only their order is known.
-
-        Call it before the first frame.
-        """
+        """Use the numbers of frames as times, from the first frame on: only their order is known."""
         self.motion = self.lattice.motion = replace(self.motion, is_timed=False)
 
     def prepare(self, panorama: Panorama) -> Query:
@@ -113,10 +99,7 @@ class Tracker:
 
     @one_blas_thread
     def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
-        """Localize the next frame, whose query is prepared.
-
-        The first one waits until free space is known.
-        """
+        """Localize the next frame, whose query is prepared; the first one waits until free space is known."""
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
             self._keep(len(self.frames), query)
@@ -128,7 +111,8 @@ class Tracker:
             if is_far or (not frame.states and self.motion.reach(time - self.found_at) >= self.next_search):
                 self._search(query, panorama, frame)
             elif frame.states and self._is_telling(frame):
-                frame.make_key(list_key_states(query, frame.states))
+                frame.states = list_key_states(query, frame.states)
+                frame.is_key = True
         self.lattice.add(frame)
         if frame.is_key:
             self._depart(query, frame)
@@ -151,8 +135,8 @@ class Tracker:
 
     def _is_telling(self, frame: Frame) -> bool:
         """Return True if the camera has moved so far since the last key frame that it sees another place."""
-        begin = None if frame.key is None else self.frames[frame.key].known
-        return begin is None or frame.arrived is None or distance(frame.arrived, begin) >= SAME_PLACE
+        begin = None if frame.key is None else self.frames[frame.key].tracking_pose
+        return begin is None or frame.arrived is None or frame.arrived.distance(begin) >= SAME_PLACE
 
     def _follow(self, query: Query, frame: Frame) -> None:
         """Find a frame from the last one that was found."""
@@ -160,7 +144,9 @@ class Tracker:
         if key is None:
             return
         since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
-        found = self.find(query, frame, [(k, pose) for k in since[:-3:-1] if (pose := self.frames[k].known)])
+        found = self.find(
+            query, frame, [(k, pose) for k in since[:-3:-1] if (pose := self.frames[k].tracking_pose)]
+        )
         if found is None:
             return
         frame.states = [found.state]
@@ -212,7 +198,8 @@ class Tracker:
         is_mirrored = not is_sure and is_whole(query) and score_mirror(brief) > score_briefly(brief)
         if found := [] if is_mirrored else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
-            frame.make_key(list_key_states(query, found[:1] if is_sure else found, is_sure))
+            frame.states = list_key_states(query, found[:1] if is_sure else found, is_sure)
+            frame.is_key = True
 
     def _depart(self, query: Query, frame: Frame) -> None:
         """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it.
@@ -241,9 +228,9 @@ def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -
     best = own[0]
     limit = -MOST_ODDS - COPY_LOG_ODDS if is_sure else 0.0
     rough = [
-        State(p.pose, best.log_odds + min(p.behind, limit))
-        for p in find_places(query, best.pose)
-        if not any(is_same_place(p.pose, state.pose) for state in own)
+        State(pose, best.log_odds + min(behind, limit))
+        for pose, behind in find_places(query, best.pose)
+        if not any(is_same_place(pose, state.pose) for state in own)
     ]
     states: list[State] = []
     for state in (*own, *rough):
@@ -306,8 +293,8 @@ def find_near(query: Query, expected: Expected) -> Found | None:
     score = score_near(query, expected.pose)
     best_score = max(ends.best_score, score)
     is_alike = log_behind(query, score, best_score) > -COPY_LOG_ODDS
-    places = [p.pose for p in list_places(query, ends, best_score) if p.behind > -COPY_LOG_ODDS]
-    alike = [pose for pose in places if distance(pose, expected.last) <= expected.reach]
+    places = [pose for pose, behind in list_places(query, ends, best_score) if behind > -COPY_LOG_ODDS]
+    alike = [pose for pose in places if pose.distance(expected.last) <= expected.reach]
     starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
     found = (track(query, start) for start in starts)
     end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
@@ -330,12 +317,7 @@ def compute_gain(query: Query, near: Query) -> float:
 def is_acceptable(state: State, expected: Expected) -> bool:
     """Return True for a pose within reach that is where it was expected, or sure by itself."""
     is_sure = state.log_odds >= MOST_EXPECTED or is_same_place(state.pose, expected.pose)
-    return is_sure and distance(state.pose, expected.last) <= expected.reach
-
-
-def distance(pose: Pose, other: Pose) -> float:
-    """Return the distance [m] of two poses."""
-    return float(np.linalg.norm(pose.center_world - other.center_world))
+    return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
 def track(query: Query, start: Pose) -> State | None:
@@ -343,16 +325,11 @@ def track(query: Query, start: Pose) -> State | None:
 
     A narrow photo is tracked again from where its matches put it.
     """
-    end = refine(query, start)
+    ends = [refine_near(query, start)]
     if has_own_matches(query):
-        again = refine(query, verify(query, end.pose).pose)
-        end = max(end, again, key=lambda state: state.log_odds)
-    is_wrong = end.log_odds < 0.0 or end.score is None or end.score < SURE_SCORE
-    return None if is_wrong else end
-
-
-def refine(query: Query, start: Pose) -> State:
-    """Refine a pose, whatever it is; return the end with its odds by the photo alone."""
-    end = refine_near(query, start)
-    log_odds = log_odds_of_place(end.probability, end.probability, end.covariance)
-    return State(end.pose, log_odds, end.score, end.covariance)
+        ends.append(refine_near(query, verify(query, ends[0].pose).pose))
+    odds = [log_odds_of_place(end.probability, end.probability, end.covariance) for end in ends]
+    best = int(np.argmax(odds))
+    end = ends[best]
+    is_wrong = odds[best] < 0.0 or end.score < SURE_SCORE
+    return None if is_wrong else State(end.pose, odds[best], end.score, end.covariance)
