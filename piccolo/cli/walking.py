@@ -104,9 +104,8 @@ def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: W
     with watch.stage("all"):
         interruption = follow_all(arguments, walk, frames)
         if interruption.number:
-            return interruption.stop(
-                arguments, f"{len(walk.blanks)} frames", bool(frames_file(arguments.out))
-            )
+            is_kept = frames_file(arguments.out) is not None
+            return interruption.stop(arguments, f"{len(walk.blanks)} frames", is_kept)
         results = walk.finish(progress_bar(arguments.quiet))
     write_results(arguments.out, results)
     counts = Counter(result.status for result in results)

@@ -13,7 +13,7 @@ from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..local_features.hypotheses import count_matches, propose_poses
+from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
@@ -26,7 +26,7 @@ from .last_descent import settle
 from .prior import contradictions
 from .query import Query
 from .refinement import refine_matches
-from .selection import SURE_MATCHES, Selection, assess_poses
+from .selection import Selection, assess_poses
 from .verification import count_agreeing, find_copies
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
@@ -152,7 +152,7 @@ def collect_evidence(
 
 
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
-    """Return True if the mirrored photo fits a pose better than the photo: by features and by whole views.
+    """Return True if whole views explain more of the mirrored photo, at the pose of its matches.
 
     Symmetric scenes match in a mirror too, but no better. The test is skipped for a pose that explains nearly
     all of the photo, and after a first look, which has compared the mirrored photo itself.
@@ -160,8 +160,5 @@ def is_mirrored(query: Query, best: Hypothesis) -> bool:
     if best.score >= ENOUGH_EXPLAINED or not query.num_parts:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
-    found = propose_poses(matches, None, 1, query.workers)
-    num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
-    if not found or found[0].num_matches <= max(num_matches, SURE_MATCHES):
-        return False
-    return refine_matches(mirror_query(query), [found[0].pose])[0].score > best.score
+    poses = [found.pose for found in propose_poses(matches, None, 1, query.workers)]
+    return any(end.score > best.score for end in refine_matches(mirror_query(query), poses))

@@ -144,9 +144,8 @@ class Tracker:
         if key is None:
             return
         since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
-        found = self.find(
-            query, frame, [(k, pose) for k in since[:-3:-1] if (pose := self.frames[k].tracking_pose)]
-        )
+        near = [(k, pose) for k in since[:-3:-1] if (pose := self.frames[k].tracking_pose)]
+        found = self.find(query, frame, near)
         if found is None:
             return
         frame.states = [found.state]
