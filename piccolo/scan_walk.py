@@ -106,7 +106,7 @@ class Walk:
         with reading_once():
             try:
                 with watch.stage("read"):
-                    panorama = self._read(frame)
+                    panorama = self._read(frame, name)
                     photo = read_photo_facts(frame, self.read_options.rig)
             except Exception as error:
                 if isinstance(frame, np.ndarray):
@@ -117,8 +117,7 @@ class Walk:
         with watch.stage("prepare"):
             query = self.tracker.prepare(panorama)
         result = self.scan.make_result(frame, panorama, photo, Localization(), self.settings, watch.seconds)
-        warnings = tuple(warning.replace(str(frame), name) for warning in result.warnings)
-        return Prepared(frame, replace(result, pano=name, warnings=warnings), panorama, query)
+        return Prepared(frame, replace(result, pano=name), panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
         """Localize a prepared frame, as `add` does."""
@@ -177,9 +176,12 @@ class Walk:
             return result
         return with_localization(result, add_places(self.tracker.scan_map, found))
 
-    def _read(self, picture: Picture) -> Panorama:
-        """Read a picture; its focal length counts as exact."""
-        return replace(read_photo(picture, self.read_options), focal_prior=None)
+    def _read(self, picture: Picture, name: str) -> Panorama:
+        """Read a picture, which warnings call by its name; its focal length counts as exact."""
+        panorama = read_photo(picture, self.read_options)
+        path = name if isinstance(picture, np.ndarray) else str(picture)
+        warnings = tuple(warning.replace(path, name) for warning in panorama.warnings)
+        return replace(panorama, focal_prior=None, warnings=warnings)
 
     def _read_again(self, k: int) -> Panorama | None:
         """Read the picture of an earlier frame; None if it can't be read, or is another now."""
@@ -187,7 +189,7 @@ class Walk:
         blank = self.blanks[k]
         with reading_once():
             is_readable = blank.error is None and self._is_of(picture, blank)
-            return self._read(picture) if is_readable else None
+            return self._read(picture, blank.pano) if is_readable else None
 
     def _is_of(self, picture: Picture, result: Result) -> bool:
         """Return True if a result is of what a picture shows now."""

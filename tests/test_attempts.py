@@ -102,14 +102,33 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     tilted = replace(asked, photo=photo)
     mirror = brief.mirror_query(tilted)
     other = _query(_turned_over(panorama))
-    own, expected = (q.photo.images.search().rgbx.view(np.uint8).astype(int) for q in (mirror, other))
-    assert np.abs(own - expected).max() <= 1  # level
+    for own, expected in zip(mirror.photo.images, other.photo.images, strict=True):
+        levels = (image().rgbx.view(np.uint8).astype(int) for image in (own, expected))
+        assert np.abs(np.subtract(*levels)).max() <= 1
+    np.testing.assert_array_equal(mirror.photo.small.rgbx, other.photo.small.rgbx)
+    np.testing.assert_array_equal(mirror.photo.panorama.is_valid, other.photo.panorama.is_valid)
+    R = exp_so3(np.array([0.1, -0.2, 0.3]))
+    (turned,) = brief.mirror_query(replace(tilted, rotations=R[None])).rotations
+    np.testing.assert_allclose(turned, brief.ACROSS @ R @ brief.ACROSS)
     assert mirror.settings.prior == Prior()
     d = np.array([0.6, -0.2, 0.77])
     across = np.array([1.0, -1.0, 1.0])
     np.testing.assert_allclose(
         mirror.photo.R_cam_from_level @ (across * d), across * (tilted.photo.R_cam_from_level @ d), atol=1e-12
     )
+
+
+@pytest.mark.parametrize("photo", [WHOLE, PARTIAL])
+def test_a_narrow_photo_with_matches_needs_no_margin_after_whole_views(monkeypatch, photo):
+    asked = []
+    monkeypatch.setattr(attempts, "search_poses", lambda query, gravity: None)
+    monkeypatch.setattr(attempts, "refine", lambda query, starts, beam: [at(1.0, 0.5)])
+    monkeypatch.setattr(attempts, "add_verified", lambda query, found: found)
+    monkeypatch.setattr(
+        attempts, "is_sure", lambda query, found, needs_margin: asked.append(needs_margin) or True
+    )
+    found, is_enough = attempts.search_views(replace(QUERY, photo=photo), [], Stopwatch(), "level")
+    assert (places(found), is_enough, asked) == ([1.0], True, [photo is WHOLE])
 
 
 def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):

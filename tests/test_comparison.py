@@ -21,6 +21,7 @@ from piccolo.localization.comparison import (
     correlate_blocks,
     mask_occluders,
     sample_photo,
+    score_pose,
 )
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -202,14 +203,15 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg):
     plain = Hypothesis(doubtful.pose, 0.7)  # it explains nearly all of the photo
     assert is_mirrored(turned_over, doubtful)
     assert not is_mirrored(right, doubtful)
+    assert score_pose(right, doubtful.pose).score > 0.9
+    assert score_pose(turned_over, doubtful.pose).score < 0.05
     assert not is_mirrored(turned_over, plain)
     assert not is_mirrored(dataclasses.replace(turned_over, num_parts=0), doubtful)
 
 
-def test_a_photo_that_views_explain_better_is_not_mirrored_by_its_matches(monkeypatch):
+@pytest.mark.parametrize(("score", "expected"), [(0.49, False), (0.52, False), (0.53, True)])
+def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(monkeypatch, score, expected):
     """The mirrored photo has more matches, as in a place that looks alike in a mirror."""
     turned_over = _query(rooms.query(1).rgb[:, ::-1].copy())
-    doubtful = Hypothesis(_clean()[1], 0.5)
-    for score, expected in ((0.49, False), (0.51, True)):
-        monkeypatch.setattr(verdict, "refine_matches", lambda query, poses: [Hypothesis(poses[0], score)])  # noqa: B023
-        assert is_mirrored(turned_over, doubtful) == expected
+    monkeypatch.setattr(verdict, "refine_matches", lambda query, poses: [Hypothesis(poses[0], score)])
+    assert is_mirrored(turned_over, Hypothesis(_clean()[1], 0.5)) == expected

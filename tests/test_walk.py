@@ -270,7 +270,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     kept = walk_command.frames_file(stopped)
     lines = kept.read_bytes().splitlines(keepends=True)
     assert len(lines) == 1 + len(queries)
-    kept.write_bytes(lines[0] + b'{"taken": 3}\n')
+    kept.write_bytes(lines[0] + b'{"blank": 3}\n')
     assert _command(folder, *walk, str(stopped)) == 3
     assert f"{kept}: found a damaged line (ValidationError)" in capsys.readouterr().err
     kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])
@@ -355,6 +355,8 @@ REFUSED = {
     "no photo": ([], 2, "the following arguments are required: --pano"),
     "stdin": (["--walk", "--pano", "-"], 2, "--walk: found names on stdin, wanted files or folders"),
     "speed alone": (["--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: only with --walk or --video"),
+    "no speed of photos": (["--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: only with --walk or"),
+    "step of photos": (["--pano", "a.jpg", "--every", "1"], 2, "--every: only with --video"),
     "jobs": (["--walk", "--pano", "a.jpg", "--jobs", "2"], 2, "--jobs: not with a walk"),
     "times of a video": (["--video", "a.mp4", "--times", "order"], 2, "--times: not with a video"),
     "no step of time": (

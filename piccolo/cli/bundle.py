@@ -13,9 +13,9 @@ from ..jobs.stopwatch import Stopwatch
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..result import Result
+from .command import check_alone
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
-from .options import check_alone
 
 NOT_WITH = ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 

@@ -16,9 +16,9 @@ from ..opened_scan import OpenedScan
 from ..result import Result
 from ..scan_map.scan_map import ScanMap
 from .bundle import check_new_results
+from .command import check_alone
 from .errors import UsageError, print_note
 from .executing import choose_exit_code
-from .options import check_alone
 from .progress import progress_bar
 
 NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before

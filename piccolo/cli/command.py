@@ -1,6 +1,7 @@
 """Commands: options written as a help text shows them, and the `main` that parses and runs them."""
 
 import argparse
+import math
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -14,7 +15,7 @@ from .start import as_started, for_terminal
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
     **dict.fromkeys(("N", "PX", "FIRST", "W", "ROOM"), int),
-    **dict.fromkeys(("X", "M", "DEG", "X0", "MIN", "HZ", "FRACTION", "GB"), float),
+    **dict.fromkeys(("X", "M", "S", "DEG", "X0", "MIN", "HZ", "FRACTION", "GB"), float),
 }
 EXIT_CODES = "2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 terminated."
 Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
@@ -83,15 +84,28 @@ def check_least(arguments: argparse.Namespace, **limits: float) -> None:
     """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
     for name, limit in limits.items():
         value = getattr(arguments, name, None)
-        if value is not None and not value >= limit:
+        if value is not None and not limit <= value < math.inf:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
 
 
-def check_only_with(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
-    """Refuse options that mean something only with one that is not given."""
+def check_alone(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
+    """Refuse options, by their names in `arguments`, that do not go with what is asked for."""
     for name in others:
-        if getattr(arguments, name) not in (None, False):
-            raise UsageError(f"--{name.replace('_', '-')}: only with {option}")
+        if is_given(arguments, name):
+            raise UsageError(f"--{name.replace('_', '-')}: not with {what}")
+
+
+def check_only_with(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
+    """Refuse options, by their names in `arguments`, that mean something only with what is not asked for."""
+    for name in others:
+        if is_given(arguments, name):
+            raise UsageError(f"--{name.replace('_', '-')}: only with {what}")
+
+
+def is_given(arguments: argparse.Namespace, name: str) -> bool:
+    """Return True for an option without a default, by its name in `arguments`, that was given."""
+    value = getattr(arguments, name)
+    return value is not None and value is not False
 
 
 def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:

@@ -128,7 +128,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
     if not arguments.walk:
-        check_only_with(arguments, "--walk", OF_WALKS)
+        check_only_with(arguments, "--walk", [name for name in OF_WALKS if getattr(arguments, name)])
     if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
     if arguments.walk and (arguments.labels or arguments.camera):

@@ -184,8 +184,8 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
     option(group, "--video FILE", "video of a walk, instead of --pano")
-    text = f"seconds from one frame of a video to the next; the sharpest is taken (default {DEFAULT_EVERY})"
-    option(group, "--every S", text, type=float)
+    text = "seconds from one frame of a video to the next, the sharpest around each time "
+    option(group, "--every S", f"{text}(default {DEFAULT_EVERY})")
     text = (
         f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file with "
     )
@@ -317,13 +317,6 @@ def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
             wanted = f"one of {', '.join(choices)}" if choices else hint.__name__
             raise InputError(f"--preset {preset}: found {word!r}, wanted {wanted}") from error
     return given
-
-
-def check_alone(arguments: argparse.Namespace, option: str, others: Sequence[str]) -> None:
-    """Refuse the others of an option that does not go with them."""
-    for name in others:
-        if getattr(arguments, name) not in (None, False):
-            raise InputError(f"--{name.replace('_', '-')}: not with {option}")
 
 
 def check_arguments(arguments: argparse.Namespace) -> None:

@@ -25,13 +25,13 @@ from ..panorama.video import frames_of
 from ..result import FAILED
 from ..scan_walk import Walk
 from ..walk.motion import Motion
-from .command import check_only_with
+from .command import check_alone, check_only_with
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
-from .options import DEFAULT_EVERY, check_alone
+from .options import DEFAULT_EVERY
 from .progress import progress_bar, show_progress
 
-ONLY_WITH = ("times", "max_speed", "odometry", "every")
+ONLY_WITH = ("times", "max_speed", "odometry")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 KEY_BEGINS = b'{"'
 
@@ -48,6 +48,10 @@ class WalkInput(NamedTuple):
 def check_walk_options(arguments: argparse.Namespace) -> None:
     """Refuse what does not go together."""
     is_video = arguments.video is not None
+    if is_video:
+        check_alone(arguments, "a video", ("times",))
+    else:
+        check_only_with(arguments, "--video", ("every",))
     if not (arguments.walk or is_video):
         if not arguments.pano:
             raise UsageError("the following arguments are required: --pano")
@@ -58,11 +62,7 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
     if is_from_stdin(arguments.pano):
         raise UsageError("--walk: found names on stdin, wanted files or folders")
     check_alone(arguments, "a walk", NOT_WITH)
-    if is_video:
-        check_alone(arguments, "a video", ("times",))
-    else:
-        check_only_with(arguments, "--video", ("every",))
-    Motion(arguments.max_speed)
+    Motion(arguments.max_speed)  # refuses a wrong one
 
 
 @contextmanager

@@ -62,7 +62,7 @@ class Pose:
         return quaternion_wxyz(self.R_cam_from_world)
 
     def distance(self, other: "Pose") -> float:
-        """Return the distance [m] of two cameras."""
+        """Return the distance [m] to another camera."""
         return math.dist(self.center_world, other.center_world)
 
     def inverse(self) -> "Pose":

@@ -1,7 +1,7 @@
 """The searches that are tried for a photo, in order, each with its refinement.
 
-A first look by whole views finds most upright photos of the whole sphere, without local features. As only
-features would show that a photo is mirrored, the first look briefly searches its mirror image too.
+A first look by whole views finds most upright photos of the whole sphere, without local features. These would
+show where a mirrored photo lies, so the first look briefly searches its mirror image too.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from .prior import contradictions
 from .query import Query
 from .refinement import refine, refine_matches
 from .search import SearchedGravity, search_poses
-from .selection import SURE_MARGIN, is_clear, is_sure, rank
+from .selection import is_clear, is_sure, rank
 from .settings import Beam
 from .verification import verify
 
@@ -119,8 +119,7 @@ def search_views(
         found = refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         found = known + add_verified(query, found)
         # a narrow photo looks like many places: its features tell which
-        least_margin = -1.0 if query.photo.is_partial else SURE_MARGIN
-        return found, is_sure(query, found, least_margin)
+        return found, is_sure(query, found, needs_margin=not query.photo.is_partial)
 
 
 def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:

@@ -10,7 +10,7 @@ from ..geometry.pose import Array, Pose
 from ..jobs.threads import Once
 from ..panorama.texels import Texels
 from .query import Cache, Images, Query
-from .refinement import count_first_iterations, descend_all
+from .refinement import FIRST_ITERATIONS, count_first_iterations, descend_all
 from .search import Starts, search_poses
 
 FIRST_STARTS = 300  # few are enough for a clear photo
@@ -38,13 +38,13 @@ def brief_query(query: Query, most: int = FIRST_STARTS) -> Query:
 
 def descend_briefly(query: Query) -> Ends:
     """Search at the photo's tilt, and descend a few steps."""
-    return descend_from(query, search_poses(query, "known"))
+    return descend_from(query, search_poses(query, "known"), count_first_iterations(query))
 
 
-def descend_from(query: Query, starts: Starts) -> Ends:
+def descend_from(query: Query, starts: Starts, num_steps: int) -> Ends:
     """Descend a few steps from starts on their candidates' prepared views."""
-    num = count_first_iterations(query)
-    return Ends(*descend_all(query.scan_map, query.photo.images.search(), starts, num, query.workers))
+    image = query.photo.images.search()
+    return Ends(*descend_all(query.scan_map, image, starts, num_steps, query.workers))
 
 
 def score_briefly(query: Query) -> float:
@@ -56,18 +56,21 @@ def score_near(query: Query, pose: Pose) -> float:
     """Return the score a few steps from a pose, on the prepared view of the candidate nearest to it."""
     distances = np.linalg.norm(query.scan_map.centers - pose.center_world, axis=1)
     nearest = np.array([distances.argmin()])
-    return descend_from(
-        query, Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest)
-    ).best_score
+    start = Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest)
+    return descend_from(query, start, count_first_iterations(query)).best_score
 
 
 def score_starts(query: Query, starts: Starts) -> float:
     """Return the best score after short descents from the best starts."""
-    return descend_from(query, starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))).best_score
+    best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
+    return descend_from(query, best, FIRST_ITERATIONS).best_score
 
 
 def mirror_query(query: Query) -> Query:
-    """Return the brief query of the photo mirrored left to right, without the prior's heading."""
+    """Return the query of the photo mirrored left to right, with all that whole views need.
+
+    It has few starts, no features, and not the prior's heading.
+    """
     photo = query.photo
     panorama = replace(
         photo.panorama, rgb=photo.panorama.rgb[:, ::-1], is_valid=photo.panorama.is_valid[:, ::-1]
@@ -80,8 +83,16 @@ def mirror_query(query: Query) -> Query:
     prior = replace(query.settings.prior, heading_deg=None)
     settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
     rotations = ACROSS @ query.rotations @ ACROSS
-    cache = Cache(query.cache.views)
-    return replace(query, photo=mirrored, settings=settings, rotations=rotations, cache=cache, num_parts=0)
+    return replace(
+        query,
+        photo=mirrored,
+        settings=settings,
+        rotations=rotations,
+        features=(),
+        num_parts=0,
+        beside=(),
+        cache=Cache(query.cache.views),
+    )
 
 
 def mirror_image(image: Once[Texels]) -> Texels:

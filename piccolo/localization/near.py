@@ -31,19 +31,18 @@ def has_own_matches(query: Query) -> bool:
 
 
 def refine_near(query: Query, start: Pose) -> Near:
-    """Descend from a pose and around, then on the points themselves, and judge the end by whole views.
+    """Descend from a pose and from poses around it, then on the points, and judge the end by whole views.
 
     A narrow photo converges slowly: its descent goes on.
     """
-    start, seen_from = refine_on_middle_cells(query, start)
-    pose = descend(query.points_at(start), query.photo.images.full(), start, FULL_LIMITS)
-    sees_same = pose.distance(seen_from) < NEARLY
-    end = score_pose(query, pose, seen_from if sees_same else None)
+    middle, seen_from = refine_on_middle_cells(query, start)
+    pose = descend(query.points_at(middle), query.photo.images.full(), middle, FULL_LIMITS)
+    end = score_pose(query, pose, seen_from if pose.distance(seen_from) < NEARLY else None)
     end = settle(query, end) if query.photo.is_partial else end
     covariance = None
     if end.score >= HOPELESS_SCORE:
-        sees_same = end.pose.distance(start) < NEARLY
-        covariance = estimate_covariance(query, end.pose, seen_from=start if sees_same else None)
+        sees_same = end.pose.distance(middle) < NEARLY
+        covariance = estimate_covariance(query, end.pose, seen_from=middle if sees_same else None)
     probability = float(posterior([assess_end(query, end)], covariance)[0])
     return Near(end.pose, end.score, covariance, probability)
 

@@ -13,7 +13,7 @@ from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..local_features.hypotheses import propose_poses
+from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
@@ -30,6 +30,7 @@ from .selection import Selection, assess_poses
 from .verification import count_agreeing, find_copies
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
+MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo; in symmetric scenes it is about 1
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
@@ -152,13 +153,16 @@ def collect_evidence(
 
 
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
-    """Return True if whole views explain more of the mirrored photo, at the pose of its matches.
+    """Return True if more features of the mirrored photo agree with a pose, where views also explain more.
 
-    Symmetric scenes match in a mirror too, but no better. The test is skipped for a pose that explains nearly
-    all of the photo, and after a first look, which has compared the mirrored photo itself.
+    In a symmetric scene both are about equal. The test is skipped for a pose that explains nearly all of the
+    photo, and after a first look, which has compared the mirrored photo itself.
     """
     if best.score >= ENOUGH_EXPLAINED or not query.num_parts:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
-    poses = [found.pose for found in propose_poses(matches, None, 1, query.workers)]
-    return any(end.score > best.score for end in refine_matches(mirror_query(query), poses))
+    found = propose_poses(matches, None, 1, query.workers)
+    num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
+    if not found or found[0].num_matches <= num_matches:
+        return False
+    return refine_matches(mirror_query(query), [found[0].pose])[0].score > MIRROR_RATIO * best.score

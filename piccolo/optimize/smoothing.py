@@ -20,7 +20,8 @@ def smooth_positions(
 
     Minimizes sum (x_k - z_k)' C_k^-1 (x_k - z_k) + sum |a_k|^2 / s^2 over the positions x_k, where a_k is the
     second difference by time of three consecutive frames and s its deviation `max_acceleration` [m/s^2].
-    Rotations follow their positions by each frame's own covariance.
+    Rotations follow their positions by each frame's own covariance. Frames so far apart in time that a camera
+    at `max_speed` [m/s] can stop and turn back between them do not constrain each other.
     """
     from scipy.sparse import block_diag, eye, kron  # noqa: PLC0415  # only walks wait for it
     from scipy.sparse.linalg import splu  # noqa: PLC0415
