@@ -118,19 +118,6 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     )
 
 
-@pytest.mark.parametrize("photo", [WHOLE, PARTIAL])
-def test_a_narrow_photo_with_matches_needs_no_margin_after_whole_views(monkeypatch, photo):
-    asked = []
-    monkeypatch.setattr(attempts, "search_poses", lambda query, gravity: None)
-    monkeypatch.setattr(attempts, "refine", lambda query, starts, beam: [at(1.0, 0.5)])
-    monkeypatch.setattr(attempts, "add_verified", lambda query, found: found)
-    monkeypatch.setattr(
-        attempts, "is_sure", lambda query, found, needs_margin: asked.append(needs_margin) or True
-    )
-    found, is_enough = attempts.search_views(replace(QUERY, photo=photo), [], Stopwatch(), "level")
-    assert (places(found), is_enough, asked) == ([1.0], True, [photo is WHOLE])
-
-
 def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):
     monkeypatch.setattr(attempts, "search_poses", lambda *_: pytest.fail("a search beyond gravity"))
     told = replace(KNOWN, prior=Prior(gravity_vector=(0.0, 0.0, -1.0)))

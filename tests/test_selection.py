@@ -165,10 +165,6 @@ def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things(
     ):
         query = compared(monkeypatch, {0.0: score, 3.0: other}, {0.0: num_matches})
         assert selection.is_sure(query, [at(0.0, score), at(3.0, other)]) == is_sure
-    query = compared(monkeypatch, {0.0: 0.5, 3.0: 0.5}, {0.0: 12, 3.0: 12})
-    hypotheses = [at(0.0, 0.5), at(3.0, 0.5)]
-    assert not selection.is_sure(query, hypotheses)
-    assert selection.is_sure(query, hypotheses, needs_margin=False)
 
 
 def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):

@@ -118,8 +118,7 @@ def search_views(
     with watch.stage("refine"):
         found = refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         found = known + add_verified(query, found)
-        # a narrow photo looks like many places: its features tell which
-        return found, is_sure(query, found, needs_margin=not query.photo.is_partial)
+        return found, is_sure(query, found)
 
 
 def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:

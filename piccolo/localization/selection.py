@@ -98,10 +98,10 @@ def select(query: Query, found: Selection) -> Selection:
     return Selection(ranked[best], tuple(ranked[k] for k in others), rival_ratio)
 
 
-def is_sure(query: Query, hypotheses: Sequence[Hypothesis], needs_margin: bool = True) -> bool:
+def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
     """Return True if score, margin and matches of the best pose make further searches needless."""
     found = select(query, rank(hypotheses))
-    if found.best.score < SURE_SCORE or (needs_margin and found.margin < SURE_MARGIN):
+    if found.best.score < SURE_SCORE or found.margin < SURE_MARGIN:
         return False
     return count_agreeing(query, found.best.pose) >= SURE_MATCHES
 
