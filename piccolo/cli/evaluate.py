@@ -65,7 +65,7 @@ with the same file name. Tables are Markdown on stdout (on stderr if one of the 
 For walks (make_room.py --walk) there is a table with a line per walk, and one of the frames that were
 searched alone, by themselves and with the others. A query with "answerable": false is correct if it is not
 localized.
-Errors of a path as evo defines them: tools/export_poses.py --format tum, then evo_ape and evo_rpe.
+Errors of a path as evo defines them: tools/export_poses.py --format tum --timestamps walk, then evo_ape.
 Queries that can't be read and --results without a query are named on stderr; the others are still evaluated,
 and the exit code is 3.
 """
