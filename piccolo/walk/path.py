@@ -261,7 +261,8 @@ class Lattice:
             column = self.columns[n]
             log = next((s.log[i, j] for s in column.steps if s.begin == m), 0.0)
             if self.motion.is_timed and log <= self.motion.jump_log:
-                before, after = self.frames[self.columns[m].number], self.frames[column.number]
+                before = self.frames[self.columns[m].number]
+                after = self.frames[column.number]
                 metres = after.states[j].pose.distance(before.states[i].pose)
                 path.gaps[column.number] = Gap(metres, after.time - before.time)
 
