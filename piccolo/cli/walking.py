@@ -176,6 +176,7 @@ def count_finished(out: Path | None, walk: Walk, frames: Sequence[WalkInput]) ->
         return None
     paths = {frame.name: frame.path for frame in frames}
     records = Records(out)
-    records.read(lambda name: walk.key, paths)
+    key = walk.key
+    records.read(lambda name: key, paths)
     left = list(records.remaining(paths, lambda name: sha256_of(paths[name], walk.read_options.rig)))
     return None if left or not records.is_in_order else records.counts

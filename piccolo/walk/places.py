@@ -19,7 +19,6 @@ from ..localization.query import Cache, Query
 
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 
-
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 
 
