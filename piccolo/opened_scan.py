@@ -19,10 +19,12 @@ from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.colors import Labels
 from .geometry.pose import Pose, check_rotation
+from .jobs.memory import check_memory
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
 from .localization.beside import Picture, localize_beside, locate
 from .localization.bundle import localize_bundle
+from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
 from .localization.verification import is_near
@@ -38,6 +40,7 @@ from .scan_map.scan_map import ScanMap
 
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
+MEMORY_OF_PHOTO = 3e7  # [byte] that a photo keeps while others of its bundle are localized
 MAX_SKEW = 1e-3  # of R R^T from the identity
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
@@ -131,9 +134,10 @@ class OpenedScan:
             photo = read_photo_facts(panorama, read_options.rig)
         if photo.sha256 != result.source.pano_sha256:
             return None
-        pose = self.from_world(result.best_pose)
-        located = locate(prepared, picture, pose, settings, self.workers)
-        return Picture(located, result.confidence, result.covariance)
+        found = Localization(
+            confidence=result.confidence, pose=result.best_pose, covariance=result.covariance
+        )
+        return locate(prepared, picture, found, settings, self.workers)
 
     def localize_again(
         self,
@@ -181,8 +185,9 @@ class OpenedScan:
         read_options: ReadOptions,
         settings: Settings,
         is_masked: NDArray[np.bool_] | None = None,
+        is_scale_free: bool = False,
     ) -> list[Result]:
-        """Localize photos together whose poses in a common frame are known.
+        """Localize photos together whose poses in a common frame are known; its scale may be free.
 
         Raises InputError for a photo that can't be read, for the preset paper, and for a focal length that is
         a guess.
@@ -193,12 +198,15 @@ class OpenedScan:
         if not panoramas:
             return []
         watch = Stopwatch()
+        needed = len(panoramas) * MEMORY_OF_PHOTO
+        check_memory(needed, f"{len(panoramas)} photos together", "localize fewer together")
         with watch.stage("read"), reading_once():
             pictures = [read_photo(panorama, read_options, is_masked) for panorama in panoramas]
             photos = [read_photo_facts(panorama, read_options.rig) for panorama in panoramas]
         if any(map(has_guessed_focal, pictures)):
             raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
-        found = localize_bundle(prepared, pictures, cams_from_bundle, settings, self.workers, watch)
+        errors = RelativeErrors(log_scale=UNKNOWN_SCALE) if is_scale_free else RelativeErrors()
+        found = localize_bundle(prepared, pictures, cams_from_bundle, settings, self.workers, watch, errors)
         about = settings_json(settings, self.cloud_settings, read_options)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
         return [

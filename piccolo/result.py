@@ -251,8 +251,8 @@ class Result:
 
 def with_localization(result: Result, found: Localization) -> Result:
     """Return a result with what was found, and its warnings added."""
-    apart = "pose", "warnings", "cameras", "standings"
-    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name not in apart}
+    own = {f.name for f in fields(result)} - {"warnings", "cameras"}
+    values = {f.name: getattr(found, f.name) for f in fields(found) if f.name in own}
     return replace(result, best_pose=found.pose, warnings=result.warnings + found.warnings, **values)
 
 

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import InputError
-from ..geometry.pose import MAX_DISTANCE, Array
-from .covariance import PoseCovariance
+from ..geometry.pose import Array
+from ..geometry.pose_gaussian import probability_within
 
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
@@ -76,34 +76,34 @@ def log_odds(standing: Standing, model: ChoiceModel | None = None) -> float:
     return float(pose_features(standing) @ np.array(model.weights)) + standing.log_prior
 
 
-def none_features(covariance: PoseCovariance | None) -> Array:
-    """Return the features (2,) of the odds that no pose is right, as NONE_FEATURES names them."""
-    if covariance is None:
-        return np.array([1.0, math.log10(MOST_STD)])
-    std = covariance.largest_std if covariance.std_of_fit is None else covariance.std_of_fit
-    return np.array([1.0, math.log10(min(max(std, LEAST_STD), MOST_STD))])
+def none_features(std: float | None) -> Array:
+    """Return the features (2,) of the odds that no pose is right, as NONE_FEATURES names them.
 
-
-def probability_within(covariance: PoseCovariance | None) -> float:
-    """Return the probability that a pose of the right place is right by its deviation."""
-    return 1.0 if covariance is None else math.erf(MAX_DISTANCE / (covariance.largest_std * math.sqrt(2.0)))
+    `std` is the largest deviation [m] of the best pose by image and scan; None where it is not known.
+    """
+    return np.array([1.0, math.log10(min(max(std or MOST_STD, LEAST_STD), MOST_STD))])
 
 
 def posterior(
-    standings: Sequence[Standing], covariance: PoseCovariance | None, model: ChoiceModel | None = None
+    standings: Sequence[Standing],
+    std: float | None,
+    std_of_fit: float | None = None,
+    model: ChoiceModel | None = None,
 ) -> Array:
     """Return the probabilities (K + 1,) that each of K poses, best first, is right, and that none of them is.
 
-    The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees. They hold where
-    half of all queries have an answer, as in the trials from which they were learnt. None is more likely if
-    the best pose's deviation makes 0.1 m doubtful.
+    `std` is the largest deviation [m] of the best pose, `std_of_fit` that with an exact focal length (as
+    `std` by default). The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees.
+    Calibrated for queries of which half were taken in the scan. None is more likely if the best pose's
+    deviation makes 0.1 m doubtful.
     """
     model = model or MODELS[standings[0].kind]
     logits = [log_odds(standing, model) for standing in standings]
-    logits.append(float(none_features(covariance) @ np.array(model.none_weights)))
+    of_none = none_features(std if std_of_fit is None else std_of_fit)
+    logits.append(float(of_none @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))
     probabilities = odds / odds.sum()
-    probabilities[:-1] *= probability_within(covariance)
+    probabilities[:-1] *= probability_within(std)
     probabilities[-1] = 1.0 - probabilities[:-1].sum()
     return np.asarray(probabilities)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.pose import Array
+from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 
 SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
 
@@ -20,7 +21,6 @@ class PoseCovariance:
 
     matrix: Array
     least_constrained_direction: str  # of the translation, in words
-    std_of_fit: float | None = None  # [m] `largest_std` if the focal length were exact; None where it is
 
     @property
     def std_deg(self) -> Array:
@@ -35,7 +35,17 @@ class PoseCovariance:
     @property
     def largest_std(self) -> float:
         """Standard deviation of the position in its least constrained direction [m]."""
-        return float(math.sqrt(np.linalg.eigvalsh(self.matrix[3:, 3:])[-1]))
+        return largest_std(self.matrix)
+
+
+def describe_errors(found: PoseGaussian | None, R_world_from_map: Array) -> PoseCovariance | None:
+    """Return the covariance in the world of a pose that is found in a map, whose z is up; None of none."""
+    if found is None:
+        return None
+    in_map = found.covariance
+    in_world = turn_positions(in_map, R_world_from_map)
+    words = least_constrained_direction(in_map[3:, 3:], in_world[3:, 3:])
+    return PoseCovariance(0.5 * (in_world + in_world.T), words)
 
 
 def least_constrained_direction(covariance_up: Array, covariance: Array) -> str:

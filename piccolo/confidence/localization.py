@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 from ..camera import Mount
 from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import PoseGaussian
 from .confidence import NOT_LOCALIZED, Standing
 from .covariance import PoseCovariance
 
@@ -63,4 +64,8 @@ class Localization:
     scan: str | None = None  # as of Alternative
     storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
     height_above_floor: float | None = None  # [m] of the pose, above the floor there
-    standings: tuple[Standing, ...] = ()  # evidence for the pose and each alternative; not in results
+    # not in results:
+    is_ruled_out: bool = False  # whatever others say: mirrored, or what the user says is contradicted
+    gaussian: PoseGaussian | None = None  # pose and covariance, in the map
+    std_of_fit: float | None = None  # [m] largest deviation if the focal length were exact; None where it is
+    standings: tuple[Standing, ...] = ()  # evidence for the pose and each alternative

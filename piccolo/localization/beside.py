@@ -11,10 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..confidence.confidence import classify, probability_within
-from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose, skew
+from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -23,17 +22,16 @@ from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
-from .bundle import LOOSE, ROBUST, differentiate, subtract, turn_positions, update
 from .comparison import score_pose
+from .covariance import split_errors
+from .judge import judge, reconsider, take_pose
 from .localize import Found, finish
 from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
 from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
-from .verdict import judge
 from .verification import Located, is_near, match_beside, place_keypoints
 
-HERE = Pose(np.eye(3), np.zeros(3))
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
 
@@ -43,7 +41,7 @@ class Picture(NamedTuple):
 
     located: Located
     confidence: float  # of its pose
-    covariance: PoseCovariance | None  # of its pose, in the world
+    gaussian: PoseGaussian | None  # its pose in the map with its covariance
 
 
 class Beside(NamedTuple):
@@ -57,10 +55,22 @@ class Beside(NamedTuple):
 
 @one_blas_thread
 def locate(
-    scan_map: ScanMap, panorama: Panorama, pose: Pose, settings: CoarseToFineSettings, workers: Workers
-) -> Located:
-    """Return the keypoints of a photo whose pose in the map is known."""
-    return place_keypoints(prepare_query(panorama, scan_map, settings, workers), pose)
+    scan_map: ScanMap,
+    panorama: Panorama,
+    found: Localization,
+    settings: CoarseToFineSettings,
+    workers: Workers,
+) -> Picture:
+    """Return the keypoints of a photo that is localized, and its pose with its errors."""
+    if found.pose is None:
+        raise ValueError("a photo without a pose")
+    query = prepare_query(panorama, scan_map, settings, workers)
+    pose = scan_map.from_world(found.pose)
+    gaussian = None
+    if found.covariance is not None:
+        in_map = turn_positions(found.covariance.matrix, scan_map.R_map_from_world)
+        gaussian = split_errors(query, pose, in_map)
+    return Picture(place_keypoints(query, pose), found.confidence, gaussian)
 
 
 @one_blas_thread
@@ -94,9 +104,13 @@ def localize_beside(
         kept = list_agreeing(judged, found, ended.query.beside, scan_map)
         if not kept:
             return Localization(), ()
-        result = fuse(judged, kept[0], ended, scan_map)
-    certainty = max(other.picture.confidence for other in kept)
-    return weaken(result, certainty, settings.min_confidence), tuple(other.name for other in kept)
+        factor = max(other.picture.confidence for other in kept)
+        fused = fuse(judged, kept[0], ended)
+        if fused is not None and judged.gaussian is not None:
+            before = probability_within(judged.gaussian.largest_std)
+            factor *= probability_within(fused.largest_std) / before
+            judged = take_pose(judged, fused, scan_map)
+    return reconsider(judged, factor, settings.min_confidence), tuple(other.name for other in kept)
 
 
 def list_agreeing(
@@ -114,50 +128,23 @@ def list_agreeing(
     return agreeing
 
 
-def fuse(judged: Localization, other: Beside, ended: Found, scan_map: ScanMap) -> Localization:
-    """Return a result whose pose is the weighted mean of its own and of that by the photo beside.
+def fuse(judged: Localization, other: Beside, ended: Found) -> PoseGaussian | None:
+    """Return the mean of a result's own pose and of that by the photo beside, in the map.
 
-    If they contradict each other, their covariances grow by as much. An error of the focal length is common
-    to both. How likely the place is does not change. A result that is ruled out stays as it is, and one whose
-    mean would contradict the prior.
+    Errors of the focal length and of the scan are common to both. None for a result that is ruled out, and if
+    the mean would contradict the prior.
     """
-    of_photo = other.picture.covariance
-    if judged.pose is None or judged.covariance is None or of_photo is None or judged.confidence == 0.0:
-        return judged
-    common = np.zeros((6, 6)) if ended.fit is None else ended.fit.pose_covariance
-    R_map_from_world = scan_map.R_map_from_world
-    own = scan_map.from_world(judged.pose)
-    of_own = turn_positions(judged.covariance.matrix, R_map_from_world) - common
-    J = differentiate(HERE, other.pose) @ np.linalg.inv(differentiate(HERE, other.picture.located.pose))
-    of_expected = J @ turn_positions(of_photo.matrix, R_map_from_world) @ J.T
-    of_expected += match_covariance(other.matches, other.pose)
-    step = subtract(own, other.pose)
-    excess = max(float(step @ np.linalg.solve(of_own + of_expected, step)) - ROBUST, 0.0) + 1.0
-    pose, covariance = update(other.pose, excess * of_expected, own, excess * of_own)
-    if contradictions(scan_map, pose, ended.query.settings.prior):
-        return judged
-    covariance += common
-    in_world = turn_positions(covariance, R_map_from_world.T)
-    words = least_constrained_direction(covariance[3:, 3:], in_world[3:, 3:])
-    known = PoseCovariance(0.5 * (in_world + in_world.T), words)
-    gain = probability_within(known) / probability_within(judged.covariance)
-    return scale(replace(judged, pose=scan_map.to_world(pose), covariance=known), gain)
-
-
-def weaken(found: Localization, certainty: float, min_confidence: float) -> Localization:
-    """Return a result whose evidence itself is right with a probability, and its status."""
-    found = scale(found, certainty)
-    others = [a.probability or 0.0 for a in found.alternatives]
-    probabilities = np.array([found.confidence, *others, found.probability_none])
-    return replace(found, status=classify(probabilities, min_confidence))
-
-
-def scale(found: Localization, factor: float) -> Localization:
-    """Return a result with the probabilities of all its poses multiplied."""
-    confidence = factor * found.confidence
-    others = tuple(replace(a, probability=factor * (a.probability or 0.0)) for a in found.alternatives)
-    none = 1.0 - confidence - sum(a.probability or 0.0 for a in others)
-    return replace(found, confidence=confidence, probability_none=none, alternatives=others)
+    own = judged.gaussian
+    of_photo = other.picture.gaussian
+    if own is None or of_photo is None or judged.is_ruled_out:
+        return None
+    other_from_cam = other.pose @ of_photo.pose.inverse()
+    expected = of_photo.attach(other_from_cam, match_covariance(other.matches, other.pose))
+    if ended.fit is not None:
+        expected = expected.widen(ended.fit.pose_covariance)
+    fused = expected.fuse(own)
+    is_contradicted = contradictions(ended.query.scan_map, fused.pose, ended.query.settings.prior)
+    return None if is_contradicted else fused
 
 
 def match_covariance(matches: Matches, pose: Pose) -> Array:

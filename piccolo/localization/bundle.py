@@ -1,63 +1,85 @@
 """Photos with known poses relative to each other, localized as one rigid camera.
 
 Each photo is searched by itself. Its poses vote for poses of the bundle, and the best few of these are tested
-in every photo. Then the bundle is adjusted to the photos' own poses by their covariances, and each photo's
-pose is what it and the others say together.
+in every photo. Then the bundle, its scale and the errors of the relative poses are adjusted to the poses of
+single photos, and each photo's pose is what it and the others say together. A photo that contradicts the
+others is judged by itself, and so are all if the relative poses contradict the photos that are sure.
 """
 
+import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import classify, posterior
-from ..confidence.covariance import PoseCovariance, least_constrained_direction
-from ..confidence.localization import Alternative, Localization
-from ..geometry.pose import MAX_DISTANCE, Array, Pose, exp_so3, log_so3, orthonormal, skew
+from ..confidence.confidence import CONTRADICTED, LOCALIZED, posterior
+from ..confidence.localization import Localization
+from ..geometry.pose import Array, Pose, angle_between, log_so3
+from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, std_of
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
+from .bundle_adjustment import (
+    Adjusted,
+    Bundle,
+    Estimate,
+    RelativeErrors,
+    adjust,
+    estimate_errors,
+    find_contradicting,
+    find_scale,
+)
 from .comparison import score_pose
 from .covariance import estimate_covariance
-from .localize import Found, find_pose
-from .prior import contradictions
+from .focal_length import FocalFit, calibrate
+from .judge import MOST_CONFLICT, judge, judge_together
+from .localize import find_pose
 from .query import Query
 from .refinement import descend_fine
 from .selection import Selection, assess_poses
 from .settings import CoarseToFineSettings
-from .verdict import judge
 from .verification import verify
 
-MISSED = 0.25  # of photos, those whose right pose is not found: BENCHMARK.md, phone photos
-CHANCE = 0.02  # probability that a photo has a pose near that by a wrong pose of the bundle
+MISSED = 0.25  # chosen: of photos, those whose right pose is not found (BENCHMARK.md, phone photos: a sixth)
+MISSED_HERE = (
+    0.05  # chosen: of photos of the bundle, those that do not show where they are, if searched there
+)
+CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
 LEAST_NONE = 1e-6
+EVEN = 0.5
 NUM_BUNDLES = 4  # poses of the bundle that are tested
 SAME_PLACE = 0.5  # [m] a photo's pose this near to that by the bundle,
 SAME_TURN = math.radians(6.0)  # and this, supports it
-TURN_STD = math.radians(0.5)  # of relative poses, as phones' trackers and structure from motion have it
-MOVE_STD = 0.02  # [m]
-RELATIVE = np.diag([TURN_STD**2] * 3 + [MOVE_STD**2] * 3)
-NUM_ADJUSTMENTS = 6
-ROBUST = 12.6  # chi square of 6 at 95 %: a photo whose squared deviations are larger counts less
-LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible
+SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
+LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
+NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most probability
+TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
+NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
+DOUBTED = "`relative_poses`: they contradict the photos that are sure; each photo is judged by itself"
+CONTRADICTS = "`relative_poses`: this photo contradicts the others; it is judged by itself"
 
 
-class Member(NamedTuple):
+@dataclass(frozen=True)
+class Member:
     """A photo of the bundle, found by itself."""
 
-    found: Found
+    query: Query  # without what takes memory
+    selection: Selection
+    fit: FocalFit | None
     alone: Localization
     cam_from_bundle: Pose
 
     @property
     def own_poses(self) -> list[tuple[Hypothesis, float]]:
-        """Poses in the map with their probabilities, best first."""
-        hypotheses = [self.found.selection.best, *self.found.selection.alternatives]
+        """Poses in the map with their probabilities, best first; none if the best one is ruled out."""
+        if self.alone.is_ruled_out:
+            return []
+        hypotheses = [self.selection.best, *self.selection.alternatives]
         own = [self.alone.confidence, *(a.probability or 0.0 for a in self.alone.alternatives)]
         return list(zip(hypotheses, own, strict=False))
 
@@ -67,16 +89,36 @@ class Support(NamedTuple):
 
     own: Hypothesis  # its own pose there
     is_found: bool  # by the photo alone
-    probability: float  # of the pose
-    probability_none: float  # that none of the photo's poses is right
+    odds: float  # of that pose, against that none of the photo's poses is right
+    odds_elsewhere: float  # of the photo's other poses
+
+    @property
+    def weights(self) -> Array:
+        """Odds (4,) that the own pose is right, that the photo misses its own, and that it does not belong.
+
+        The last are of no place in the scan, and of another pose of the photo. That a photo by itself finds a
+        pose where the others have it is no chance.
+        """
+        belongs = 1.0 - CONTRADICTED
+        gain = CHANCE if self.is_found else 1.0
+        of_others = [CONTRADICTED * gain, CONTRADICTED * gain * self.odds_elsewhere]
+        right = belongs * (1.0 - MISSED_HERE) * self.odds
+        return np.array([right, belongs * MISSED_HERE * gain, *of_others])
+
+    @property
+    def shares(self) -> Array:
+        """Probabilities (4,) of `weights`."""
+        return np.asarray(self.weights / self.weights.sum())
 
 
-class Estimate(NamedTuple):
-    """A photo's own pose in the map, with its covariance (6, 6), axes as of PoseCovariance but in the map."""
+class Agreed(NamedTuple):
+    """A bundle that is believed."""
 
-    pose: Pose
-    covariance: Array
-    cam_from_bundle: Pose
+    adjusted: Adjusted
+    errors: RelativeErrors
+    estimates: dict[int, Estimate]  # own poses of the photos that agree with it
+    apart: frozenset[int]  # photos that contradict it
+    warnings: tuple[str, ...]
 
 
 @one_blas_thread
@@ -87,8 +129,12 @@ def localize_bundle(
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
+    errors: RelativeErrors,
 ) -> list[Localization]:
-    """Localize photos together; `cams_from_bundle` are their poses in any common frame, in metres."""
+    """Localize photos together; `cams_from_bundle` are their poses in any common frame.
+
+    `errors` are those expected of these poses; their scale is unknown if its deviation is large.
+    """
     cams_from_bundle = move_origin_near(cams_from_bundle)
     alone: list[Localization] = []
     members: dict[int, Member] = {}
@@ -96,26 +142,34 @@ def localize_bundle(
         found = find_pose(scan_map, panorama, settings, workers, watch)
         alone.append(found if isinstance(found, Localization) else judge(*found, may_change=False))
         if not isinstance(found, Localization) and alone[k].pose is not None:
-            members[k] = Member(found, alone[k], cams_from_bundle[k])
-    bundles = propose_bundles(list(members.values()))
-    if not bundles:
-        return alone
-    tested = [{k: find_support(member, bundle) for k, member in members.items()} for bundle in bundles]
-    num_proposed = sum(len(member.own_poses) for member in members.values())
-    probabilities = weigh_bundles([list(supports.values()) for supports in tested], num_proposed)
-    order = np.argsort(-probabilities[:-1], kind="stable")
-    ranked = probabilities[[*order, -1]]
-    own = {k: estimate_own(members[k], support) for k, support in tested[order[0]].items()}
-    estimates = {k: estimate for k, estimate in own.items() if estimate}
-    if not estimates:  # the points fix no photo
-        return alone
-    bundle = adjust_bundle(bundles[order[0]], list(estimates.values()))
-    others = [bundles[i] for i in order[1:]]
+            query, selection, fit = found
+            members[k] = Member(query.forget(), selection, fit, alone[k], cams_from_bundle[k])
+    with watch.stage("refine"):
+        together = judge_members(members, errors)
+    return [together.get(k, one) for k, one in enumerate(alone)]
+
+
+def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[int, Localization]:
+    """Return the results of photos together, or each by itself with the reason."""
+    bundles = propose_bundles(list(members.values()), errors)
+    tested = [dict[int, Support]() for _ in bundles]
     for k, member in members.items():
-        rest = [estimate for i, estimate in estimates.items() if i != k]
-        pose, covariance = fuse_pose(bundle, rest, own[k], member.cam_from_bundle)
-        alone[k] = describe_member(member, pose, covariance, others, ranked)
-    return alone
+        query = member.query.forget()
+        for bundle, supports in zip(bundles, tested, strict=True):
+            supports[k] = find_support(member, query, bundle)
+    probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
+    best = int(probabilities[:-1].argmax()) if bundles else 0
+    if not bundles or probabilities[best] < EVEN:
+        doubted = DOUBTED if probabilities[-1] < EVEN else NOT_FOUND
+        return {k: judge_apart(member, doubted) for k, member in members.items()}
+    supports = tested[best]
+    agreed = agree(members, bundles[best], supports, errors)
+    if isinstance(agreed, str):
+        return {k: judge_apart(member, agreed) for k, member in members.items()}
+    others = [i for i in range(len(bundles)) if i != best]
+    ranked = probabilities[[best, *others, -1]]
+    elsewhere = [bundles[i] for i in others]
+    return {k: judge_member(members[k], k, supports[k], agreed, elsewhere, ranked) for k in members}
 
 
 def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
@@ -124,39 +178,66 @@ def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
     return [Pose(pose.R_cam_from_world, pose.center_world - mean) for pose in cams_from_bundle]
 
 
-def propose_bundles(members: Sequence[Member]) -> list[Pose]:
+def propose_bundles(members: Sequence[Member], errors: RelativeErrors) -> list[Bundle]:
     """Return distinct poses of the bundle in the map, the likeliest first, by the photos' own poses."""
     proposed = [
-        member.cam_from_bundle.inverse() @ own.pose for member in members for own, _ in member.own_poses
+        Bundle(member.cam_from_bundle.inverse() @ own.pose)
+        for member in members
+        for own, _ in member.own_poses
     ]
+    for one, other in itertools.combinations(members, 2):
+        for (a, _), (b, _) in itertools.product(one.own_poses[:NUM_LIKELY], other.own_poses[:NUM_LIKELY]):
+            proposed += propose_with_scale(one, a.pose, other, b.pose, errors)
     votes = [sum(vote(member, bundle) for member in members) for bundle in proposed]
-    kept: list[Pose] = []
+    kept: list[Bundle] = []
     for i in np.argsort(-np.array(votes), kind="stable"):
-        bundle = join_near(members, proposed[i])
+        bundle = join_near(members, proposed[i], errors)
         if len(kept) < NUM_BUNDLES and not any(is_same_bundle(members, bundle, other) for other in kept):
             kept.append(bundle)
     return kept
 
 
-def join_near(members: Sequence[Member], bundle: Pose) -> Pose:
-    """Adjust a pose of the bundle to the photos' poses near it, all of one deviation."""
+def propose_with_scale(
+    one: Member, own: Pose, other: Member, own_of_other: Pose, errors: RelativeErrors
+) -> list[Bundle]:
+    """Return the bundle whose scale is that of two photos' own poses; nothing if these do not fit."""
+    relative = other.cam_from_bundle @ one.cam_from_bundle.inverse()
+    found = own_of_other @ own.inverse()
+    given_apart = float(np.linalg.norm(relative.center_world))
+    found_apart = float(np.linalg.norm(found.center_world))
+    if angle_between(relative.R_cam_from_world, found.R_cam_from_world) > SAME_TURN:
+        return []
+    is_free = errors.log_scale > 1.0
+    if found_apart < LEAST_APART or given_apart <= 0.0:
+        return []
+    scale = found_apart / given_apart
+    if not is_free and not SCALES[0] < scale < SCALES[1]:
+        return []
+    scaled = Bundle(own, math.log(scale)).scale(one.cam_from_bundle)
+    return [Bundle(scaled.inverse() @ own, math.log(scale))]
+
+
+def join_near(members: Sequence[Member], bundle: Bundle, errors: RelativeErrors) -> Bundle:
+    """Adjust a bundle to the photos' poses near it, all of one deviation."""
+    nothing = np.zeros((6, 6))
     near = []
     for member in members:
-        expected = member.cam_from_bundle @ bundle
+        expected = bundle.place(member.cam_from_bundle)
         own = next((own for own, _ in member.own_poses if is_same(own.pose, expected)), None)
         if own:
-            near.append(Estimate(own.pose, RELATIVE, member.cam_from_bundle))
-    return adjust_bundle(bundle, near)
+            near.append(Estimate(PoseGaussian(own.pose, nothing, nothing), member.cam_from_bundle))
+    loose = errors._replace(log_scale=max(errors.log_scale, 1.0))
+    return adjust(bundle, near, loose).bundle if len(near) > 1 else bundle
 
 
-def is_same_bundle(members: Sequence[Member], bundle: Pose, other: Pose) -> bool:
+def is_same_bundle(members: Sequence[Member], bundle: Bundle, other: Bundle) -> bool:
     """Return True if two poses of the bundle put every photo at the same place."""
-    return all(is_same(m.cam_from_bundle @ bundle, m.cam_from_bundle @ other) for m in members)
+    return all(is_same(bundle.place(m.cam_from_bundle), other.place(m.cam_from_bundle)) for m in members)
 
 
-def vote(member: Member, bundle: Pose) -> float:
+def vote(member: Member, bundle: Bundle) -> float:
     """Return the probability of a photo's own pose that supports a pose of the bundle."""
-    expected = member.cam_from_bundle @ bundle
+    expected = bundle.place(member.cam_from_bundle)
     return max((p for own, p in member.own_poses if is_same(own.pose, expected)), default=0.0)
 
 
@@ -166,18 +247,19 @@ def is_same(pose: Pose, other: Pose) -> bool:
     return bool(turn < SAME_TURN and pose.distance(other) < SAME_PLACE)
 
 
-def find_support(member: Member, bundle: Pose) -> Support:
-    """Return what a photo says of a pose of the bundle, by its own best pose near the one expected."""
-    query = member.found.query
-    expected = member.cam_from_bundle @ bundle
+def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
+    """Return a photo's evidence for a bundle pose: its best own pose near the prediction."""
+    expected = bundle.place(member.cam_from_bundle)
     poses = [own for own, _ in member.own_poses]
     own = next((h for h in poses if is_same(h.pose, expected)), None)
     found = own or max(refine_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
-    p = posterior(assess_poses(query, poses[0], poses[1:]), member.alone.covariance)
+    std = std_of(member.alone.gaussian)
+    p = posterior(assess_poses(query, poses[0], poses[1:]), std, member.alone.std_of_fit)
     k = next(k for k, h in enumerate(poses) if h is found)
-    return Support(found, own is not None, float(p[k]), max(float(p[-1]), LEAST_NONE))
+    none = max(float(p[-1]), LEAST_NONE)
+    return Support(found, own is not None, float(p[k]) / none, float(p[:-1].sum() - p[k]) / none)
 
 
 def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
@@ -189,139 +271,134 @@ def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
     return [score_pose(query, pose) for pose in (*near, expected)]
 
 
-def weigh_bundles(supports: Sequence[Sequence[Support]], num_proposed: int) -> Array:
+def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
     The photos are independent evidence. Those that have missed a pose count as one: bare walls and changed
     places lie together. Photos that have found the same pose of the bundle are more than chance, if they are
-    more than chance would give among all poses that were proposed.
+    more than chance would give among all poses that were proposed. If the relative poses are wrong, each
+    photo may have any of its own poses; that counts as none.
     """
+    num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []
-    for of_one in supports:
-        p = np.array([s.probability for s in of_one])
-        none = np.array([s.probability_none for s in of_one])
-        missed = np.log((p + MISSED * none) / (p + none)).min()
+    for of_one in tested:
+        missed = np.log([(s.odds + MISSED) / (s.odds + 1.0) for s in of_one]).min()
         gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE)
         coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
-        logits.append(np.log((p + none) / none).sum() + missed + coincidence)
-    odds = np.exp(np.array([*logits, 0.0]) - max([*logits, 0.0]))
+        of_photos = sum(math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
+        logits.append(of_photos + missed + coincidence)
+    alone = [sum(p for _, p in member.own_poses) for member in members]
+    apart = math.log(CONTRADICTED) - sum(math.log(max(1.0 - p, LEAST_NONE)) for p in alone)
+    odds = np.exp(np.array([*logits, 0.0, apart]) - max([*logits, 0.0, apart]))
+    odds = np.append(odds[:-2], odds[-2:].sum())
     return np.asarray(odds / odds.sum())
+
+
+def agree(
+    members: dict[int, Member], bundle: Bundle, supports: dict[int, Support], errors: RelativeErrors
+) -> Agreed | str:
+    """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed."""
+    own = {
+        k: estimate
+        for k, support in supports.items()
+        if support.shares.argmax() == 0 and (estimate := estimate_own(members[k], support))
+    }
+    every = frozenset(own)
+    while (out := find_contradicting(bundle, list(own.values()), errors)) is not None:
+        del own[list(own)[out]]
+    sure = [k for k, member in members.items() if member.alone.status == LOCALIZED]
+    if 2 * sum(k in own for k in sure) < len(sure) or not own:
+        return DOUBTED if sure else NOT_FOUND
+    estimates = list(own.values())
+    expected = errors
+    free = errors._replace(log_scale=max(errors.log_scale, 1.0))
+    errors = estimate_errors(bundle, estimates, free)._replace(log_scale=errors.log_scale)
+    log_scale, std = find_scale(bundle, estimates, errors)
+    if abs(log_scale) > MOST_CONFLICT * math.hypot(std, errors.log_scale):
+        return f"`relative_poses`: positions are {describe_scale(log_scale)}; each photo is judged by itself"
+    adjusted = adjust(bundle, estimates, errors)
+    warnings = []
+    if abs(adjusted.bundle.log_scale) > TOLD * errors.log_scale:
+        warnings.append(f"`relative_poses`: positions are {describe_scale(adjusted.bundle.log_scale)}")
+    if errors.turn > TOLD * expected.turn or errors.move > TOLD * expected.move:
+        text = f"{errors.move:.2f} m and {math.degrees(errors.turn):.1f} deg"
+        warnings.append(f"`relative_poses`: they are off by about {text} each")
+    return Agreed(adjusted, errors, own, every - frozenset(own), tuple(warnings))
+
+
+def describe_scale(log_scale: float) -> str:
+    """Return by how much positions are too long or too short that are to be multiplied by a scale."""
+    percent = 100.0 * abs(math.expm1(-log_scale))
+    return f"{percent:.0f} % too {'short' if log_scale > 0.0 else 'long'}"
 
 
 def estimate_own(member: Member, support: Support) -> Estimate | None:
     """Return a photo's own pose with its covariance; None where the points do not fix it."""
-    query, _, fit = member.found
-    found = estimate_covariance(query, support.own.pose, fit and fit.pose_covariance)
-    if found is None:
-        return None
-    covariance = turn_positions(found.matrix, query.scan_map.R_map_from_world)
-    return Estimate(support.own.pose, covariance, member.cam_from_bundle)
+    gaussian = member.alone.gaussian
+    if gaussian is None or support.own is not member.selection.best:
+        gaussian = estimate_covariance(member.query.forget(), support.own.pose, member.fit is None)
+        if gaussian is not None and member.fit is not None:
+            gaussian = gaussian.widen(member.fit.pose_covariance)
+    return None if gaussian is None else Estimate(gaussian, member.cam_from_bundle)
 
 
-def turn_positions(covariance: Array, R_target_from_source: Array) -> Array:
-    """Turn the positions' axes of a pose covariance (6, 6)."""
-    J = np.eye(6)
-    J[3:, 3:] = R_target_from_source
-    return np.asarray(J @ covariance @ J.T)
+def judge_apart(member: Member, reason: str) -> Localization:
+    """Return the result of a photo by itself, with the reason; no pose if that is not sure."""
+    alone = member.alone
+    if alone.status != LOCALIZED and reason is not CONTRADICTS:
+        return Localization(warnings=(*alone.warnings, reason))
+    return replace(alone, warnings=(*alone.warnings, reason))
 
 
-def differentiate(bundle: Pose, cam_from_bundle: Pose) -> Array:
-    """Return the derivative (6, 6) of a photo's pose by that of the bundle."""
-    J = np.eye(6)
-    J[:3, :3] = cam_from_bundle.R_cam_from_world
-    J[3:, :3] = bundle.R_cam_from_world.T @ skew(cam_from_bundle.center_world)
-    return J
-
-
-def subtract(pose: Pose, other: Pose) -> Array:
-    """Return the step (6,) that takes `other` to `pose`: a turn in the camera's axes, a move in the map's."""
-    turn = log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T)
-    return np.concatenate([turn, pose.center_world - other.center_world])
-
-
-def add(pose: Pose, step: Array) -> Pose:
-    """Apply a step (6,) of `subtract`."""
-    return Pose(orthonormal(exp_so3(step[:3]) @ pose.R_cam_from_world), pose.center_world + step[3:])
-
-
-def weigh_robustly(step: Array, covariance: Array) -> Array:
-    """Return the information (6, 6) of a step with a covariance, less if the step is improbable."""
-    information = np.linalg.inv(covariance)
-    square = float(step @ information @ step)
-    return np.asarray(information * min(1.0, ROBUST / max(square, 1e-9)) ** 2)
-
-
-def solve_bundle(bundle: Pose, estimates: Sequence[Estimate]) -> tuple[Pose, Array]:
-    """Return the pose of the bundle after a Gauss-Newton step towards the photos' own poses; covariance."""
-    information = LOOSE * np.eye(6)
-    gradient = np.zeros(6)
-    for own in estimates:
-        J = differentiate(bundle, own.cam_from_bundle)
-        step = subtract(own.pose, own.cam_from_bundle @ bundle)
-        weighted = J.T @ weigh_robustly(step, own.covariance + RELATIVE)
-        information = information + weighted @ J
-        gradient = gradient + weighted @ step
-    covariance = np.linalg.inv(information)
-    return add(bundle, covariance @ gradient), np.asarray(covariance)
-
-
-def adjust_bundle(bundle: Pose, estimates: Sequence[Estimate]) -> Pose:
-    """Adjust the pose of the bundle to the photos' own poses."""
-    for _ in range(NUM_ADJUSTMENTS):
-        bundle, _ = solve_bundle(bundle, estimates)
-    return bundle
-
-
-def fuse_pose(
-    bundle: Pose, rest: Sequence[Estimate], own: Estimate | None, cam_from_bundle: Pose
-) -> tuple[Pose, Array]:
-    """Return a photo's pose by the other photos and by itself, with its covariance (6, 6)."""
-    if own is not None and not rest:
-        return own.pose, own.covariance
-    by_rest, of_rest = solve_bundle(bundle, rest)
-    expected = cam_from_bundle @ by_rest
-    J = differentiate(by_rest, cam_from_bundle)
-    of_expected = J @ of_rest @ J.T + RELATIVE
-    if own is None:
-        return expected, of_expected
-    return update(expected, of_expected, own.pose, own.covariance)
-
-
-def update(expected: Pose, of_expected: Array, own: Pose, of_own: Array) -> tuple[Pose, Array]:
-    """Return the weighted mean of two poses by their covariances (6, 6), and its covariance."""
-    step = subtract(own, expected)
-    gain = of_expected @ weigh_robustly(step, of_own + of_expected)  # of Kalman
-    return add(expected, gain @ step), of_expected - gain @ of_expected
-
-
-def describe_member(
-    member: Member, pose: Pose, covariance: Array, others: Sequence[Pose], probabilities: Array
+def judge_member(
+    member: Member,
+    number: int,
+    support: Support,
+    agreed: Agreed,
+    elsewhere: Sequence[Bundle],
+    probabilities: Array,
 ) -> Localization:
-    """Return the result of a photo: its evidence at its pose, and the probabilities of the bundle's poses.
+    """Return the result of a photo in a bundle that is believed.
 
-    `others` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
+    `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
     """
-    query, _, fit = member.found
-    scan_map = query.scan_map
-    judged = judge(query, Selection(score_pose(query, pose), ()), fit)
-    in_world = turn_positions(covariance, scan_map.R_map_from_world.T)
-    words = least_constrained_direction(covariance[3:, 3:], in_world[3:, 3:])
-    known = PoseCovariance(0.5 * (in_world + in_world.T), words)
-    is_right = math.erf(MAX_DISTANCE / (known.largest_std * math.sqrt(2.0)))
-    warnings = contradictions(scan_map, pose, query.settings.prior)
-    p = np.append(is_right * probabilities[:-1], 0.0) * (not warnings)
-    p[-1] = 1.0 - p.sum()
-    elsewhere = [score_pose(query, member.cam_from_bundle @ other) for other in others]
-    return replace(
-        judged,
-        status=classify(p, query.settings.min_confidence),
-        confidence=float(p[0]),
-        probability_none=float(p[-1]),
-        pose=scan_map.to_world(pose),
-        covariance=known,
-        warnings=warnings,
-        alternatives=tuple(
-            Alternative(scan_map.to_world(h.pose), h.score, None, float(q))
-            for h, q in zip(elsewhere, p[1:-1], strict=True)
-        ),
-    )
+    if member.alone.is_ruled_out:
+        return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
+    right, missed, *_ = support.shares
+    if right + missed < EVEN or number in agreed.apart:
+        return judge_apart(member, CONTRADICTS)
+    rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
+    own = agreed.estimates.get(number)
+    gaussian = None if own is None else own.own
+    within = 0.0
+    if rest:
+        adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
+        expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
+        gaussian = expected if gaussian is None else expected.fuse(gaussian)
+        offset = gaussian.pose.center_world - expected.pose.center_world
+        within = missed * probability_near(offset, expected.covariance[3:, 3:])
+    if gaussian is None:
+        return judge_apart(member, NOT_FOUND)
+    of_own = probability_within(gaussian.largest_std)
+    confidence = (within + right * of_own) * probabilities[0]
+    before = member.alone.gaussian
+    if member.alone.status == LOCALIZED and own and before:
+        # that others show nothing says nothing against a photo that is sure
+        gain = of_own / probability_within(before.largest_std)
+        confidence = max(confidence, member.alone.confidence * min(gain, 1.0))
+    others = probabilities[1:-1] * min(1.0, (1.0 - confidence) / max(1.0 - probabilities[0], LEAST_NONE))
+    p = np.array([confidence, *others, max(1.0 - confidence - others.sum(), 0.0)])
+    query, fit = recalibrate_at(member, support)
+    placed = [score_pose(query, bundle.place(member.cam_from_bundle)) for bundle in elsewhere]
+    selection = Selection(score_pose(query, gaussian.pose), tuple(placed))
+    result = judge_together(query, selection, fit, gaussian, p)
+    return replace(result, warnings=result.warnings + agreed.warnings)
+
+
+def recalibrate_at(member: Member, support: Support) -> tuple[Query, FocalFit | None]:
+    """Return the query, and the focal length fitted at a photo's own pose, if it is not exact."""
+    query = member.query.forget()
+    if member.fit is None or support.own is member.selection.best:
+        return query, member.fit
+    query, _, fit = calibrate(query, Selection(support.own, ()))
+    return query, fit

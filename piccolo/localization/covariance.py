@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.covariance import PoseCovariance, least_constrained_direction
 from ..geometry.pose import Array, Pose, rotate_points, step
+from ..geometry.pose_gaussian import PoseGaussian, turn_positions
 from ..geometry.sphere import compute_indices, find_cell
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .query import Query
@@ -28,6 +29,8 @@ UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
 SHAPE_MOVE = 0.01  # [m]
+TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
+ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common with other photos
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
 
 
@@ -204,33 +207,46 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
 
 
-def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
-    """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the photo and of the scan.
+def photo_covariance(turn: float, median_range: float) -> Array:
+    """Return the covariance (6, 6) [rad, m] of a photo's grid and stitching, by an error [rad] of all blocks.
 
-    These are correlated over many blocks: a photo's grid and stitching, in pixels, and a scan's noise and
-    doubled surfaces, by `surface_noise`; of shape alone, those of its edges. The median range converts angles
-    to displacements.
+    The median range [m] converts angles to displacements.
     """
-    median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
-    turn = pixel_share * query.photo.pixel
-    surface = query.scan_map.surface_variance
+    return np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))
+
+
+def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
+    """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
+
+    These are correlated over many blocks: its noise and doubled surfaces, by `surface_noise`; of shape alone,
+    those of its edges.
+    """
+    surface = scan_map.surface_variance
     covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * (turn**2 + np.trace(surface) / 3.0 / median_range**2)
-    covariance[3:, 3:] = np.eye(3) * (turn * median_range) ** 2 + surface
-    if query.scan_map.has_shape:
-        covariance[:3, :3] += np.eye(3) * SHAPE_TURN**2
-        covariance[3:, 3:] += np.eye(3) * SHAPE_MOVE**2
+    covariance[:3, :3] = np.eye(3) * np.trace(surface) / 3.0 / median_range**2
+    covariance[3:, 3:] = surface
+    if scan_map.has_shape:
+        covariance += np.diag(np.repeat([SHAPE_TURN**2, SHAPE_MOVE**2], 3))
     return covariance
 
 
-def estimate_covariance(
-    query: Query, pose: Pose, of_camera: Array | None = None, seen_from: Pose | None = None
-) -> PoseCovariance | None:
-    """Estimate the covariance of a pose, in world axes; None where the points do not fix it.
+def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
+    """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
+    median_range = float(np.median(np.linalg.norm(query.points_at(pose).offsets, axis=0)))
+    common = scan_covariance(query.scan_map, median_range)
+    variances, axes = np.linalg.eigh(covariance - common)
+    return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
-    `of_camera` (6, 6), in the map's axes, is the covariance added by the calibration. `seen_from` is a pose
-    so near that it sees the same points; of a whole photo those behind occluders are then left out, which
-    takes less time than to normalise a masked photo.
+
+def estimate_covariance(
+    query: Query, pose: Pose, is_calibrated: bool = True, seen_from: Pose | None = None
+) -> PoseGaussian | None:
+    """Estimate the covariance of a pose in the map; None where the points do not fix it.
+
+    Photos have the errors of the scan in common, and of a scan without colours all errors: edges lie beside
+    those of the photos in the same way. `seen_from` is a pose so near that it sees the same points; of a
+    whole photo those behind occluders are then left out, which takes less time than to normalise a masked
+    photo.
     """
     shown = mask_occluders(query, pose)
     seen = shown.points_at(pose) if seen_from is None else query.points_at(seen_from)
@@ -242,15 +258,10 @@ def estimate_covariance(
     covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return None
-    J = np.eye(6)
-    J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
-    pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
-    covariance_map = J @ covariance @ J.T + source_covariance(query, points, pixel_share)
-    std_of_fit = None
-    if of_camera is not None:
-        std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))
-        covariance_map += of_camera
-    J[3:, 3:] = query.scan_map.R_map_from_world.T
-    covariance_world = J @ covariance_map @ J.T
-    words = least_constrained_direction(covariance_map[3:, 3:], covariance_world[3:, 3:])
-    return PoseCovariance(0.5 * (covariance_world + covariance_world.T), words, std_of_fit)
+    median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
+    turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.photo.pixel
+    own = turn_positions(covariance, pose.R_cam_from_world.T) + photo_covariance(turn, median_range)
+    common = scan_covariance(query.scan_map, median_range)
+    if query.scan_map.has_shape:
+        return PoseGaussian(pose, ALONE * own, common + (1.0 - ALONE) * own)
+    return PoseGaussian(pose, own, common)

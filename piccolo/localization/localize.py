@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.confidence import classify
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Array, is_correct
 from ..jobs.blas import one_blas_thread
@@ -18,13 +17,13 @@ from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate, change_camera
+from .judge import judge, reconsider
 from .last_descent import HOPELESS_SCORE, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
 from .shape import Aligned, align_level, find_tilts, is_explained, is_tilt_known
-from .verdict import judge
 
 GUESSES = (
     0.0,
@@ -163,15 +162,9 @@ def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettin
         return best
     fraction = best.confidence / total
     others = [
-        Alternative(f.pose, f.evidence.score, f.evidence.num_matches, fraction * f.confidence)
+        Alternative(f.pose, f.evidence.score, f.evidence.num_matches, f.confidence)
         for f in others_found
         if f.pose and f.evidence
     ]
-    listed = [*others, *best.alternatives][:MAX_ALTERNATIVES]
-    confidence = fraction * best.confidence
-    none = 1.0 - confidence - sum(a.probability or 0.0 for a in listed)
-    probabilities = np.array([confidence, *(a.probability or 0.0 for a in listed), none])
-    status = classify(probabilities, settings.min_confidence)
-    return replace(
-        best, status=status, confidence=confidence, probability_none=none, alternatives=tuple(listed)
-    )
+    listed = replace(best, alternatives=(*others, *best.alternatives)[:MAX_ALTERNATIVES])
+    return reconsider(listed, fraction, settings.min_confidence)

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import Standing, posterior
-from ..confidence.covariance import PoseCovariance
 from ..geometry.pose import MAX_DISTANCE, Pose
+from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .comparison import score_pose
 from .covariance import estimate_covariance
 from .last_descent import FULL_LIMITS, HOPELESS_SCORE, NEARLY, settle
@@ -21,7 +21,7 @@ class Near(NamedTuple):
 
     pose: Pose  # in the map
     score: float  # as of Evidence
-    covariance: PoseCovariance | None  # in the world
+    gaussian: PoseGaussian | None  # with its covariance; None where the points do not fix it
     probability: float  # that the pose is right
 
 
@@ -39,12 +39,12 @@ def refine_near(query: Query, start: Pose) -> Near:
     pose = descend(query.points_at(middle), query.photo.images.full(), middle, FULL_LIMITS)
     end = score_pose(query, pose, seen_from if pose.distance(seen_from) < NEARLY else None)
     end = settle(query, end) if query.photo.is_partial else end
-    covariance = None
+    found = None
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
-        covariance = estimate_covariance(query, end.pose, seen_from=middle if sees_same else None)
-    probability = float(posterior([assess_end(query, end)], covariance)[0])
-    return Near(end.pose, end.score, covariance, probability)
+        found = estimate_covariance(query, end.pose, seen_from=middle if sees_same else None)
+    probability = float(posterior([assess_end(query, end)], std_of(found))[0])
+    return Near(end.pose, end.score, found, probability)
 
 
 def assess_end(query: Query, end: Hypothesis) -> Standing:

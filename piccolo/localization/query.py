@@ -151,6 +151,14 @@ class Query:
         photo = replace(self.photo, panorama=rest, images=make_images(rest, scales), small=small)
         return replace(self, photo=photo, cache=Cache(self.cache.views))
 
+    def forget(self) -> "Query":
+        """Return the query without what was computed for it but its features: that takes 100 MB."""
+        given = self.photo.given
+        images = make_images(self.photo.panorama, self.method.scales)
+        photo = replace(self.photo, images=images, colors=Once(partial(make_texels, given)))
+        seen = Once(partial(find_seen, photo, self.workers))
+        return replace(self, photo=photo, seen=seen, cache=Cache(make_views(self.scan_map)))
+
     def view_at(self, pose: Pose, config: ViewConfig) -> Cells:
         """Return the cells seen from a position near a pose, without those that the photo does not show."""
         place = round_position(pose)
@@ -204,11 +212,16 @@ def prepare_query(
     features = tuple(
         Once(partial(find_features, resized, scan_map, workers, [every[k] for k in half])) for half in halves
     )
-    # leaves have narrow edges, which only the last descent is near enough to
-    averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
-    cache = Cache(RecentViews(scan_map.octree, averaged))
+    cache = Cache(make_views(scan_map))
     seen = Once(partial(find_seen, photo, workers))
     return Query(photo, scan_map, settings, workers, method, features, seen, cache, len(features), rotations)
+
+
+def make_views(scan_map: ScanMap) -> RecentViews:
+    """Return the views of a map, none rendered yet."""
+    # leaves have narrow edges, which only the last descent is near enough to
+    averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
+    return RecentViews(scan_map.octree, averaged)
 
 
 def find_tilt(panorama: Panorama, settings: CoarseToFineSettings) -> tuple[Array, bool]:

@@ -1,27 +1,24 @@
 """Positions measured one after another, smoothed by small accelerations."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..confidence.covariance import PoseCovariance
-from ..geometry.pose import Array, Pose, exp_so3
-
-# A pose and its covariance, both in the world
-Located = tuple[Pose, PoseCovariance]
+from ..geometry.pose import Array
+from ..geometry.pose_gaussian import PoseGaussian, add
 
 
 def smooth_positions(
-    located: Sequence[Located], times: Sequence[float], max_acceleration: float, max_speed: float
-) -> list[Located]:
+    located: Sequence[PoseGaussian], times: Sequence[float], max_acceleration: float, max_speed: float
+) -> list[PoseGaussian]:
     """Smooth the positions of a walking camera by small accelerations; return poses and covariances.
 
     Minimizes sum (x_k - z_k)' C_k^-1 (x_k - z_k) + sum |a_k|^2 / s^2 over the positions x_k, where a_k is the
     second difference by time of three consecutive frames and s its deviation `max_acceleration` [m/s^2].
-    Rotations follow their positions by each frame's own covariance. Frames so far apart in time that a camera
-    at `max_speed` [m/s] can stop and turn back between them do not constrain each other.
+    Rotations follow their positions by each frame's own covariance. Errors in common stay. Frames so far
+    apart in time that a camera at `max_speed` [m/s] can stop and turn back between them do not constrain each
+    other.
     """
     from scipy.sparse import block_diag, eye, kron  # noqa: PLC0415  # only walks wait for it
     from scipy.sparse.linalg import splu  # noqa: PLC0415
@@ -30,15 +27,15 @@ def smooth_positions(
         return list(located)
     rows = acceleration_rows(times, max_acceleration, max_speed)
     smooth = kron(rows.T @ rows, eye(3))
-    own = [np.linalg.inv(c.matrix[3:, 3:]) for _, c in located]
+    own = [np.linalg.inv(one.own[3:, 3:]) for one in located]
     factor = splu((block_diag(own) + smooth).tocsc())
-    centers = np.concatenate([pose.center_world for pose, _ in located])
+    centers = np.concatenate([one.pose.center_world for one in located])
     moves = factor.solve(-(smooth @ centers)).reshape(-1, 3)
     smoothed = []
-    for k, (pose, covariance) in enumerate(located):
+    for k, one in enumerate(located):
         part = slice(3 * k, 3 * k + 3)
         variance = factor.solve(np.eye(3 * len(located), 3, -3 * k))[part]
-        smoothed.append(move_pose(pose, covariance, moves[k], variance))
+        smoothed.append(move_pose(one, moves[k], variance))
     return smoothed
 
 
@@ -56,17 +53,17 @@ def acceleration_rows(times: Sequence[float], max_acceleration: float, max_speed
     return csr_matrix((factors.T.ravel(), (row.ravel(), (row + offset).ravel())), (len(before), len(times)))
 
 
-def move_pose(pose: Pose, covariance: PoseCovariance, move: Array, variance: Array) -> Located:
+def move_pose(located: PoseGaussian, move: Array, variance: Array) -> PoseGaussian:
     """Move a pose by the smoothing of its position, and update its covariance.
 
     Rotation and position are jointly Gaussian: the rotation follows by C_wd C_dd^-1.
     """
-    C = covariance.matrix
+    C = located.own
     gain = C[:3, 3:] @ np.linalg.inv(C[3:, 3:])
-    matrix = C.copy()
-    matrix[:3, :3] -= gain @ (C[3:, 3:] - variance) @ gain.T
-    matrix[:3, 3:] = gain @ variance
-    matrix[3:, :3] = matrix[:3, 3:].T
-    matrix[3:, 3:] = variance
-    turned = Pose(exp_so3(gain @ move) @ pose.R_cam_from_world, pose.center_world + move)
-    return turned, replace(covariance, matrix=0.5 * (matrix + matrix.T))
+    own = C.copy()
+    own[:3, :3] -= gain @ (C[3:, 3:] - variance) @ gain.T
+    own[:3, 3:] = gain @ variance
+    own[3:, :3] = own[:3, 3:].T
+    own[3:, 3:] = variance
+    pose = add(located.pose, np.concatenate([gain @ move, move]))
+    return PoseGaussian(pose, 0.5 * (own + own.T), located.common)

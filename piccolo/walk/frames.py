@@ -13,10 +13,10 @@ from typing import Literal
 import numpy as np
 
 from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
-from ..confidence.confidence import LOCALIZED, probability_within
-from ..confidence.covariance import PoseCovariance
+from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose, pose_errors
+from ..geometry.pose_gaussian import PoseGaussian, probability_within, std_of
 from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
@@ -33,7 +33,7 @@ class State:
     pose: Pose  # in the map's frame
     log_odds: float  # against none of the frame's poses being right
     score: float | None = None  # as of Evidence; None of a pose that was not refined
-    covariance: PoseCovariance | None = None  # in the world
+    gaussian: PoseGaussian | None = None  # the pose with its covariance, in the map
     gain: float = 0.0  # [log] of one that was found among the few places within reach
 
     @property
@@ -81,17 +81,17 @@ def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
         return []
     total = 1.0 - found.probability_none
     known = [(found.pose, found.confidence), *((a.pose, a.probability or 0.0) for a in found.alternatives)]
-    odds = [log_odds_of_place(probability, total, found.covariance) for _, probability in known]
+    odds = [log_odds_of_place(probability, total, found.gaussian) for _, probability in known]
     best, *others = [State(scan_map.from_world(pose), o) for (pose, _), o in zip(known, odds, strict=True)]
-    return [replace(best, score=found.evidence.score, covariance=found.covariance), *others]
+    return [replace(best, score=found.evidence.score, gaussian=found.gaussian), *others]
 
 
-def log_odds_of_place(probability: float, total: float, covariance: PoseCovariance | None) -> float:
+def log_odds_of_place(probability: float, total: float, gaussian: PoseGaussian | None) -> float:
     """Return the log odds that a pose is of the right place, from the probability that the pose is right.
 
     `total` is the probability that any of the frame's poses is.
     """
-    within = max(probability_within(covariance), 1e-9)
+    within = max(probability_within(std_of(gaussian)), 1e-9)
     return log_ratio(probability / within, 1.0 - total / within)
 
 

@@ -1,15 +1,18 @@
 """The results of a walk's frames: positions smoothed with a constant-acceleration prior."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import classify, probability_within
+from ..confidence.covariance import describe_errors
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import probability_within, std_of
+from ..localization.judge import decide, take_pose
+from ..localization.prior import contradictions
 from ..optimize.smoothing import smooth_positions
 from .beliefs import Belief
 from .frames import Frame
@@ -44,14 +47,14 @@ def make_localizations(
     frames = tracker.frames
     motion = tracker.motion
     found = [make_localization(tracker, f, belief) for f, belief in zip(frames, beliefs, strict=True)]
-    sure = [k for k, f in enumerate(found) if motion.is_timed and f.covariance and f.confidence > EVEN]
-    located = [(f.pose, f.covariance) for k in sure if (f := found[k]).pose and f.covariance]
+    sure = [k for k, f in enumerate(found) if motion.is_timed and f.gaussian and f.confidence > EVEN]
+    located = [gaussian for k in sure if (gaussian := found[k].gaussian)]
     begins = [0, *(n for n, k in enumerate(sure) if n and path.gaps[k]), len(sure)]
     for lo, hi in pairwise(begins):
         times = [frames[k].time for k in sure[lo:hi]]
         parts = smooth_positions(located[lo:hi], times, motion.max_acceleration, motion.speed)
-        for k, (pose, covariance) in zip(sure[lo:hi], parts, strict=True):
-            found[k] = replace(found[k], pose=pose, covariance=covariance)
+        for k, gaussian in zip(sure[lo:hi], parts, strict=True):
+            found[k] = take_pose(found[k], gaussian, tracker.scan_map)
     return [(f, describe_frame(frames, k, path.gaps[k])) for k, f in enumerate(found)]
 
 
@@ -68,22 +71,23 @@ def make_localization(tracker: Tracker, frame: Frame, belief: Belief) -> Localiz
     if not belief.states:
         return frame.alone or Localization()
     best, *others = belief.states
-    within = probability_within(best.covariance)
-    confidence, *rest = (within * float(p) for p in belief.probabilities)
-    none = max(1.0 - confidence - sum(rest), 0.0)
-    to_world = tracker.scan_map.to_world
+    scan_map = tracker.scan_map
+    within = probability_within(std_of(best.gaussian))
+    rest = within * belief.probabilities[1 : 1 + MAX_ALTERNATIVES]
+    p = np.array([within * belief.probabilities[0], *rest, 0.0])
+    p[-1] = max(1.0 - p.sum(), 0.0)
     is_own = frame.alone and frame.states and best is frame.states[0]
     own = frame.alone if is_own and frame.alone else Localization()
-    found = [
-        Alternative(to_world(s.pose), s.score or 0.0, None, p) for s, p in zip(others, rest, strict=True)
-    ]
-    return Localization(
-        classify(np.array([confidence, *rest, none]), tracker.settings.min_confidence),
-        confidence,
-        none,
-        to_world(best.pose),
-        own.loss,
-        own.evidence,
-        tuple(found[:MAX_ALTERNATIVES]),
-        best.covariance,
+    warnings = contradictions(scan_map, best.pose, tracker.settings.prior)
+    alternatives = [Alternative(scan_map.to_world(s.pose), s.score or 0.0) for s in others[:MAX_ALTERNATIVES]]
+    described = Localization(
+        pose=scan_map.to_world(best.pose),
+        loss=own.loss,
+        evidence=own.evidence,
+        alternatives=tuple(alternatives),
+        covariance=describe_errors(best.gaussian, scan_map.R_map_from_world.T),
+        warnings=warnings,
+        is_ruled_out=bool(warnings),
+        gaussian=best.gaussian,
     )
+    return decide(described, p, tracker.settings.min_confidence)

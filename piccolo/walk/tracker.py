@@ -327,8 +327,8 @@ def track(query: Query, start: Pose) -> State | None:
     ends = [refine_near(query, start)]
     if has_own_matches(query):
         ends.append(refine_near(query, verify(query, ends[0].pose).pose))
-    odds = [log_odds_of_place(end.probability, end.probability, end.covariance) for end in ends]
+    odds = [log_odds_of_place(end.probability, end.probability, end.gaussian) for end in ends]
     best = int(np.argmax(odds))
     end = ends[best]
     is_wrong = odds[best] < 0.0 or end.score < SURE_SCORE
-    return None if is_wrong else State(end.pose, odds[best], end.score, end.covariance)
+    return None if is_wrong else State(end.pose, odds[best], end.score, end.gaussian)

@@ -50,6 +50,7 @@ class Outcome(NamedTuple):
     case: str
     standings: list[Standing]  # the best first
     covariance: PoseCovariance | None
+    std_of_fit: float | None  # [m] of the best pose, as of Localization
     right: int  # of the poses, or their number if none is
     is_refused: bool  # as mirrored: no choice was made
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
@@ -59,11 +60,16 @@ class Outcome(NamedTuple):
         """Key in MODELS: what the photo was compared with."""
         return self.standings[0].kind
 
+    @property
+    def std(self) -> float | None:
+        """Largest deviation of the best pose [m]; None where it is not known."""
+        return None if self.covariance is None else self.covariance.largest_std
+
     def probabilities(self, model: ChoiceModel | None) -> Array:
         """Return the probability of each pose, and of none (K + 1,); by default with the model in use."""
         if self.is_refused:
             return np.append(np.zeros(len(self.standings)), 1.0)
-        return posterior(self.standings, self.covariance, model)
+        return posterior(self.standings, self.std, self.std_of_fit, model)
 
 
 def pose_error(pose: Pose, true_pose: Pose) -> Array:
@@ -80,7 +86,7 @@ def read_outcome(line: str) -> Outcome | None:
         return None
     standings = [Standing(*standing) for standing in trial["standings"]]
     matrix = trial["covariance"]
-    covariance = None if matrix is None else PoseCovariance(np.array(matrix), "", trial["std_of_fit"])
+    covariance = None if matrix is None else PoseCovariance(np.array(matrix), "")
     error = np.full(6, np.nan)
     right = len(poses)
     if trial["truth"] is not None:
@@ -88,7 +94,7 @@ def read_outcome(line: str) -> Outcome | None:
         error = pose_error(poses[0], true_pose)
         right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
     is_refused = trial["probabilities"][-1] == 1.0
-    return Outcome(str(trial["case"]), standings, covariance, right, is_refused, error)
+    return Outcome(str(trial["case"]), standings, covariance, trial["std_of_fit"], right, is_refused, error)
 
 
 def read_pose(document: dict[str, list[float]]) -> Pose:
@@ -99,7 +105,7 @@ def read_pose(document: dict[str, list[float]]) -> Pose:
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
     """Return the weights of the greatest penalised likelihood."""
     poses = [np.array([pose_features(s) for s in o.standings]) for o in outcomes]
-    nones = np.array([none_features(o.covariance) for o in outcomes])
+    nones = np.array([none_features(o.std if o.std_of_fit is None else o.std_of_fit) for o in outcomes])
     deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
 
     def loss(w: Array) -> tuple[float, Array]:

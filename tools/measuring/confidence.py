@@ -279,7 +279,7 @@ def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, objec
         "poses": [pose_json(pose) for pose in poses],
         "standings": [list(standing) for standing in found.standings],
         "covariance": found.covariance and found.covariance.matrix.tolist(),
-        "std_of_fit": found.covariance and found.covariance.std_of_fit,
+        "std_of_fit": found.std_of_fit,
     }
 
 

@@ -1,23 +1,32 @@
-"""The evidence for and against the pose that was found, and the resulting status."""
+"""The judge: the only maker of a status, of confidences and of what is ruled out.
+
+A photo alone is judged by its evidence. Photos that help each other, guesses of a focal length, and walks
+hand over probabilities and a pose with its errors; they never make a status.
+"""
 
 import math
 import operator
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import compress
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
+from ..confidence.covariance import describe_errors
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
+from ..geometry.pose import Array, Pose
+from ..geometry.pose_gaussian import PoseGaussian, std_of
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
 from ..panorama import Panorama
+from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .brief import mirror_query
 from .covariance import estimate_covariance
@@ -37,16 +46,127 @@ TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
+class Measured(NamedTuple):
+    """Measurements of the best pose."""
+
+    pose: Pose  # in the map
+    gaussian: PoseGaussian | None  # with its covariance; None where the points do not fix it
+    std_of_fit: float | None  # [m] largest deviation if the focal length were exact; None where it is
+    loss: float
+    evidence: Evidence
+
+
 def judge(
     query: Query, found: Selection, fit: FocalFit | None = None, may_change: bool = True
 ) -> Localization:
-    """Return the result for the best pose: evidence, covariance, probabilities and status.
+    """Return the result for the best pose of a photo by itself.
 
     `fit` is the fitted focal length, if the photo's is not exact. If `may_change`, a copy of the best pose's
     place that turns out likelier becomes the best.
     """
-    if found.best.score < 0.0:
+    measured = measure(query, found, fit)
+    if measured is None:
         return Localization()
+    reported = found.alternatives[:MAX_ALTERNATIVES]
+    is_copy = list_copies(query, found.best, reported)
+    standings = credit_copies(assess_poses(query, found.best, reported), is_copy)
+    probabilities = posterior(standings, std_of(measured.gaussian), measured.std_of_fit)
+    likeliest = int(probabilities[:-1].argmax())
+    if likeliest and is_copy[likeliest] and may_change and fit is None:
+        return judge(query, promote(query, found, reported[likeliest - 1]), None, may_change=False)
+    return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
+
+
+def judge_together(
+    query: Query, found: Selection, fit: FocalFit | None, gaussian: PoseGaussian, probabilities: Array
+) -> Localization:
+    """Return the result of a photo whose pose is what it and others say together.
+
+    `gaussian` is that pose, in the map, and that of the best of `found`. `probabilities` (K + 1,) of the best
+    pose, the alternatives and none are those that the others give. What the photo itself rules out stays so.
+    """
+    measured = measure(query, found, fit)
+    if measured is None:
+        return Localization()
+    standings = assess_poses(query, found.best, found.alternatives)
+    measured = measured._replace(gaussian=gaussian)
+    return conclude(query, found, fit, measured, standings, probabilities)
+
+
+def conclude(
+    query: Query,
+    found: Selection,
+    fit: FocalFit | None,
+    measured: Measured,
+    standings: Sequence[Standing],
+    probabilities: Array,
+) -> Localization:
+    """Return the result for measurements and probabilities, if nothing rules the pose out."""
+    scan_map = query.scan_map
+    least = query.settings.min_confidence
+    warnings = contradictions(scan_map, measured.pose, query.settings.prior)
+    if classify(probabilities, least) != NOT_LOCALIZED and is_mirrored(query, found.best):
+        warnings += (MIRRORED,)
+    gaussian = measured.gaussian
+    alternatives = [
+        Alternative(scan_map.to_world(h.pose), h.score, s.num_matches)
+        for h, s in zip(found.alternatives, standings[1:], strict=True)
+    ]
+    described = Localization(
+        pose=scan_map.to_world(measured.pose),
+        loss=measured.loss,
+        evidence=measured.evidence,
+        alternatives=tuple(alternatives),
+        covariance=describe_errors(gaussian, scan_map.R_map_from_world.T),
+        warnings=warnings,
+        cameras=() if fit is None else query.photo.given.cameras,
+        focal_length=None if fit is None else fit.focal_length(query.photo.given),
+        is_ruled_out=bool(warnings) or (fit is not None and fit.conflict > MOST_CONFLICT),
+        gaussian=gaussian,
+        std_of_fit=measured.std_of_fit,
+        standings=tuple(standings),
+    )
+    decided = decide(described, probabilities, least)
+    if fit is None or decided.status == LOCALIZED:
+        return decided
+    return replace(decided, warnings=warnings + explain_doubts(query.photo.given, fit))
+
+
+def decide(found: Localization, probabilities: Array, min_confidence: float) -> Localization:
+    """Return a result with the probabilities (K + 1,) of its pose, its alternatives and none, and its status.
+
+    What is ruled out stays so, whatever the probabilities are. Every status is made here.
+    """
+    p = np.append(np.zeros(len(probabilities) - 1), 1.0) if found.is_ruled_out else probabilities
+    others = tuple(replace(a, probability=float(q)) for a, q in zip(found.alternatives, p[1:-1], strict=True))
+    return replace(
+        found,
+        status=classify(p, min_confidence),
+        confidence=float(p[0]),
+        probability_none=float(p[-1]),
+        alternatives=others,
+    )
+
+
+def reconsider(found: Localization, factor: float, min_confidence: float) -> Localization:
+    """Return a result with the probabilities of all its poses multiplied by a factor, and its status."""
+    poses = factor * np.array([found.confidence, *(a.probability or 0.0 for a in found.alternatives)])
+    return decide(found, np.append(poses, 1.0 - poses.sum()), min_confidence)
+
+
+def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> Localization:
+    """Return a result with another pose of the same place."""
+    described = describe_errors(fused, scan_map.R_map_from_world.T)
+    return replace(judged, pose=scan_map.to_world(fused.pose), covariance=described, gaussian=fused)
+
+
+def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | None:
+    """Measure how well the best pose explains a photo, and how well the photo fixes the pose.
+
+    None if there is no pose, or no point is visible from it.
+    """
+    if found.best.score < 0.0:
+        return None
     settings = query.settings
     pose = found.best.pose
     points, coarse = query.surroundings_at(pose)
@@ -54,48 +174,19 @@ def judge(
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, make_sampling_loss(query.photo.colors()), pose, descent).pose
     measures: list[Callable[[], Any]] = [
-        partial(estimate_covariance, query, pose, fit and fit.pose_covariance),  # takes longest
+        partial(estimate_covariance, query, pose, fit is None),  # takes longest
         lambda: compare_occlusion(points, query.photo.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),
     ]
-    covariance, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
+    gaussian, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
-        return Localization()
-    evidence = collect_evidence(query, found, agreement, fractions)
-    reported = found.alternatives[:MAX_ALTERNATIVES]
-    standings = assess_poses(query, found.best, reported)
-    is_copy = list_copies(query, found.best, reported)
-    weighed = credit_copies(standings, is_copy)
-    probabilities = posterior(weighed, covariance)
-    likeliest = int(probabilities[:-1].argmax())
-    if likeliest and is_copy[likeliest] and may_change and fit is None:
-        return judge(query, promote(query, found, reported[likeliest - 1]), None, may_change=False)
-    warnings = contradictions(query.scan_map, pose, settings.prior)
-    if classify(probabilities, settings.min_confidence) != NOT_LOCALIZED and is_mirrored(query, found.best):
-        warnings += (MIRRORED,)
-    if warnings or (fit is not None and fit.conflict > MOST_CONFLICT):
-        probabilities = np.append(np.zeros(len(standings)), 1.0)
-    if fit is not None and classify(probabilities, settings.min_confidence) != LOCALIZED:
-        warnings += explain_doubts(query.photo.given, fit)
-    alternatives = tuple(
-        Alternative(query.scan_map.to_world(h.pose), h.score, s.num_matches, float(p))
-        for h, s, p in zip(reported, standings[1:], probabilities[1:-1], strict=True)
-    )
-    return Localization(
-        classify(probabilities, settings.min_confidence),
-        float(probabilities[0]),
-        float(probabilities[-1]),
-        query.scan_map.to_world(pose),
-        loss,
-        evidence,
-        alternatives,
-        covariance,
-        warnings,
-        cameras=() if fit is None else query.photo.given.cameras,
-        focal_length=None if fit is None else fit.focal_length(query.photo.given),
-        standings=tuple(weighed),
-    )
+        return None
+    std_of_fit = None
+    if gaussian is not None and fit is not None:
+        std_of_fit = gaussian.largest_std
+        gaussian = gaussian.widen(fit.pose_covariance)
+    return Measured(pose, gaussian, std_of_fit, loss, collect_evidence(query, found, agreement, fractions))
 
 
 def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:

@@ -1,0 +1,137 @@
+"""A pose with the covariance of its error, of which a part may be shared with other poses.
+
+An error is a step (6,): a rotation [rad] about the camera's axes, then a translation [m] along the axes of
+the pose's frame: R_true = exp([w]x) R, center_true = center + d.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .pose import MAX_DISTANCE, Array, Pose, exp_so3, log_so3, orthonormal, skew
+
+LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
+LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible
+
+
+@dataclass(frozen=True)
+class PoseGaussian:
+    """A pose, the covariance of its own error, and that of the error that it has in common with others.
+
+    What is in common, as the noise of a scan or the focal length of one camera, is not averaged away.
+    """
+
+    pose: Pose
+    own: Array  # (6, 6) [rad, m]
+    common: Array  # (6, 6) [rad, m]
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6, 6) of the whole error."""
+        return self.own + self.common
+
+    @property
+    def largest_std(self) -> float:
+        """Standard deviation of the position in its least constrained direction [m]."""
+        return largest_std(self.covariance)
+
+    def to_frame(self, pose: Pose, R_target_from_source: Array) -> "PoseGaussian":
+        """Return this as `pose` of another frame, whose axes are turned by a rotation (3, 3)."""
+        own, common = (turn_positions(part, R_target_from_source) for part in (self.own, self.common))
+        return PoseGaussian(pose, own, common)
+
+    def attach(self, other_from_cam: Pose, relative: Array) -> "PoseGaussian":
+        """Return the pose of another camera on the same rig, whose place there has a covariance (6, 6)."""
+        J = differentiate(self.pose, other_from_cam)
+        return PoseGaussian(other_from_cam @ self.pose, J @ self.own @ J.T + relative, J @ self.common @ J.T)
+
+    def widen(self, common: Array) -> "PoseGaussian":
+        """Return this with a further error in common (6, 6)."""
+        return replace(self, common=self.common + common)
+
+    def square_distance(self, other: "PoseGaussian") -> float:
+        """Return the squared distance to another estimate of the pose, in deviations: chi square of 6.
+
+        What both have in common makes no difference.
+        """
+        step = subtract(other.pose, self.pose)
+        return float(step @ np.linalg.solve(self.own + other.own, step))
+
+    def fuse(self, other: "PoseGaussian") -> "PoseGaussian":
+        """Return the mean of two estimates of a pose, weighted by the covariances of their own errors.
+
+        If they contradict each other, these grow by as much.
+        """
+        excess = max(self.square_distance(other) - LIKELY, 0.0) + 1.0
+        gain = self.own @ np.linalg.inv(self.own + other.own)  # of Kalman
+        pose = add(self.pose, gain @ subtract(other.pose, self.pose))
+        own = excess * (self.own - gain @ self.own)
+        root = (np.eye(6) - gain) @ square_root(self.common) + gain @ square_root(other.common)
+        return PoseGaussian(pose, 0.5 * (own + own.T), root @ root.T)
+
+
+def largest_std(covariance: Array) -> float:
+    """Return the largest deviation [m] of a position by the covariance (6, 6) of a pose."""
+    return math.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
+
+
+def std_of(found: PoseGaussian | None) -> float | None:
+    """Return `largest_std` of a pose; None of none."""
+    return None if found is None else found.largest_std
+
+
+def probability_within(std: float | None, distance: float = MAX_DISTANCE) -> float:
+    """Return the probability that a position is within a distance [m] of the truth, by its deviation [m].
+
+    It is 1 where no deviation is known.
+    """
+    return 1.0 if std is None else math.erf(distance / (max(std, 1e-9) * math.sqrt(2.0)))
+
+
+def probability_near(offset: Array, covariance: Array, distance: float = MAX_DISTANCE) -> float:
+    """Return the probability that a position is within a distance [m] of a place at an offset (3,) from it.
+
+    Along the offset and across it the covariance (3, 3) counts by its largest deviation.
+    """
+    std = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 1e-18)) * math.sqrt(2.0)
+    gap = float(np.linalg.norm(offset))
+    return 0.5 * (math.erf((distance - gap) / std) + math.erf((distance + gap) / std))
+
+
+def square_root(covariance: Array) -> Array:
+    """Return the symmetric square root of a covariance (6, 6)."""
+    variances, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.sqrt(np.maximum(variances, 0.0))) @ axes.T)
+
+
+def mean_of(covariances: Sequence[Array]) -> Array:
+    """Return the mean (6, 6) of covariances; zeros if there are none."""
+    return np.asarray(sum(covariances, np.zeros((6, 6))) / max(len(covariances), 1))
+
+
+def turn_positions(covariance: Array, R_target_from_source: Array) -> Array:
+    """Turn the positions' axes of a pose covariance (6, 6)."""
+    J = np.eye(6)
+    J[3:, 3:] = R_target_from_source
+    return np.asarray(J @ covariance @ J.T)
+
+
+def differentiate(pose: Pose, other_from_cam: Pose) -> Array:
+    """Return the derivative (6, 6) of another camera's pose on the same rig by that of a camera."""
+    J = np.eye(6)
+    J[:3, :3] = other_from_cam.R_cam_from_world
+    J[3:, :3] = pose.R_cam_from_world.T @ skew(other_from_cam.center_world)
+    return J
+
+
+def subtract(pose: Pose, other: Pose) -> Array:
+    """Return the step (6,) that takes `other` to `pose`."""
+    turn = log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T)
+    return np.concatenate([turn, pose.center_world - other.center_world])
+
+
+def add(pose: Pose, step: Array) -> Pose:
+    """Apply a step (6,) of `subtract`."""
+    return Pose(orthonormal(exp_so3(step[:3]) @ pose.R_cam_from_world), pose.center_world + step[3:])

@@ -1,0 +1,178 @@
+"""Pose and scale of a bundle of photos, adjusted to the photos' own poses, and errors of relative poses.
+
+The relative poses that a user gives have errors like everything else. The photos that are found by themselves
+tell how large these are, whether the positions are too long, and which photo does not belong to the others.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..geometry.pose import Array, Pose
+from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
+
+UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known
+NUM_ADJUSTMENTS = 6
+NUM_ROUNDS = 4  # in which errors of relative poses and the bundle are estimated in turn
+TELLING = 10.0  # ratio of variances (F) by which one photo differs from the others: it contradicts them
+QUANTILE = 1.645  # deviations of the normal distribution below which 95 % lie
+
+
+class RelativeErrors(NamedTuple):
+    """Standard deviations of the relative poses that a user gives."""
+
+    turn: float = math.radians(0.5)  # [rad] about each axis, as of phones' trackers and structure from motion
+    move: float = 0.02  # [m] along each axis
+    log_scale: float = 0.01  # of all positions' scale
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (6, 6) of one photo's relative pose."""
+        return np.asarray(np.diag(np.repeat([self.turn**2, self.move**2], 3)))
+
+
+class Bundle(NamedTuple):
+    """The common frame of relative poses, placed in the map."""
+
+    pose: Pose  # in the map
+    log_scale: float = 0.0  # logarithm of the factor of relative positions
+
+    def place(self, cam_from_bundle: Pose) -> Pose:
+        """Return the pose in the map of a photo with a relative pose."""
+        return self.scale(cam_from_bundle) @ self.pose
+
+    def scale(self, cam_from_bundle: Pose) -> Pose:
+        """Return a relative pose with its position scaled."""
+        center = math.exp(self.log_scale) * cam_from_bundle.center_world
+        return Pose(cam_from_bundle.R_cam_from_world, center)
+
+
+class Estimate(NamedTuple):
+    """A photo's own pose in the map, and its relative pose."""
+
+    own: PoseGaussian
+    cam_from_bundle: Pose
+
+
+class Adjusted(NamedTuple):
+    """A bundle adjusted to photos."""
+
+    bundle: Bundle
+    covariance: Array  # (7, 7) of a step of its pose, and of its logarithm of the scale
+    common: Array  # (6, 6) of errors that all photos have in common
+
+    def predict(self, cam_from_bundle: Pose, errors: RelativeErrors) -> PoseGaussian:
+        """Return the pose that a photo has by the others."""
+        J = differentiate_bundle(self.bundle, cam_from_bundle)
+        own = J @ self.covariance @ J.T + errors.covariance
+        return PoseGaussian(self.bundle.place(cam_from_bundle), own, self.common)
+
+
+def differentiate_bundle(bundle: Bundle, cam_from_bundle: Pose) -> Array:
+    """Return the derivative (6, 7) of a photo's pose by the bundle's, and by its logarithm of the scale."""
+    scaled = bundle.scale(cam_from_bundle)
+    J = np.zeros((6, 7))
+    J[:, :6] = differentiate(bundle.pose, scaled)
+    J[3:, 6] = bundle.pose.R_cam_from_world.T @ scaled.center_world
+    return J
+
+
+def weigh_robustly(step: Array, covariance: Array) -> Array:
+    """Return the information (6, 6) of a step with a covariance, less if the step is improbable."""
+    information = np.linalg.inv(covariance)
+    square = float(step @ information @ step)
+    return np.asarray(information * min(1.0, LIKELY / max(square, 1e-9)) ** 2)
+
+
+def adjust(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> Adjusted:
+    """Adjust pose and scale of a bundle to the photos' own poses by Gauss-Newton steps."""
+    covariance = np.eye(7)
+    for _ in range(NUM_ADJUSTMENTS):
+        information = np.diag([LOOSE] * 6 + [errors.log_scale**-2])
+        gradient = np.zeros(7)
+        gradient[6] = -bundle.log_scale * errors.log_scale**-2
+        for own, cam_from_bundle in estimates:
+            J = differentiate_bundle(bundle, cam_from_bundle)
+            step = subtract(own.pose, bundle.place(cam_from_bundle))
+            weighted = J.T @ weigh_robustly(step, own.own + errors.covariance)
+            information = information + weighted @ J
+            gradient = gradient + weighted @ step
+        covariance = np.linalg.inv(information)
+        delta = np.asarray(covariance @ gradient)
+        bundle = Bundle(add(bundle.pose, delta[:6]), bundle.log_scale + float(delta[6]))
+    return Adjusted(bundle, covariance, mean_of([own.common for own, _ in estimates]))
+
+
+def sum_squares(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> Array:
+    """Return chi square of the rotations and that of the positions (2,) of photos in a bundle."""
+    total = np.zeros(2)
+    for own, cam_from_bundle in estimates:
+        step = subtract(own.pose, bundle.place(cam_from_bundle))
+        covariance = own.own + errors.covariance
+        for k, part in enumerate((slice(0, 3), slice(3, 6))):
+            total[k] += step[part] @ np.linalg.solve(covariance[part, part], step[part])
+    return total
+
+
+def count_freedom(num_photos: int) -> Array:
+    """Return how many rotations and positions (2,) of photos are more than a pose and a scale take."""
+    return np.asarray(np.maximum(3.0 * num_photos - np.array([3.0, 4.0]), 0.0))
+
+
+def find_limit(freedom: float) -> float:
+    """Return chi square at 95 % for a number of degrees of freedom (Wilson and Hilferty, 1931)."""
+    if freedom == 0.0:
+        return math.inf
+    spread = 2.0 / (9.0 * freedom)
+    return float(freedom * (1.0 - spread + QUANTILE * math.sqrt(spread)) ** 3)
+
+
+def estimate_errors(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> RelativeErrors:
+    """Return the errors of relative poses, larger than expected where the photos' own poses say so.
+
+    A variance that few photos tell is larger than their squares (the mean of Student's t).
+    """
+    freedom = count_freedom(len(estimates))
+    for _ in range(NUM_ROUNDS):
+        squares = sum_squares(adjust(bundle, estimates, errors).bundle, estimates, errors)
+        factors = [
+            math.sqrt(max(square / max(free - 2.0, 1.0), 1.0)) if square > find_limit(free) else 1.0
+            for square, free in zip(squares, freedom, strict=True)
+        ]
+        errors = errors._replace(turn=errors.turn * factors[0], move=errors.move * factors[1])
+        if max(factors) == 1.0:
+            break
+    return errors
+
+
+def find_contradicting(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> int | None:
+    """Return the photo without which the others fit much better, if they do not fit: an F test.
+
+    None if all fit, or no single photo is to blame.
+    """
+    if len(estimates) < 3:
+        return None
+    total = squares_at_best(bundle, estimates, errors)
+    if total <= find_limit(float(count_freedom(len(estimates)).sum())):
+        return None
+    rest = [
+        squares_at_best(bundle, [*estimates[:k], *estimates[k + 1 :]], errors) for k in range(len(estimates))
+    ]
+    best = int(np.argmin(rest))
+    left = max(rest[best] / float(count_freedom(len(estimates) - 1).sum()), 1.0)
+    return best if (total - rest[best]) / 6.0 > TELLING * left else None
+
+
+def squares_at_best(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> float:
+    """Return chi square of photos in the bundle that is adjusted to them."""
+    return float(sum_squares(adjust(bundle, estimates, errors).bundle, estimates, errors).sum())
+
+
+def find_scale(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> tuple[float, float]:
+    """Return the logarithm of the scale by the photos alone, and its deviation; (0, inf) by one photo."""
+    if len(estimates) < 2:
+        return 0.0, math.inf
+    free = adjust(bundle, estimates, errors._replace(log_scale=UNKNOWN_SCALE))
+    return free.bundle.log_scale, math.sqrt(free.covariance[6, 6])
