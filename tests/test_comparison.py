@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import rooms
 from measuring.confidence import mask_outside_field, occlude
+from piccolo.localization.verdict import is_mirrored
 
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
@@ -25,7 +26,6 @@ from piccolo.localization.comparison import (
 )
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.localization.verdict import is_mirrored
 from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama

@@ -46,9 +46,8 @@ from .settings import CoarseToFineSettings
 from .verification import verify
 
 MISSED = 0.25  # chosen: of photos, those whose right pose is not found (BENCHMARK.md, phone photos: a sixth)
-MISSED_HERE = (
-    0.05  # chosen: of photos of the bundle, those that do not show where they are, if searched there
-)
+MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
+MISSED_HERE = 0.05  # chosen: of photos of the bundle, those that do not show where they are
 CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
 LEAST_NONE = 1e-6
 EVEN = 0.5
@@ -61,6 +60,7 @@ NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most pro
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
 NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
 DOUBTED = "`relative_poses`: they contradict the photos that are sure; each photo is judged by itself"
+UNSEEN = "`relative_poses`: this photo does not show the place where the others put it"
 CONTRADICTS = "`relative_poses`: this photo contradicts the others; it is judged by itself"
 
 
@@ -160,8 +160,9 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
     if not bundles or probabilities[best] < EVEN:
-        doubted = DOUBTED if probabilities[-1] < EVEN else NOT_FOUND
-        return {k: judge_apart(member, doubted) for k, member in members.items()}
+        is_any_sure = any(member.alone.status == LOCALIZED for member in members.values())
+        reason = DOUBTED if is_any_sure and len(members) > 1 else NOT_FOUND
+        return {k: judge_apart(member, reason) for k, member in members.items()}
     supports = tested[best]
     agreed = agree(members, bundles[best], supports, errors)
     if isinstance(agreed, str):
@@ -274,15 +275,16 @@ def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
 def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
-    The photos are independent evidence. Those that have missed a pose count as one: bare walls and changed
-    places lie together. Photos that have found the same pose of the bundle are more than chance, if they are
+    The photos are independent evidence. A third of them may show nothing or not belong to the others. If more
+    have missed a pose, these count as one: bare walls and changed places lie together. Photos that have found the same pose of the bundle are more than chance, if they are
     more than chance would give among all poses that were proposed. If the relative poses are wrong, each
     photo may have any of its own poses; that counts as none.
     """
     num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []
     for of_one in tested:
-        missed = np.log([(s.odds + MISSED) / (s.odds + 1.0) for s in of_one]).min()
+        odds_of_seen = sorted(s.odds for s in of_one)[int(len(of_one) * MOST_UNSEEN) :]
+        missed = min(math.log((o + MISSED) / (o + 1.0)) for o in odds_of_seen)
         gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE)
         coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
         of_photos = sum(math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
@@ -392,7 +394,8 @@ def judge_member(
     placed = [score_pose(query, bundle.place(member.cam_from_bundle)) for bundle in elsewhere]
     selection = Selection(score_pose(query, gaussian.pose), tuple(placed))
     result = judge_together(query, selection, fit, gaussian, p)
-    return replace(result, warnings=result.warnings + agreed.warnings)
+    doubts = (UNSEEN,) if right < EVEN else ()
+    return replace(result, warnings=result.warnings + doubts + agreed.warnings)
 
 
 def recalibrate_at(member: Member, support: Support) -> tuple[Query, FocalFit | None]:
