@@ -1,7 +1,6 @@
 """A photo localized beside another: matches, the covariance of their pose, and the average of poses."""
 
 import functools
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -9,16 +8,15 @@ import pytest
 import rooms
 from test_verification import NUM_POINTS, SETTINGS, _beside, _narrow, _query, _true_pose
 
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose
+from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
 from piccolo.localization.beside import Beside, Picture, fuse, localize_beside, match_covariance
-from piccolo.localization.bundle import ROBUST, subtract
 from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
 from piccolo.localization.selection import NOTHING
@@ -82,40 +80,43 @@ def test_the_covariance_of_matches_is_that_of_poses_found_by_them(noise, count):
     assert 3.0 < np.median(squares) < 9.0  # of 6 parameters 5.3
 
 
+def _at(pose, std):
+    """A pose in the map with its own error [m], none in common."""
+    return PoseGaussian(pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
+
+
+def _fused(judged, of_photo, settings=SETTINGS, fit=None):
+    """The mean of a result's pose and that by a photo beside, at the true pose."""
+    matches = _matches_of(_true_pose(), 1e-3, np.random.default_rng(1))
+    located = verification.Located(_beside().keypoints, _beside().ranges, of_photo.pose)
+    other = Beside("b", Picture(located, 0.99, of_photo), matches, _true_pose())
+    return fuse(judged, other, Found(replace(_query(), settings=settings), NOTHING, fit))
+
+
 def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     """By their covariances; not if it is ruled out, nor against a prior."""
-    rng = np.random.default_rng(1)
-    scan_map = rooms.scan_map(1, NUM_POINTS)
     true = _true_pose()
-    here = scan_map.to_world(true)
-    off = Pose(here.R_cam_from_world, here.center_world + np.array([0.09, 0.0, 0.0]))
-    wide, narrow = (PoseCovariance(np.diag([1e-6] * 3 + [s**2] * 3), "x") for s in (0.05, 0.01))
-    judged = Localization("not_localized", 0.8, 0.2, off, covariance=wide)
-    picture = Picture(verification.Located(_beside().keypoints, _beside().ranges, true), 0.99, narrow)
-    other = Beside("b", picture, _matches_of(true, 1e-3, rng), true)
-    ended = Found(_query(), NOTHING, None)
-    fused = fuse(judged, other, ended, scan_map)
-    distance = rooms.errors(fused.pose, here)[0]
-    assert distance == pytest.approx(0.09 * 0.01**2 / (0.05**2 + 0.01**2), rel=0.3)
-    assert fused.covariance.largest_std < 0.0105
-    assert fused.confidence == pytest.approx(0.8 * math.erf(10.0 / 2**0.5) / math.erf(2.0 / 2**0.5), rel=1e-3)
-    assert fused.confidence + fused.probability_none == pytest.approx(1.0)
-    sure = PoseCovariance(np.diag([1e-6] * 3 + [0.01**2] * 3), "x")
-    apart = fuse(replace(judged, covariance=sure), other, ended, scan_map)
-    assert rooms.errors(apart.pose, here)[0] == pytest.approx(0.045, abs=0.004)
-    excess = 0.09**2 / (2.0 * 0.01**2) - ROBUST + 1.0
-    assert apart.covariance.largest_std == pytest.approx(0.01 * (excess / 2.0) ** 0.5, rel=0.1)
-    assert apart.confidence < 0.8
-    for same in (replace(judged, confidence=0.0), replace(judged, covariance=None)):
-        assert fuse(same, other, ended, scan_map) is same
-    away = replace(SETTINGS, prior=Prior(near_world=(*(here.center_world[:2] + 5.0), None), radius=0.5))
-    against = Found(replace(_query(), settings=away), NOTHING, None)
-    assert fuse(judged, other, against, scan_map) is judged
+    off = Pose(true.R_cam_from_world, true.center_world + np.array([0.09, 0.0, 0.0]))
+    judged = Localization("not_localized", 0.8, 0.2, off, gaussian=_at(off, 0.05))
+    fused = _fused(judged, _at(true, 0.01))
+    expected = 0.09 * 0.01**2 / (0.05**2 + 0.01**2)
+    assert fused.pose.distance(true) == pytest.approx(expected, rel=0.3)
+    assert fused.largest_std < 0.0105
+    apart = _fused(replace(judged, gaussian=_at(off, 0.01)), _at(true, 0.01))
+    assert apart.pose.distance(true) == pytest.approx(0.045, abs=0.004)
+    excess = 0.09**2 / (2.0 * 0.01**2) - LIKELY + 1.0
+    assert apart.largest_std == pytest.approx(0.01 * (excess / 2.0) ** 0.5, rel=0.1)
+    assert _fused(replace(judged, is_ruled_out=True), _at(true, 0.01)) is None
+    assert _fused(replace(judged, gaussian=None), _at(true, 0.01)) is None
+    here = rooms.scan_map(1, NUM_POINTS).to_world(true).center_world
+    away = replace(SETTINGS, prior=Prior(near_world=(*(here[:2] + 5.0), None), radius=0.5))
+    assert _fused(judged, _at(true, 0.01), away) is None
     motion = np.zeros((6, 1))
     motion[3] = 1.0
     fit = FocalFit(np.zeros(1), np.array([[0.03**2]]), motion, 0.0)
-    widened = fuse(judged, other, ended._replace(fit=fit), scan_map)
-    assert 0.03 < widened.covariance.largest_std < 0.033, "the focal length's error is common"
+    of_camera = fit.pose_covariance
+    widened = _fused(replace(judged, gaussian=_at(off, 0.05).widen(of_camera)), _at(true, 0.01), fit=fit)
+    assert 0.03 < widened.largest_std < 0.033, "the focal length's error is common"
 
 
 def replace_keypoints(located, kept):

@@ -42,7 +42,7 @@ WHERE = (1, 2, 7)  # eighths of a turn; the first photo shows a bare wall
 
 
 def _support(odds, elsewhere=0.0, is_found=True):
-    return Support(at(0.0, 0.5), is_found, odds, elsewhere)
+    return Support(at(0.0, 0.5), None, is_found, odds, elsewhere, 100)
 
 
 def _alone(*probabilities):
@@ -103,7 +103,9 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
 
 def test_a_photo_belongs_to_the_others_or_does_not():
     assert _support(30.0).shares.argmax() == 0
-    assert _support(0.5).shares[0] > 0.9, "found by itself where the others are"
+    assert _support(30.0).shares[0] > 0.95
+    assert 0.7 < _support(0.1).shares[0] < 0.9, "it shows the place, but its own pose may be a little off"
+    assert _support(0.1).shares[:2].sum() > 0.95
     assert MISSES.shares.argmax() == 1, "shows nothing"
     assert MISSES.shares[1] < 0.9, "so it may be of another place"
     assert _support(0.0, 30.0, is_found=False).shares.argmax() == 3, "it is surely elsewhere"

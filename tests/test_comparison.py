@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 import rooms
 from measuring.confidence import mask_outside_field, occlude
-from piccolo.localization.verdict import is_mirrored
 
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
-from piccolo.localization import verdict
+from piccolo.localization import judge as judging
 from piccolo.localization.comparison import (
     CONTRADICTS,
     Comparison,
@@ -24,6 +23,7 @@ from piccolo.localization.comparison import (
     sample_photo,
     score_pose,
 )
+from piccolo.localization.judge import is_mirrored
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.verification import count_agreeing
@@ -213,5 +213,5 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg):
 def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(monkeypatch, score, expected):
     """The mirrored photo has more matches, as in a place that looks alike in a mirror."""
     turned_over = _query(rooms.query(1).rgb[:, ::-1].copy())
-    monkeypatch.setattr(verdict, "refine_matches", lambda query, poses: [Hypothesis(poses[0], score)])
+    monkeypatch.setattr(judging, "refine_matches", lambda query, poses: [Hypothesis(poses[0], score)])
     assert is_mirrored(turned_over, Hypothesis(_clean()[1], 0.5)) == expected

@@ -16,12 +16,7 @@ from piccolo.geometry.pose import exp_so3, step
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 
-
-def _covariance(std):
-    return PoseCovariance(np.diag([1e-8] * 3 + [std**2] * 3), "")
-
-
-SURE = _covariance(0.002)
+SURE = 0.002  # [m] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60), Standing(1.0, 0.03, 3)
 ELSEWHERE = Standing(0.1, 0.05, 3)
 MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
@@ -29,7 +24,7 @@ MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
 
 def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
-    p = posterior([Standing(1.0, 0.5, 12), Standing(0.5, 0.1, 2)], _covariance(0.01), MODEL)
+    p = posterior([Standing(1.0, 0.5, 12), Standing(0.5, 0.1, 2)], 0.01, model=MODEL)
     e = math.exp
     odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
     doubt = math.erf(0.1 / (0.01 * math.sqrt(2.0)))
@@ -61,7 +56,7 @@ def test_each_kind_of_evidence_has_a_model_of_its_own():
         model = rule.MODELS[standing.kind]
         expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0
         assert rule.log_odds(standing._replace(log_prior=-2.0)) == pytest.approx(expected)
-        np.testing.assert_array_equal(posterior([standing], SURE), posterior([standing], SURE, model))
+        np.testing.assert_array_equal(posterior([standing], SURE), posterior([standing], SURE, model=model))
     assert classify(posterior([RIGHT._replace(num_matches=None)], SURE), 0.9) == rule.LOCALIZED
     p = posterior([WRONG._replace(num_matches=None)], None)
     assert classify(p, 0.9) == rule.NOT_LOCALIZED
@@ -88,15 +83,15 @@ def test_more_evidence_is_more_probability(name, more):
 @pytest.mark.parametrize(("std", "most"), [(0.05, 0.954), (0.1, 0.683), (0.3, 0.261)])
 def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
     """The part of a normal distribution within 0.1 m."""
-    p = posterior([RIGHT._replace(num_matches=10**7)], _covariance(std))
+    p = posterior([RIGHT._replace(num_matches=10**7)], std)
     assert p[0] == pytest.approx(most, abs=0.002)
     assert p.sum() == pytest.approx(1.0)
 
 
 @pytest.mark.parametrize(("a", "b"), [(1.0, 50.0), (0.003, 0.001)])
 def test_numbers_beyond_reason_change_nothing_more(a, b):
-    np.testing.assert_array_equal(*(rule.none_features(_covariance(std)) for std in (a, b)))
-    assert (rule.none_features(None) == rule.none_features(_covariance(0.3))).all()
+    np.testing.assert_array_equal(*(rule.none_features(std) for std in (a, b)))
+    assert (rule.none_features(None) == rule.none_features(0.3)).all()
     least, less = Standing(0.0, 0.02, 0), Standing(-0.5, -0.3, 0)
     faint, nothing = (rule.pose_features(standing) for standing in (least, less))
     np.testing.assert_array_equal(faint, nothing)

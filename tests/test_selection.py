@@ -10,7 +10,8 @@ from made_up import at, compared, place, places
 
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.occlusion import Agreement
-from piccolo.localization import last_descent, refinement, selection, verdict
+from piccolo.localization import judge as judging
+from piccolo.localization import last_descent, refinement, selection
 from piccolo.localization.last_descent import refine_to_the_end
 from piccolo.localization.selection import Selection
 
@@ -176,7 +177,7 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
         asked.append(place(pose))
         return [copies[place(other)] for other in others]
 
-    monkeypatch.setattr(verdict, "find_copies", find_copies)
+    monkeypatch.setattr(judging, "find_copies", find_copies)
     best, *others = (at(x, 0.0) for x in (0.0, 1.0, 2.0, 3.0))
     standings = [Standing(1.0, 0.5, n, is_drawn=True) for n in (12, 3, 4, 20)]
     for is_partial, num_parts, expected in (
@@ -185,7 +186,7 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
         (True, 0, [12, 3, 4, 20]),
     ):
         query = SimpleNamespace(photo=SimpleNamespace(is_partial=is_partial), num_parts=num_parts)
-        found = verdict.credit_copies(standings, verdict.list_copies(query, best, others))
+        found = judging.credit_copies(standings, judging.list_copies(query, best, others))
         assert [s.num_matches for s in found] == expected
     assert asked == [0.0]
 
@@ -197,6 +198,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     query = compared(monkeypatch, explains, counts)
     photo = SimpleNamespace(given=None, panorama=None, colors=lambda: None, is_partial=False)
     query = replace(query, photo=photo, cache=replace(query.cache, views=around))
+    query.scan_map.R_map_from_world = np.eye(3)
     for name, value in {
         "visible_points": lambda *_: None,
         "sampling_loss": lambda *_: 0.07,
@@ -206,9 +208,9 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "estimate_covariance": lambda *_: None,
         "is_mirrored": lambda *_: False,
     }.items():
-        monkeypatch.setattr(verdict, name, value)
+        monkeypatch.setattr(judging, name, value)
     alternatives = at(1.0, 0.3), at(2.0, 0.2)
-    found = verdict.judge(query, Selection(at(0.0, 0.6), alternatives, 0.7))
+    found = judging.judge(query, Selection(at(0.0, 0.6), alternatives, 0.7))
     e = found.evidence
     assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
     assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
@@ -221,7 +223,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
     assert sum(stated) == pytest.approx(1.0)
     assert stated[0] > stated[1] > stated[2]
-    alone = verdict.judge(query, Selection(at(0.0, 0.6), ()))
+    alone = judging.judge(query, Selection(at(0.0, 0.6), ()))
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
-    monkeypatch.setattr(verdict, "sampling_loss", lambda *_: np.inf)
-    assert verdict.judge(query, Selection(at(0.0, 0.6), ())).pose is None
+    monkeypatch.setattr(judging, "sampling_loss", lambda *_: np.inf)
+    assert judging.judge(query, Selection(at(0.0, 0.6), ())).pose is None

@@ -7,9 +7,9 @@ from rooms import write_room
 
 import piccolo
 from piccolo.batch.frame_times import times_of
-from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
+from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.optimize.smoothing import smooth_positions
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
@@ -24,7 +24,7 @@ def _located(centers, stds, coupling=0.0):
         matrix = np.diag([0.01**2] * 3 + [std**2] * 3)
         for k in range(3):
             matrix[k, 3 + k] = matrix[3 + k, k] = coupling * 0.01 * std
-        found.append((Pose(TURN, np.array(center, float)), PoseCovariance(matrix, "")))
+        found.append(PoseGaussian(Pose(TURN, np.array(center, float)), matrix, np.zeros((6, 6))))
     return found
 
 
@@ -36,8 +36,8 @@ def _dense(located, times, s):
         A[k, k : k + 3] = (
             2.0 / (before + after) * np.array([1 / before, -1 / before - 1 / after, 1 / after]) / s
         )
-    own = np.diag([1.0 / c.matrix[3, 3] for _, c in located])
-    centers = np.array([pose.center_world for pose, _ in located])
+    own = np.diag([1.0 / one.own[3, 3] for one in located])
+    centers = np.array([one.pose.center_world for one in located])
     covariance = np.linalg.inv(own + A.T @ A)
     return covariance @ own @ centers, covariance
 
@@ -48,8 +48,8 @@ def test_positions_and_deviations_are_those_of_dense_least_squares():
     located = _located(rng.normal(0.0, 0.3, (12, 3)) + times[:, None], rng.uniform(0.01, 0.4, 12))
     centers, covariance = _dense(located, times, MAX_ACCELERATION)
     found = smooth_positions(located, times, MAX_ACCELERATION, MAX_SPEED)
-    np.testing.assert_allclose([pose.center_world for pose, _ in found], centers, atol=1e-8)
-    variances = [c.matrix[4, 4] for _, c in found]
+    np.testing.assert_allclose([one.pose.center_world for one in found], centers, atol=1e-8)
+    variances = [one.own[4, 4] for one in found]
     np.testing.assert_allclose(variances, np.diag(covariance), rtol=1e-8)
 
 
@@ -58,12 +58,30 @@ def test_an_uncertain_frame_comes_to_the_others_and_turns_with_its_place():
     centers = np.outer(times, [1.0, 0.0, 0.0])
     centers[2, 1] += 0.2
     located = _located(centers, [0.005, 0.005, 0.3, 0.005, 0.005], coupling=0.9)
-    pose, covariance = smooth_positions(located, times, MAX_ACCELERATION, MAX_SPEED)[2]
+    found = smooth_positions(located, times, MAX_ACCELERATION, MAX_SPEED)[2]
+    pose = found.pose
     assert abs(pose.center_world[1]) < 0.02
-    assert covariance.std_mm[1] < 40.0
+    assert found.largest_std < 0.04
     turn = log_so3(pose.R_cam_from_world @ TURN.T)
     np.testing.assert_allclose(turn[1], 0.9 * 0.01 / 0.3 * (pose.center_world[1] - 0.2), rtol=1e-3)
-    assert np.linalg.eigvalsh(covariance.matrix)[0] > 0.0
+    assert np.linalg.eigvalsh(found.covariance)[0] > 0.0
+
+
+@pytest.mark.parametrize("rate", [2, 10, 30])
+def test_errors_of_the_scan_are_not_smoothed_away(rate):
+    """Chi square of positions whose errors of 9 mm are in common, and 4.4 mm their own."""
+    rng = np.random.default_rng(rate)
+    own, common = (np.diag([1e-8] * 3 + [std**2] * 3) for std in (0.0044, 0.009))
+    times = np.arange(40) / rate
+    path = np.outer(times, [0.5, 0.0, 0.0])
+    squares = []
+    for _ in range(100):
+        shift = 0.009 * rng.normal(size=3)
+        found = [PoseGaussian(Pose(TURN, c + shift + 0.0044 * rng.normal(size=3)), own, common) for c in path]
+        middle = smooth_positions(found, times, 2.0, MAX_SPEED)[20]
+        error = path[20] - middle.pose.center_world
+        squares.append(error @ np.linalg.solve(middle.covariance[3:, 3:], error) / 3.0)
+    assert 0.7 < np.mean(squares) < 1.5
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])
@@ -75,7 +93,7 @@ def test_few_frames_stay_as_they_are(count):
 def test_frames_far_apart_say_nothing_of_each_other():
     located = _located([[0, 0, 0], [0, 1, 0], [0, 0, 0]], [0.1] * 3)
     found = smooth_positions(located, [0.0, 10.0, 20.0], MAX_ACCELERATION, MAX_SPEED)
-    np.testing.assert_allclose([pose.center_world[1] for pose, _ in found], [0, 1, 0], atol=1e-12)
+    np.testing.assert_allclose([one.pose.center_world[1] for one in found], [0, 1, 0], atol=1e-12)
 
 
 def test_times_by_names_tables_and_exif(tmp_path):

@@ -38,6 +38,7 @@ from .comparison import score_pose
 from .covariance import estimate_covariance
 from .focal_length import FocalFit, calibrate
 from .judge import MOST_CONFLICT, judge, judge_together
+from .last_descent import HOPELESS_SCORE
 from .localize import find_pose
 from .query import Query
 from .refinement import descend_fine
@@ -47,7 +48,7 @@ from .verification import verify
 
 MISSED = 0.25  # chosen: of photos, those whose right pose is not found (BENCHMARK.md, phone photos: a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
-MISSED_HERE = 0.05  # chosen: of photos of the bundle, those that do not show where they are
+SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
 CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
 LEAST_NONE = 1e-6
 EVEN = 0.5
@@ -88,22 +89,25 @@ class Support(NamedTuple):
     """Evidence of a photo for a pose of the bundle."""
 
     own: Hypothesis  # its own pose there
+    gaussian: PoseGaussian | None  # that pose with its covariance; None where the points do not fix it
     is_found: bool  # by the photo alone
     odds: float  # of that pose, against that none of the photo's poses is right
     odds_elsewhere: float  # of the photo's other poses
+    num_places: int  # of the scan where a photo alone may be
 
     @property
     def weights(self) -> Array:
         """Odds (4,) that the own pose is right, that the photo misses its own, and that it does not belong.
 
-        The last are of no place in the scan, and of another pose of the photo. That a photo by itself finds a
-        pose where the others have it is no chance.
+        The last are of no place in the scan, and of another pose of the photo. The odds of a photo alone are
+        those of the best of all places; where the others say which place it is, they are as many times larger.
         """
         belongs = 1.0 - CONTRADICTED
-        gain = CHANCE if self.is_found else 1.0
-        of_others = [CONTRADICTED * gain, CONTRADICTED * gain * self.odds_elsewhere]
-        right = belongs * (1.0 - MISSED_HERE) * self.odds
-        return np.array([right, belongs * MISSED_HERE * gain, *of_others])
+        here = self.odds * self.num_places
+        missed = MISSED / (1.0 + self.odds)
+        right = belongs * (1.0 - missed) * here
+        of_others = [CONTRADICTED, CONTRADICTED * self.odds_elsewhere]
+        return np.array([right, belongs * (missed * here + SILENT), *of_others])
 
     @property
     def shares(self) -> Array:
@@ -256,11 +260,19 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     found = own or max(refine_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
-    std = std_of(member.alone.gaussian)
-    p = posterior(assess_poses(query, poses[0], poses[1:]), std, member.alone.std_of_fit)
+    gaussian = member.alone.gaussian
+    std_of_fit = member.alone.std_of_fit
+    if found is not member.selection.best and found.score > HOPELESS_SCORE:
+        gaussian = estimate_covariance(query, found.pose, member.fit is None)
+        std_of_fit = std_of(gaussian)
+        if gaussian is not None and member.fit is not None:
+            gaussian = gaussian.widen(member.fit.pose_covariance)
+    p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(gaussian), std_of_fit)
     k = next(k for k, h in enumerate(poses) if h is found)
     none = max(float(p[-1]), LEAST_NONE)
-    return Support(found, own is not None, float(p[k]) / none, float(p[:-1].sum() - p[k]) / none)
+    odds_elsewhere = float(p[:-1].sum() - p[k]) / none
+    num_places = len(query.scan_map.sparse)
+    return Support(found, gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places)
 
 
 def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
@@ -275,10 +287,11 @@ def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
 def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
-    The photos are independent evidence. A third of them may show nothing or not belong to the others. If more
-    have missed a pose, these count as one: bare walls and changed places lie together. Photos that have found the same pose of the bundle are more than chance, if they are
-    more than chance would give among all poses that were proposed. If the relative poses are wrong, each
-    photo may have any of its own poses; that counts as none.
+    The photos are independent evidence. A third of them may show nothing, or not belong to the others. If
+    more have missed a pose, these count as one: bare walls and changed places lie together. Photos that have
+    found the same pose of the bundle are more than chance, if they are more than chance would give among all
+    poses that were proposed. If the relative poses are wrong, each photo may have any of its own poses; that
+    counts as none.
     """
     num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []
@@ -301,14 +314,14 @@ def agree(
 ) -> Agreed | str:
     """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed."""
     own = {
-        k: estimate
+        k: Estimate(support.gaussian, members[k].cam_from_bundle)
         for k, support in supports.items()
-        if support.shares.argmax() == 0 and (estimate := estimate_own(members[k], support))
+        if support.shares.argmax() == 0 and support.gaussian is not None
     }
+    sure = [k for k, member in members.items() if member.alone.status == LOCALIZED]
     every = frozenset(own)
     while (out := find_contradicting(bundle, list(own.values()), errors)) is not None:
         del own[list(own)[out]]
-    sure = [k for k, member in members.items() if member.alone.status == LOCALIZED]
     if 2 * sum(k in own for k in sure) < len(sure) or not own:
         return DOUBTED if sure else NOT_FOUND
     estimates = list(own.values())
@@ -325,23 +338,14 @@ def agree(
     if errors.turn > TOLD * expected.turn or errors.move > TOLD * expected.move:
         text = f"{errors.move:.2f} m and {math.degrees(errors.turn):.1f} deg"
         warnings.append(f"`relative_poses`: they are off by about {text} each")
-    return Agreed(adjusted, errors, own, every - frozenset(own), tuple(warnings))
+    apart = (every - frozenset(own)) & frozenset(sure)
+    return Agreed(adjusted, errors, own, apart, tuple(warnings))
 
 
 def describe_scale(log_scale: float) -> str:
     """Return by how much positions are too long or too short that are to be multiplied by a scale."""
     percent = 100.0 * abs(math.expm1(-log_scale))
     return f"{percent:.0f} % too {'short' if log_scale > 0.0 else 'long'}"
-
-
-def estimate_own(member: Member, support: Support) -> Estimate | None:
-    """Return a photo's own pose with its covariance; None where the points do not fix it."""
-    gaussian = member.alone.gaussian
-    if gaussian is None or support.own is not member.selection.best:
-        gaussian = estimate_covariance(member.query.forget(), support.own.pose, member.fit is None)
-        if gaussian is not None and member.fit is not None:
-            gaussian = gaussian.widen(member.fit.pose_covariance)
-    return None if gaussian is None else Estimate(gaussian, member.cam_from_bundle)
 
 
 def judge_apart(member: Member, reason: str) -> Localization:
