@@ -29,7 +29,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) 
     """
     given: dict[str, Any] = {}
     for name, kind in inspect.get_annotations(function).items():
-        if name == "return" or values[name] is None:
+        if name == "return" or (values[name] is None and is_of_kind(None, kind)):
             continue
         if not is_of_kind(values[name], kind):
             raise InputError(f"`{name}`: found {describe_value(values[name])}, wanted {describe(kind)}")

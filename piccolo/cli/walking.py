@@ -72,10 +72,10 @@ def walk_frames(
     """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
     if arguments.video is None:
         times = times_of(panoramas, arguments.times)
-        numbers = times or [float(k) for k in range(len(panoramas))]
-        frames = [WalkInput(path, time, str(path)) for path, time in zip(panoramas, numbers, strict=True)]
+        clock = times or [float(k) for k in range(len(panoramas))]
+        frames = [WalkInput(path, t - clock[0], str(path)) for path, t in zip(panoramas, clock, strict=True)]
         motion = Motion(arguments.max_speed, is_timed=times is not None)
-        yield add_odometry(frames, arguments.odometry), motion
+        yield add_odometry(frames, arguments.odometry, times), motion
         return
     with temporary_folder() as folder:
         found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
@@ -85,11 +85,14 @@ def walk_frames(
         yield add_odometry(frames, arguments.odometry), Motion(arguments.max_speed)
 
 
-def add_odometry(frames: list[WalkInput], path: Path | None) -> list[WalkInput]:
-    """Return the frames with their poses in an odometry, if there is one."""
+def add_odometry(
+    frames: list[WalkInput], path: Path | None, clock: Sequence[float] | None = None
+) -> list[WalkInput]:
+    """Return the frames with their poses in an odometry, if there is one; `clock` has their times [s]."""
     if path is None:
         return frames
-    poses = read_odometry(path, [frame.path for frame in frames], [frame.time for frame in frames])
+    times = clock or [frame.time for frame in frames]
+    poses = read_odometry(path, [frame.path for frame in frames], times, clock is not None)
     return [frame._replace(odometry=pose) for frame, pose in zip(frames, poses, strict=True)]
 
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
-from ..geometry.pose import Array, rotate_points
+from ..geometry.pose import MAX_COORDINATE, Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
 from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness
@@ -19,7 +19,6 @@ from .settings import Channel, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
-MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
 MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
 METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
 FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
@@ -211,6 +210,8 @@ def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | N
     if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted arrays of shape (N, 3)")
+    if points.dtype.kind not in "fiu":
+        raise InputError(f"points: found {points.dtype}, wanted numbers")
     given = np.full(points.shape, GRAY, np.uint8) if colors is None else colors
     brightest = find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
     chunk = next(iter(color_chunks([(points, given)], brightest, lambda row: f"{ARRAYS}, row {row}")))
