@@ -80,11 +80,11 @@ def test_frames_far_apart_say_nothing_of_each_other():
 
 def test_times_by_names_tables_and_exif(tmp_path):
     frames = [tmp_path / f"walk_{text}.jpg" for text in ("10.5", "11", "13.25")]
-    assert times_of(frames, "names") == [0.0, 0.5, 2.75]
+    assert times_of(frames, "names") == [10.5, 11.0, 13.25]
     assert times_of(frames, "order") is None
     assert times_of(frames, None) is None  # no file, no EXIF
     (tmp_path / "t.csv").write_text("name,time\nwalk_10.5.jpg,3\nwalk_11.jpg,4\n")
-    assert times_of(frames[:2], str(tmp_path / "t.csv")) == [0.0, 1.0]
+    assert times_of(frames[:2], str(tmp_path / "t.csv")) == [3.0, 4.0]
     with pytest.raises(InputError, match=r"t\.csv: found no time of .*walk_13\.25\.jpg, wanted a CSV file"):
         times_of(frames, str(tmp_path / "t.csv"))
     (tmp_path / "t.csv").write_text("name,when\na,3\n")

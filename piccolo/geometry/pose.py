@@ -168,7 +168,8 @@ def check_pose(pose: object, label: str, tolerance: float = MAX_SKEW) -> Pose:
     parts = pose.R_cam_from_world, pose.center_world
     is_numeric = all(isinstance(part, np.ndarray) and part.dtype.kind in "fiu" for part in parts)
     if not is_numeric or [part.shape for part in parts] != [(3, 3), (3,)]:
-        found = ", ".join(f"{type(part).__name__} {getattr(part, 'shape', '')}".strip() for part in parts)
+        kinds = [(getattr(part, "dtype", type(part).__name__), getattr(part, "shape", "")) for part in parts]
+        found = " and ".join(f"{kind} {shape}".strip() for kind, shape in kinds)
         raise InputError(f"{label}: found {found}, wanted arrays of numbers, (3, 3) and (3,)")
     R, center = (np.array(part, np.float64, order="C") for part in parts)
     if not np.abs(center).max() <= MAX_COORDINATE:  # NaN is not either
