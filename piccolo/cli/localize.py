@@ -7,7 +7,7 @@ import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -29,6 +29,7 @@ from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
 from ..localization.focal_length import WIDE
 from ..localization.settings import CoarseToFineSettings
+from ..localization.verdict import MIRRORED
 from ..opened_scan import OpenedScan
 from ..panorama.cube import is_cube
 from ..panorama.photo import sha256_of
@@ -56,6 +57,11 @@ from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
 from .walking import check_walk_options, run_walk, walk_frames
 
+SEVERAL = 3  # photos that fit mirrored, while none is localized: the scan is
+LEFT_HANDED = (
+    "{} photos fit the scan mirrored and none as it is: its axes are probably left-handed, which `up` can't "
+    "mend; negate one of its coordinates, or export it with right-handed axes"
+)
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
@@ -73,6 +79,7 @@ class Run:
     left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
+    mirrored: set[str] = field(default_factory=set)  # photos that fit the scan better mirrored
 
     @property
     def looks_again(self) -> bool:
@@ -231,6 +238,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     print_result(arguments, result, answer.warnings)
     write(result.to_json())
     run.counts[result.status] += 1
+    if MIRRORED in result.warnings:
+        run.mirrored.add(result.pano)
 
 
 def localize_all(
@@ -301,6 +310,8 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
         note = f"{counts.total()} photos in {seconds:.0f} s: {words}{again}"
         dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
+    if len(run.mirrored) >= SEVERAL and not counts[LOCALIZED]:
+        print_note(arguments, LEFT_HANDED.format(len(run.mirrored)))
     if interruption.number:
         return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
     if run.total is None:

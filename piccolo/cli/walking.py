@@ -22,7 +22,7 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
-from ..result import FAILED
+from ..result import FAILED, UNREADABLE
 from ..scan_walk import Walk
 from ..walk.motion import Motion
 from .command import check_alone, check_only_with
@@ -33,6 +33,7 @@ from .progress import progress_bar, show_progress
 
 ONLY_WITH = ("times", "max_speed", "odometry")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
+NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
 KEY_BEGINS = b'{"'
 
 
@@ -139,12 +140,25 @@ def follow_all(arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkI
             pairs = show_progress(prepared, arguments.quiet, **bar)
             for frame, wait in interruption.each(pairs) if file else pairs:
                 result = walk.follow(wait(), frame.time, frame.odometry)
+                if result.status == UNREADABLE and frame is frames[0]:
+                    check_others(walk, frames, str(result.error), path)
                 if result.error is not None:
                     print_error(arguments, result.error, EXIT_BAD_INPUT)
                 if file is not None:
                     file.append(walk.last_to_json())
         pool.shutdown(cancel_futures=True)
     return interruption
+
+
+def check_others(walk: Walk, frames: Sequence[WalkInput], error: str, path: Path | None) -> None:
+    """Refuse a walk whose first frames, and the last, can't be read for one reason; nothing is kept."""
+    others = [*frames[1:NUM_TRIED], frames[-1]]
+    found = (str(walk.prepare(other.path, other.name).blank.error) for other in others)
+    is_same = (text.replace(o.name, frames[0].name) == error for text, o in zip(found, others, strict=True))
+    if len(frames) > NUM_TRIED and all(is_same):
+        if path:
+            path.unlink()
+        raise InputError(f"{error}; the other {len(frames) - 1} frames seem no better")
 
 
 def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, is_new: bool) -> None:
