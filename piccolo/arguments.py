@@ -94,7 +94,7 @@ def describe_value(value: object) -> str:
     """Return a value as text for a message: of an array, dtype and shape."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
