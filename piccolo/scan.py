@@ -394,6 +394,6 @@ class Scan:
         if prior := {name: given[name] for name in PRIOR_FIELDS & given.keys()}:
             settings["prior"] = known = make_prior(prior, opened.settings)
             if "heading_tolerance_deg" in prior and known.heading_deg is None:
-                raise InputError("`heading_tolerance_deg`: found no `heading_deg`, wanted both or none")
+                raise InputError("`heading_tolerance_deg`: only with `heading_deg`")
         read_options = ReadOptions(labels=opened.cloud_settings.labels, **reading)
         return read_options, replace_settings(opened.settings, settings), is_masked

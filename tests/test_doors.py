@@ -4,6 +4,7 @@ import dataclasses
 import json
 import math
 
+import cv2
 import numpy as np
 import pytest
 import rooms
@@ -13,11 +14,14 @@ from test_result import RESULT
 
 import piccolo
 from piccolo import InputError, Pose, Result
+from piccolo.cli import localize as localize_command
+from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.geometry.sphere import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
+from piccolo.result import read_results
 from piccolo.scan_map.prior import GpsPrior
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 from piccolo.walk.path import Gap
@@ -89,6 +93,26 @@ def test_a_pose_passes_with_every_bit_and_is_a_copy(w, center):
     assert whole_numbers.center_world.dtype == whole_numbers.R_cam_from_world.dtype == np.float64
 
 
+def test_a_left_handed_scan_is_named_at_the_end_of_a_batch(tmp_path, capsys):
+    """Its photos are localized mirrored; where one is localized as it is, nothing is tried."""
+    cloud = rooms.room(1)[1]
+    points = cloud.points.astype(np.float64) + cloud.origin_world
+    photos = []
+    for k in range(3):
+        photos.append(str(tmp_path / f"{k}.png"))
+        cv2.imwrite(photos[-1], rooms.query(1, index=k).rgb[..., ::-1])
+    for name, flip in (("right", 1.0), ("left", -1.0)):
+        write_ply(tmp_path / f"{name}.ply", vertex_rows(points * [1.0, flip, 1.0], cloud.colors))
+        words = ["--cloud", str(tmp_path / f"{name}.ply"), "--cache", str(tmp_path), "--gravity", "known"]
+        words += ["--jobs", "1", "--out", str(tmp_path / name), "--pano", *photos]
+        code = localize_command.main(words)
+        err = capsys.readouterr().err
+        notes = [line for line in err.splitlines() if "are left-handed" in line]
+        assert (code, len(notes)) == ((0, 0) if flip > 0.0 else (1, 1)), err
+    assert "which --up can't mend" in notes[0]
+    assert len(read_results([tmp_path / "left"])) == 3
+
+
 def test_a_pixel_that_is_no_number_is_no_index():
     """The kernels themselves survive poses that no door lets in."""
     octree = rooms.packed(1)
@@ -125,7 +149,7 @@ def test_the_whole_part_of_a_pixel_is_as_before(u):
         (lambda s: s.localize_walk(["a"], max_acceleration=None), "^`max_acceleration`: found None"),
         (lambda s: s.track().add(None), "^`frame`: found None, wanted a path or an array"),
         (lambda s: s.track().add("a.jpg", "soon"), "^`time`: found 'soon', wanted a number"),
-        (lambda s: s.localize("a.jpg", heading_tolerance_deg=5.0), "^`heading_tolerance_deg`: found no"),
+        (lambda s: s.localize("a.jpg", heading_tolerance_deg=5.0), "^`heading_tolerance_deg`: only with"),
         (lambda s: s.save("no folder/a.piccolo-map"), "^no folder/a.piccolo-map: found no folder"),
         (lambda s: Result.from_json("{}"), "^result: found no format, wanted 'piccolo-pose/"),
         (lambda s: Result.from_json("[]"), "^result: found no format, wanted 'piccolo-pose/"),

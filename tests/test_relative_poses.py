@@ -8,6 +8,7 @@ import pytest
 from poses import SIZE, result, tilted_poses
 from refusals import assert_refused
 
+from piccolo.batch.frame_times import times_of
 from piccolo.batch.relative_poses import read_odometry, read_relative_poses
 from piccolo.errors import InputError
 from piccolo.scenes.export import Options, export
@@ -179,6 +180,47 @@ def test_an_odometry_of_more_poses_is_matched_by_time_or_name(tmp_path):
     found = read_odometry(tmp_path / "transforms.json", [Path("a/2.jpg"), Path("a/9.jpg")], [0.0, 1.0])
     _assert_same(found[:1], [POSES[2]])
     assert found[1] is None
+
+
+CLOCK = 1311868164.0  # [s] as frames and trajectories of TUM have it
+
+
+def _trajectory(path, clock):
+    """At each time of a clock, so many seconds after its beginning, a pose so many metres along x."""
+    return _write(path, "".join(f"{t:.6f} {t - clock[0]:.6f} 0 0 0 0 0 1\n" for t in clock))
+
+
+def test_frames_take_the_poses_of_their_clock(tmp_path):
+    frames = [Path(f"{CLOCK + 0.5 * k:.6f}.jpg") for k in range(6)]
+    times = times_of(frames, "names")
+    steps = CLOCK - 3.0 + 0.1 * np.arange(90)
+    found = read_odometry(_trajectory(tmp_path / "tum.txt", steps), frames, times)
+    np.testing.assert_allclose([pose.center_world[0] for pose in found], 3.0 + 0.5 * np.arange(6), atol=1e-5)
+    # as many poses as frames, but begun a second before: the last frames have none
+    path = _trajectory(tmp_path / "tum.txt", CLOCK - 1.0 + 0.5 * np.arange(6))
+    found = read_odometry(path, frames, times)
+    assert [pose and pose.center_world[0] for pose in found] == [1.0, 1.5, 2.0, 2.5, None, None]
+
+
+def test_a_trajectory_that_begins_with_the_first_frame_is_matched_by_the_time_since(tmp_path):
+    path = _trajectory(tmp_path / "tum.txt", 0.1 * np.arange(30))
+    for times, has_clock in ((CLOCK + 0.5 * np.arange(6), True), (0.5 * np.arange(6), False)):
+        found = read_odometry(path, [Path("a.jpg")] * 6, times, has_clock)
+        assert [pose.center_world[0] for pose in found] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
+
+
+def test_one_clock_goes_before_the_time_since_the_first_frame(tmp_path):
+    """An odometry that was begun 10 s before the first frame is not shifted by them."""
+    path = _trajectory(tmp_path / "tum.txt", 0.5 * np.arange(40))
+    found = read_odometry(path, [Path("a.jpg")] * 3, [10.0, 10.5, 11.0])
+    assert [pose.center_world[0] for pose in found] == [10.0, 10.5, 11.0]
+
+
+def test_frames_without_a_clock_are_taken_in_order(tmp_path):
+    """Their numbers are no seconds."""
+    path = _trajectory(tmp_path / "tum.txt", 1.1 * np.arange(10))
+    found = read_odometry(path, [Path("a.jpg")] * 10, np.arange(10.0), has_clock=False)
+    np.testing.assert_allclose([pose.center_world[0] for pose in found], 1.1 * np.arange(10), atol=1e-6)
 
 
 def test_what_is_no_odometry_of_the_frames_is_refused(tmp_path):

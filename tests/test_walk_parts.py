@@ -1,9 +1,12 @@
 """Parts of a walk: positions smoothed together, times from names, tables and EXIF, frames read again."""
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 from rooms import write_room
+from test_gps import write_photo
 
 import piccolo
 from piccolo.batch.frame_times import times_of
@@ -96,6 +99,33 @@ def test_times_by_names_tables_and_exif(tmp_path):
         times_of([tmp_path / "walk.jpg"], "names")
     with pytest.raises(InputError, match=r"^`times` exif: found a frame without a time in EXIF"):
         times_of(frames, "exif")
+
+
+@pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/New_York"])
+def test_times_of_exif_are_those_of_no_machine(tmp_path, monkeypatch, zone):
+    """An hour that summer time repeats or leaves out folds no walk."""
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    spring = "2026:03:29 01:59:50", "2026:03:29 02:00:10", "2026:03:29 03:00:10"
+    autumn = "2026:10:25 01:59:50", "2026:10:25 02:30:10", "2026:10:25 03:00:10"
+    moved = "2026:05:01 10:00:00", "2026:05:01 09:00:02", "2026:05:01 10:00:05"
+    walks = {
+        "spring": (spring, ("", "", ""), 3600.0),
+        "autumn": (autumn, ("", "", ""), 1800.0),
+        "two zones": (moved, ("+02:00", "+01:00", "+02:00"), 3.0),
+        "one without": (spring, ("+02:00", "", "+02:00"), 3600.0),
+    }
+    rgb = np.zeros((8, 16, 3), np.uint8)
+    for name, (stamps, offsets, last_step) in walks.items():
+        frames = [
+            write_photo(tmp_path / f"{name} {k}.jpg", rgb, time=(stamp, "", offset))
+            for k, (stamp, offset) in enumerate(zip(stamps, offsets, strict=True))
+        ]
+        found = times_of(frames, None)
+        assert found is not None
+        assert found[2] - found[1] == last_step
+    monkeypatch.undo()
+    time.tzset()
 
 
 def test_a_frame_that_is_gone_or_another_is_not_read_again(tmp_path):

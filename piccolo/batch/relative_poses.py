@@ -9,8 +9,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.json_file import DAMAGE, describe, read_json, read_text
-from ..geometry.pose import Array, Pose, rotation_from_quaternion_wxyz
-from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, pose_of_transform
+from ..geometry.pose import Array, Pose, check_transform, rotation_from_quaternion_wxyz
+from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
 
 WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio, or a TUM trajectory, in metres"
 ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
@@ -82,9 +82,9 @@ def read_odometry(
 def match_times(clock: Array, times: Array, has_clock: bool, is_in_order: bool) -> list[int | None]:
     """Return the number of each frame's row: by a clock, or else in order or since the first."""
     numbers = find_nearest(clock if has_clock else clock[:0], times)
-    if is_in_order:
-        return [*range(len(times))] if None in numbers else numbers
-    return numbers if any(k is not None for k in numbers) else find_nearest(clock, times - times[0])
+    if any(k is not None for k in numbers):
+        return numbers
+    return [*range(len(times))] if is_in_order else find_nearest(clock, times - times[0])
 
 
 def find_nearest(clock: Array, times: Array) -> list[int | None]:
@@ -109,7 +109,7 @@ def naming(path: Path, wanted: str) -> Iterator[None]:
 
 def read_kitti_row(row: Sequence[str]) -> NamedPose:
     """Return the pose of a row, without a name: T_world_from_cam, camera axes right, down, forward."""
-    return "", pose_of_transform(np.array(row, float).reshape(3, 4), "a row", OPTICAL_FROM_CAM)
+    return "", check_transform(np.array(row, float).reshape(3, 4), "a row", OPTICAL_FROM_CAM)
 
 
 def read_transforms(path: Path) -> list[NamedPose]:
@@ -122,7 +122,7 @@ def read_transforms(path: Path) -> list[NamedPose]:
             if T.shape != (4, 4):
                 raise ValueError(f"a transform_matrix of shape {T.shape}")
             name = str(frame["file_path"])
-            poses.append((name, pose_of_transform(T, name, OPENGL_FROM_CAM)))
+            poses.append((name, check_transform(T, name, OPENGL_FROM_CAM)))
     return poses
 
 
@@ -142,7 +142,7 @@ def read_colmap_row(row: Sequence[str]) -> NamedPose:
         raise ValueError(f"{len(row)} columns of a photo")
     values = np.array(row[1:8], float)
     T = np.column_stack([read_quaternion(values[:4]), values[4:]])
-    return row[9], pose_of_transform(T, row[9], OPTICAL_FROM_CAM, is_from_world=True)
+    return row[9], check_transform(T, row[9], OPTICAL_FROM_CAM, is_from_world=True)
 
 
 def read_tum_row(row: Sequence[str]) -> NamedPose:
@@ -151,7 +151,7 @@ def read_tum_row(row: Sequence[str]) -> NamedPose:
         raise ValueError(f"{len(row)} columns")
     values = np.array(row[1:], float)
     T = np.column_stack([read_quaternion(np.roll(values[3:], 1)), values[:3]])
-    return row[0], pose_of_transform(T, row[0], OPTICAL_FROM_CAM)
+    return row[0], check_transform(T, row[0], OPTICAL_FROM_CAM)
 
 
 def read_quaternion(wxyz: Array) -> Array:

@@ -6,7 +6,7 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from ..batch.priors import read_priors
 from ..batch.results_file import Records
 from ..batch.second_look import Look, list_looks
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..errors import printable
+from ..errors import InputError, printable
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..files.line_file import LineFile, open_locked, write_line
 from ..jobs.memory import limit_memory
@@ -29,7 +29,6 @@ from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
 from ..localization.focal_length import WIDE
 from ..localization.settings import CoarseToFineSettings
-from ..localization.verdict import MIRRORED
 from ..opened_scan import OpenedScan
 from ..panorama.cube import is_cube
 from ..panorama.photo import sha256_of
@@ -51,17 +50,13 @@ from .executing import (
     executing,
     interruptible,
 )
+from .handedness import LEFT_HANDED, is_left_handed
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
 from .walking import check_walk_options, run_walk, walk_frames
 
-SEVERAL = 3  # photos that fit mirrored, while none is localized: the scan is
-LEFT_HANDED = (
-    "{} photos fit the scan mirrored and none as it is: its axes are probably left-handed, which `up` can't "
-    "mend; negate one of its coordinates, or export it with right-handed axes"
-)
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
@@ -79,7 +74,7 @@ class Run:
     left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
-    mirrored: set[str] = field(default_factory=set)  # photos that fit the scan better mirrored
+    doubtful: list[str] = field(default_factory=list)  # spheres that were not localized
 
     @property
     def looks_again(self) -> bool:
@@ -238,8 +233,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     print_result(arguments, result, answer.warnings)
     write(result.to_json())
     run.counts[result.status] += 1
-    if MIRRORED in result.warnings:
-        run.mirrored.add(result.pano)
+    if result.best_pose is not None and result.pose is None and not result.cameras:
+        run.doubtful.append(result.pano)
 
 
 def localize_all(
@@ -296,6 +291,14 @@ def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
         replace_line(result.to_json())
 
 
+def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
+    """Say so if no photo was localized, but some are mirrored."""
+    is_over = interruption.number or run.counts[LOCALIZED] or records.counts[LOCALIZED]
+    with suppress(OSError, InputError, WorkerLostError):  # the results are written: it is only a hint
+        if not (is_over or run.arguments.quiet) and is_left_handed(run.localizer, run.doubtful, executor):
+            print_note(run.arguments, LEFT_HANDED)
+
+
 def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
     """Put the results in order, say what was done, and how to go on; return the exit code."""
     arguments = run.arguments
@@ -310,8 +313,6 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
         note = f"{counts.total()} photos in {seconds:.0f} s: {words}{again}"
         dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
         print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
-    if len(run.mirrored) >= SEVERAL and not counts[LOCALIZED]:
-        print_note(arguments, LEFT_HANDED.format(len(run.mirrored)))
     if interruption.number:
         return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
     if run.total is None:
@@ -375,4 +376,5 @@ def main(arguments: argparse.Namespace) -> int:
             interruption = localize_all(run, records, rest, executor, output.write)
             if looks := [] if interruption.number else plan_looks(run, output):
                 interruption = look_again(run, looks, executor, output)
+            note_left_handed(run, records, executor, interruption)
         return finish(run, records, output, interruption, watch.seconds["all"])

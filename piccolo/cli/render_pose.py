@@ -16,8 +16,8 @@ from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
-from ..geometry.pose import Pose, check_pose, pose_errors
-from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles, pose_of_transform
+from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
+from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
@@ -201,7 +201,7 @@ def read_pose_matrix(path: Path) -> Pose:
         raise InputError(f"{path}: found {' x '.join(map(str, T.shape))} numbers, {wanted}")
     if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
-    return pose_of_transform(T, str(path), CAMERA_AXES["piccolo"])
+    return check_transform(T, str(path), CAMERA_AXES["piccolo"])
 
 
 def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:

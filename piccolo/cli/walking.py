@@ -71,30 +71,23 @@ def walk_frames(
     arguments: argparse.Namespace, panoramas: Sequence[Path]
 ) -> Iterator[tuple[list[WalkInput], Motion]]:
     """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
-    if arguments.video is None:
-        times = times_of(panoramas, arguments.times)
-        clock = times or [float(k) for k in range(len(panoramas))]
-        frames = [WalkInput(path, t - clock[0], str(path)) for path, t in zip(panoramas, clock, strict=True)]
-        motion = Motion(arguments.max_speed, is_timed=times is not None)
-        yield add_odometry(frames, arguments.odometry, times), motion
-        return
-    with temporary_folder() as folder:
-        found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
-        bar = {"desc": "read the video", "unit": " frames", "leave": False}
-        shots = show_progress(found, arguments.quiet, **bar)
-        frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
-        yield add_odometry(frames, arguments.odometry), Motion(arguments.max_speed)
-
-
-def add_odometry(
-    frames: list[WalkInput], path: Path | None, clock: Sequence[float] | None = None
-) -> list[WalkInput]:
-    """Return the frames with their poses in an odometry, if there is one; `clock` has their times [s]."""
-    if path is None:
-        return frames
-    times = clock or [frame.time for frame in frames]
-    poses = read_odometry(path, [frame.path for frame in frames], times, clock is not None)
-    return [frame._replace(odometry=pose) for frame, pose in zip(frames, poses, strict=True)]
+    with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
+        times = None
+        if arguments.video:
+            found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
+            shots = show_progress(found, arguments.quiet, desc="read the video", unit=" frames", leave=False)
+            frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
+        else:
+            times = times_of(panoramas, arguments.times)
+            clock = times or [float(k) for k in range(len(panoramas))]
+            frames = [WalkInput(p, t - clock[0], str(p)) for p, t in zip(panoramas, clock, strict=True)]
+        if arguments.odometry:
+            paths = [frame.path for frame in frames]
+            when = times or [frame.time for frame in frames]
+            poses = read_odometry(arguments.odometry, paths, when, has_clock=times is not None)
+            frames = [f._replace(odometry=pose) for f, pose in zip(frames, poses, strict=True)]
+        is_timed = times is not None or arguments.video is not None
+        yield frames, Motion(arguments.max_speed, is_timed=is_timed)
 
 
 def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: Walk) -> int:

@@ -178,6 +178,20 @@ def check_pose(pose: object, label: str, tolerance: float = MAX_SKEW) -> Pose:
     return Pose(check_rotation(R, tolerance, f"{label}: found a matrix that"), center)
 
 
+def check_transform(
+    T: Array, label: str, other_from_cam: Array, is_from_world: bool = False, tolerance: float = MAX_SKEW
+) -> Pose:
+    """Return the pose of [R | t] (3 or 4, 4), from a tool's camera coordinates to the world's, or back.
+
+    The rotation is without what was rounded. InputError, naming it `label`, if it is no pose.
+    """
+    given = check_pose(Pose(T[:3, :3], T[:3, 3]), label, tolerance)
+    R = orthonormal(given.R_cam_from_world)
+    if is_from_world:
+        return Pose(other_from_cam.T @ R, -given.R_cam_from_world.T @ given.center_world)
+    return Pose(other_from_cam.T @ R.T, given.center_world)
+
+
 def angle_between(R_a: Array, R_b: Array) -> float:
     """Return the angle [rad] of the rotation between two orientations (3, 3); exact near 0 and pi."""
     relative = R_a @ R_b.T

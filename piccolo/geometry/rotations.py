@@ -11,16 +11,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .pose import (
-    MAX_SKEW,
-    Array,
-    Pose,
-    check_pose,
-    exp_so3,
-    orthonormal,
-    rotation_from_quaternion_wxyz,
-    yaw_rotation,
-)
+from .pose import Array, Pose, exp_so3, rotation_from_quaternion_wxyz, yaw_rotation
 
 # of a query: known: the camera is upright, up to yaw; unknown: any rotation; auto: both are tried
 Gravity = Literal["auto", "known", "unknown"]
@@ -62,20 +53,6 @@ def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
 def turn_axes(pose: Pose, other_from_cam: Array) -> Pose:
     """Return the pose with its rotation to another tool's camera axes, by `other_from_cam` (3, 3)."""
     return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)
-
-
-def pose_of_transform(
-    T: Array, label: str, other_from_cam: Array, is_from_world: bool = False, tolerance: float = MAX_SKEW
-) -> Pose:
-    """Return the pose of [R | t] (3 or 4, 4), from a tool's camera coordinates to the world's, or back.
-
-    The rotation is without what was rounded. InputError, naming it `label`, if it is no pose.
-    """
-    given = check_pose(Pose(T[:3, :3], T[:3, 3]), label, tolerance)
-    R = orthonormal(given.R_cam_from_world)
-    if is_from_world:
-        return Pose(other_from_cam.T @ R, -given.R_cam_from_world.T @ given.center_world)
-    return Pose(other_from_cam.T @ R.T, given.center_world)
 
 
 def translation(pose: Pose) -> Array:

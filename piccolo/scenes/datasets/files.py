@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from ...cloud import FORMATS
 from ...errors import InputError
 from ...files.json_file import read_text
-from ...geometry import rotations
-from ...geometry.pose import Array, Pose
+from ...geometry.pose import Array, Pose, check_transform
 from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
 from .model import Labels
@@ -52,7 +51,7 @@ def read_matrix(path: Path, num_rows: int) -> Array:
 
 def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
     """Return the pose in a matrix (3 or 4, 4) [R | t]; `where` names the file for refusals."""
-    return rotations.pose_of_transform(T, where, AXES[axes], direction == CAM_FROM_WORLD, MAX_SKEW)
+    return check_transform(T, where, AXES[axes], direction == CAM_FROM_WORLD, MAX_SKEW)
 
 
 def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
