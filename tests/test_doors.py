@@ -18,7 +18,7 @@ from piccolo.cli import localize as localize_command
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
-from piccolo.geometry.sphere import whole
+from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
 from piccolo.result import read_results

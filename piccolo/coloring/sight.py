@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import direction_to_pixel, pixel_rays, whole
-from ..kernels.jit import F0, kernel
+from ..geometry.sphere import direction_to_pixel, pixel_rays
+from ..kernels.jit import F0, kernel, whole
 from ..local_features.view_image import render_gray
 from ..panorama.texels import in_camera, pose_float32
 

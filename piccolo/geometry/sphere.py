@@ -68,12 +68,6 @@ def direction_to_pixel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: Scal
 
 
 @inline_kernel
-def whole(u: Scalar) -> np.int32:
-    """Return the whole part of a pixel coordinate; 0 for NaN, which would be an index out of any array."""
-    return np.int32(u) if u >= F0 else np.int32(0)
-
-
-@inline_kernel
 def pixel_jacobian(
     x: Scalar, y: Scalar, z: Scalar, rho2: Scalar, width: Scalar
 ) -> tuple[Scalar, Scalar, Scalar, Scalar, Scalar]:

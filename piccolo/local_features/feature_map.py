@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from ..cloud.octree import Octree
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays, whole
+from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
 from ..jobs.threads import Workers
-from ..kernels.jit import inline_kernel, kernel
+from ..kernels.jit import inline_kernel, kernel, whole
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .perspective_view import cover_sphere
 from .view_image import render_gray

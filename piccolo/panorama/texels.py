@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.colors import pack_rgbx
-from ..geometry.sphere import direction_to_pixel, solid_angles, whole
-from ..kernels.jit import F1, HALF, Scalar, inline_kernel
+from ..geometry.sphere import direction_to_pixel, solid_angles
+from ..kernels.jit import F1, HALF, Scalar, inline_kernel, whole
 
 BYTE = np.int32(255)
 CHUNK = 512  # points

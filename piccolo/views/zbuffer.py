@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
-from ..geometry.sphere import direction_to_pixel, solid_angles, whole
-from ..kernels.jit import kernel
+from ..geometry.sphere import direction_to_pixel, solid_angles
+from ..kernels.jit import kernel, whole
 from ..panorama.texels import Pose32, channel, in_camera, pose_float32
 
 Coordinates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]  # x, y, z (N,) [m]
