@@ -287,10 +287,6 @@ def unreadable_result(
     return Result(status, 0.0, cloud, pano, error=error, **more)
 
 
-def _rotation_and_center(pose: Pose) -> dict[str, object]:
-    return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
-
-
 def _pose_from_json(document: dict[str, Any]) -> Pose:
     pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
     return check_pose(pose, "result", MAX_ROTATION_ERROR)
@@ -298,18 +294,12 @@ def _pose_from_json(document: dict[str, Any]) -> Pose:
 
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """Return a pose in all its forms, POSE_FIELDS."""
-    if pose is None:
-        return None
-    others = {
-        "quaternion_wxyz": pose.quaternion_wxyz.tolist(),
-        "T_world_from_cam": pose.T_world_from_cam.tolist(),
-    }
-    return _rotation_and_center(pose) | others
+    return pose and {name: getattr(pose, name).tolist() for name in POSE_FIELDS}
 
 
 def _alternative_json(alternative: Alternative) -> dict[str, object]:
-    numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
-    return _rotation_and_center(alternative.pose) | numbers
+    pose = {name: getattr(alternative.pose, name).tolist() for name in POSE_FIELDS[:2]}
+    return pose | {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
 
 
 def _alternative_from_json(document: dict[str, Any]) -> Alternative:

@@ -29,5 +29,6 @@ def is_left_handed(localizer: Localizer, photos: Sequence[str], executor: Execut
             panorama = read_panorama(Path(photo), localizer.read_options)
             shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
             path.write_bytes(encode_image(shown[:, ::-1], ".png"))
-        found = [wait().result.status for _, wait in executor.values(map(localizer.task, paths))]
+        pairs = executor.values(map(localizer.task, paths))
+        found = [localizer.wait_for(*pair, None).result.status for pair in pairs]
     return 2 * found.count(LOCALIZED) > NUM_TRIED

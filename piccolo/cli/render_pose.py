@@ -89,15 +89,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(one, "--queries FILE", "queries.json with true poses")
     option(one, "--pose FILE", "text file with the 4 x 4 numbers of T_world_from_cam")
     option(one, "--at X Y Z", "position in world coordinates [m]")
-    option(
-        group, "--pano NAME", "choose the pose of this panorama (file name); needed if --queries has several"
-    )
+    option(group, "--pano NAME", "choose the pose of this panorama (file name), if --queries has several")
     for angle in ("heading", "pitch", "roll"):
         option(group, f"--{angle} DEG", f"{angle} with --at (default 0)")
     group = parser.add_argument_group("picture")
-    option(
-        group, "--out FILE", ".png or .jpg; for several poses a new folder of .png, named like the panoramas"
-    )
+    option(group, "--out FILE", ".png or .jpg; for several poses a new folder of .png, named like the photos")
     option(group, "--width PX", "width of a spherical picture, twice its height", default=2048)
     text = "render the view of this camera (docs/CAMERAS.md; default: that of --result, else a sphere)"
     option(group, "--camera FILE", text)
