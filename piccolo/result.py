@@ -294,7 +294,7 @@ def _pose_from_json(document: dict[str, Any]) -> Pose:
 
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """Return a pose in all its forms, POSE_FIELDS."""
-    return pose and {name: getattr(pose, name).tolist() for name in POSE_FIELDS}
+    return None if pose is None else {name: getattr(pose, name).tolist() for name in POSE_FIELDS}
 
 
 def _alternative_json(alternative: Alternative) -> dict[str, object]:
