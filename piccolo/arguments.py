@@ -29,7 +29,7 @@ def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) 
     """
     given: dict[str, Any] = {}
     for name, kind in inspect.get_annotations(function).items():
-        if name == "return" or values[name] is None:
+        if name == "return" or (values[name] is None and is_of_kind(None, kind)):
             continue
         if not is_of_kind(values[name], kind):
             raise InputError(f"`{name}`: found {describe_value(values[name])}, wanted {describe(kind)}")
@@ -94,7 +94,7 @@ def describe_value(value: object) -> str:
     """Return a value as text for a message: of an array, dtype and shape."""
     if isinstance(value, np.ndarray):
         return f"{value.dtype} of shape {value.shape}"
-    text = repr(value)
+    text = " ".join(repr(value).split())
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 

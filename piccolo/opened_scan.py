@@ -18,7 +18,7 @@ from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.colors import Labels
-from .geometry.pose import Pose, check_rotation
+from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
@@ -41,7 +41,6 @@ from .scan_map.scan_map import ScanMap
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 3e7  # [byte] that a photo keeps while others of its bundle are localized
-MAX_SKEW = 1e-3  # of R R^T from the identity
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
 
@@ -79,8 +78,8 @@ class OpenedScan:
         is_masked: NDArray[np.bool_] | None = None,
     ) -> NDArray[np.uint8]:
         """Return the pixels (H, W) of a photo that contradict the scan at a pose (`Scan.occlusion_mask`)."""
-        picture = read_photo(panorama, read_options, is_masked)
-        return occlusion_mask(self.points, picture, self.from_world(pose))
+        pose = self.from_world(check_pose(pose, "`pose`"))
+        return occlusion_mask(self.points, read_photo(panorama, read_options, is_masked), pose)
 
     def localize_query(
         self,
@@ -194,7 +193,7 @@ class OpenedScan:
         """
         prepared, settings = self.require_default_method("`relative_poses`", settings)
         self.check_options(read_options, settings)
-        check_relative_poses(cams_from_bundle)
+        poses = [check_pose(pose, "`relative_poses`") for pose in cams_from_bundle]
         if not panoramas:
             return []
         watch = Stopwatch()
@@ -206,7 +205,7 @@ class OpenedScan:
         if any(map(has_guessed_focal, pictures)):
             raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
         errors = RelativeErrors(log_scale=UNKNOWN_SCALE) if is_scale_free else RelativeErrors()
-        found = localize_bundle(prepared, pictures, cams_from_bundle, settings, self.workers, watch, errors)
+        found = localize_bundle(prepared, pictures, poses, settings, self.workers, watch, errors)
         about = settings_json(settings, self.cloud_settings, read_options)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
         return [
@@ -255,14 +254,6 @@ class OpenedScan:
         if photo.gps is None or not crs or settings.prior.near_world is not None:
             return None
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
-
-
-def check_relative_poses(poses: Sequence[Pose]) -> None:
-    """Raise InputError for a pose that is none."""
-    for pose in poses:
-        check_rotation(pose.R_cam_from_world, MAX_SKEW, "`relative_poses`: found a matrix that")
-        if pose.center_world.shape != (3,) or not np.isfinite(pose.center_world).all():
-            raise InputError(f"`relative_poses`: found a position {pose.center_world}, wanted 3 numbers")
 
 
 def settings_json(

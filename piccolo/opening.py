@@ -108,6 +108,8 @@ def open_scan(  # noqa: PLR0913  options by name
         crs,
     )
     if isinstance(source, np.ndarray):
+        if units != "m":
+            raise InputError(f"`units`: found {units!r} for arrays, wanted points in metres")
         cloud = stream_of_arrays(source, None if ignore_colors else colors)
         return Scan(scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch()))
     if colors is not None:

@@ -19,7 +19,7 @@ from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, check_rotation
+from .geometry.pose import Pose, check_pose
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .scan_map.prior import GpsPrior
@@ -117,8 +117,8 @@ class Result:
     evidence: Evidence | None = None
     alternatives: tuple[Alternative, ...] = ()
     covariance: PoseCovariance | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    settings: dict[str, object] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict, hash=False)
+    settings: dict[str, object] = field(default_factory=dict, hash=False)
     warnings: tuple[str, ...] = ()
     source: Source = Source()
     error: str | None = None
@@ -131,6 +131,13 @@ class Result:
     height_above_floor: float | None = None
     walk: WalkFrame | None = None
     beside: Beside | None = None
+
+    def __post_init__(self) -> None:
+        """Make the arrays read-only, on which the JSON and the hash rest."""
+        alone = self.walk.alone.pose if self.walk and self.walk.alone else None
+        for part in (self.best_pose, self.covariance, alone, *(a.pose for a in self.alternatives)):
+            if part is not None:
+                part.freeze()
 
     @property
     def is_calibrated(self) -> bool:
@@ -280,28 +287,19 @@ def unreadable_result(
     return Result(status, 0.0, cloud, pano, error=error, **more)
 
 
-def _rotation_and_center(pose: Pose) -> dict[str, object]:
-    return {"R_cam_from_world": pose.R_cam_from_world.tolist(), "center_world": pose.center_world.tolist()}
-
-
 def _pose_from_json(document: dict[str, Any]) -> Pose:
-    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+    pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+    return check_pose(pose, "result", MAX_ROTATION_ERROR)
 
 
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """Return a pose in all its forms, POSE_FIELDS."""
-    if pose is None:
-        return None
-    others = {
-        "quaternion_wxyz": pose.quaternion_wxyz.tolist(),
-        "T_world_from_cam": pose.T_world_from_cam.tolist(),
-    }
-    return _rotation_and_center(pose) | others
+    return None if pose is None else {name: getattr(pose, name).tolist() for name in POSE_FIELDS}
 
 
 def _alternative_json(alternative: Alternative) -> dict[str, object]:
-    numbers = {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
-    return _rotation_and_center(alternative.pose) | numbers
+    pose = {name: getattr(alternative.pose, name).tolist() for name in POSE_FIELDS[:2]}
+    return pose | {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
 
 
 def _alternative_from_json(document: dict[str, Any]) -> Alternative:
@@ -374,7 +372,7 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
 def _parse_result(text: str) -> Result:
     """Return a result of one line.
 
-    Refused are names and numbers that can't be written, and a pose that is none.
+    Refused are names and numbers that can't be written.
     """
     result = Result.from_json(text)
     texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
@@ -386,11 +384,4 @@ def _parse_result(text: str) -> Result:
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
     if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
         raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
-    if result.best_pose is not None:
-        R = result.best_pose.R_cam_from_world
-        center = result.best_pose.center_world
-        is_number = R.dtype.kind in "fiu" and center.dtype.kind in "fiu"
-        if not (is_number and center.shape == (3,) and np.isfinite(center).all()):
-            raise InputError("result: found no numbers of a pose, wanted R_cam_from_world and center_world")
-        check_rotation(R, MAX_ROTATION_ERROR, "result: R_cam_from_world")
     return result

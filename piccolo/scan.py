@@ -12,7 +12,8 @@ from .arguments import check_arguments, check_one_each
 from .camera.files import open_calibration, read_rig
 from .cloud.soa import PackedPoints
 from .errors import InputError
-from .geometry.pose import Pose
+from .files.atomic import check_output
+from .geometry.pose import Pose, check_pose
 from .geometry.rotations import Gravity
 from .opened_scan import File, OpenedScan, Settings, make_failed_result, make_prior, replace_settings
 from .optimize.refine import Solver
@@ -64,7 +65,7 @@ class Scan:
 
     def from_world(self, pose: Pose) -> Pose:
         """Transform a pose from the scan's own coordinates to the frame of `points`."""
-        return self._opened.from_world(pose)
+        return self._opened.from_world(check_pose(pose, "`pose`"))
 
     def save(self, path: File) -> None:
         """Write the prepared map to the file `path`, which `open_scan` opens in place of the scan's files.
@@ -74,6 +75,7 @@ class Scan:
         check_arguments(Scan.save, locals())
         if not isinstance(self._opened.prepared, ScanMap):
             raise InputError("save: found a scan of the preset paper, wanted one of the default method")
+        check_output(Path(path))
         write_map(self._opened.prepared, Path(path), self._opened.workers)
 
     def localize(  # noqa: PLR0913  options by name
@@ -268,8 +270,7 @@ class Scan:
             `time` [s] increases, and is given for all frames or for none. `finish()` returns a list with the
             result of each frame, from all frames.
         """
-        given = check_arguments(Scan.track, locals())
-        return self._track(given)
+        return self._track(check_arguments(Scan.track, locals()))
 
     def localize_walk(  # noqa: PLR0913  options by name
         self,
@@ -340,8 +341,8 @@ class Scan:
         check_one_each("times", times, len(taken), "frame")
         check_one_each("odometry", odometry, len(taken), "frame")
         nothing = [None] * len(taken)
-        whens = nothing if times is None else times
-        for frame, time, pose in zip(taken, whens, nothing if odometry is None else odometry, strict=True):
+        poses = [pose and check_pose(pose, "`odometry`") for pose in odometry or nothing]
+        for frame, time, pose in zip(taken, nothing if times is None else times, poses, strict=True):
             walk.add(frame, time, odometry=pose)
         return walk.finish()
 
@@ -367,9 +368,7 @@ class Scan:
         photo contradicts the scan, 0 where the scan explains it, 128 where one of them shows nothing. The
         options are those of `localize`.
         """
-        given = check_arguments(Scan.occlusion_mask, locals())
-        given.pop("pose")
-        read_options, _, is_masked = self._parse(given)
+        read_options, _, is_masked = self._parse(check_arguments(Scan.occlusion_mask, locals()))
         return self._opened.occlusion_mask(panorama, pose, read_options, is_masked)
 
     def _track(self, given: dict[str, Any]) -> Walk:
@@ -393,6 +392,8 @@ class Scan:
         opened = self._opened
         settings = {name: given[name] for name in SETTINGS_FIELDS & given.keys()}
         if prior := {name: given[name] for name in PRIOR_FIELDS & given.keys()}:
-            settings["prior"] = make_prior(prior, opened.settings)
+            settings["prior"] = known = make_prior(prior, opened.settings)
+            if "heading_tolerance_deg" in prior and known.heading_deg is None:
+                raise InputError("`heading_tolerance_deg`: only with `heading_deg`")
         read_options = ReadOptions(labels=opened.cloud_settings.labels, **reading)
         return read_options, replace_settings(opened.settings, settings), is_masked

@@ -10,10 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from . import __version__
+from .arguments import check_arguments
 from .confidence.localization import Localization
 from .errors import InputError
 from .files.json_file import reading_once
-from .geometry.pose import Pose
+from .geometry.pose import Pose, check_pose
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Progress, Workers, no_progress
 from .localization.query import Query
@@ -72,6 +73,7 @@ class Walk:
         self.settings: dict[str, object] = {**about, "walk": motion.to_settings()}
         self.pictures: list[Picture] = []
         self.blanks: list[Result] = []  # of the frames so far, without poses
+        self.has_times = True  # the frames are given with theirs
 
     @property
     def key(self) -> dict[str, object]:
@@ -93,6 +95,7 @@ class Walk:
         given for all frames or for none; `name` replaces the path in the result. `odometry` is the camera's
         pose in any frame that all poses of an odometry share [m].
         """
+        check_arguments(Walk.add, locals())
         return self.follow(self.prepare(frame, name), time, odometry)
 
     def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
@@ -123,6 +126,10 @@ class Walk:
         """Localize a prepared frame, as `add` does."""
         number = len(self.blanks)
         picture, blank, panorama, query = prepared
+        odometry = None if odometry is None else check_pose(odometry, "`odometry`")
+        if number and self.has_times != (time is not None):
+            raise InputError(f"`time`: found {time} at frame {number}, wanted it of all frames or of none")
+        self.has_times = time is not None
         when = float(number) if time is None else float(time)
         if self.tracker.frames:
             check_times([self.tracker.frames[-1].time, when])

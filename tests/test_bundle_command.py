@@ -148,7 +148,7 @@ def test_relative_poses_that_are_none_are_refused(scene, opened, tmp_path):
         ([*poses[:2], Pose(2.0 * R, np.zeros(3))], "`relative_poses`: found a matrix that is no rotation"),
         (
             [*poses[:2], Pose(R, np.full(3, np.nan))],
-            "`relative_poses`: found a position .*, wanted 3 numbers",
+            "`relative_poses`: found a position .*, wanted finite numbers",
         ),
     ):
         with pytest.raises(piccolo.InputError, match=text):

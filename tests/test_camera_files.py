@@ -175,8 +175,15 @@ GOOD = {"format": "piccolo-camera/1", "model": "SIMPLE_PINHOLE", **SIZE, "params
         ({**GOOD, "format": "piccolo-camera/9"}, "format 'piccolo-camera/9', not 'piccolo-camera/1'"),
         ({**GOOD, "width": 64.5}, "64.5, no whole number"),
         ({**GOOD, "colour": 1}, "a field 'colour' that is none of"),
-        ({**GOOD, "R_lens_from_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]}, "R_lens_from_cam is no rotation"),
-        ({**GOOD, "center_cam": [0, 0]}, "found center_cam"),
+        (
+            {**GOOD, "R_lens_from_cam": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]},
+            "found a matrix that is no rotation",
+        ),
+        (
+            {**GOOD, "center_cam": [0, 0]},
+            r"float64 \(2,\), wanted arrays of numbers",
+        ),
+        ({**GOOD, "center_cam": [0, 0, 1e30]}, "center_cam: found a position .*, wanted finite numbers"),
         ({**GOOD, "offset": [-1, 0]}, "found offset"),
         ({**GOOD, "image": 7}, "an image 7 that is no name"),
         ({**GOOD, "params": None}, "TypeError"),

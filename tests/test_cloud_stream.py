@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from plyfile import PlyData, PlyElement
 from rooms import as_panorama, errors, query, room
 from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import CloudStream
+from piccolo.cloud import CloudStream, open_cloud
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.stream import stream_of_arrays
 from piccolo.cloud.voxels import Voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
@@ -43,6 +45,58 @@ def stream(*raws, chunk=10**9, scale=1.0):
         return PointSource(Path(f"{k}.ply"), lambda: iter(chunks), len(raw.colors))
 
     return CloudStream([source(k, raw) for k, raw in enumerate(raws)], scale)
+
+
+FAR = np.array([500_000.0, 5_400_000.0, 100.0])  # UTM
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".npy", ".pcd"])
+@pytest.mark.parametrize(
+    ("dtype", "offset", "units", "step"),
+    [
+        ("f4", FAR, "m", "0.5 m"),
+        (">f4", FAR, "m", "0.5 m"),
+        ("f4", 1000.0 * FAR, "mm", "0.51 m"),
+        ("f4", 0.02 * FAR, "m", None),
+        ("f8", FAR, "m", None),
+    ],
+)
+def test_a_file_in_float32_far_from_the_origin_has_a_warning(tmp_path, suffix, dtype, offset, units, step):
+    raw = seeded_cloud(2, 3000)
+    points = (raw.points_world / METRES[units] + offset).astype(dtype)
+    if suffix == ".pcd" and dtype != ">f4":
+        path = _write_pcd(tmp_path / "a.pcd", points)
+    elif suffix == ".npy":
+        path = tmp_path / "a.npy"
+        np.save(path, points)
+    else:
+        path = tmp_path / "a.ply"
+        fields = [(axis, dtype) for axis in "xyz"] + [(name, "u1") for name in ("red", "green", "blue")]
+        rows = np.array([(*p, *c) for p, c in zip(points, raw.colors, strict=True)], fields)
+        PlyData([PlyElement.describe(rows, "vertex")], byte_order=">" if dtype == ">f4" else "<").write(path)
+    settings = CloudSettings(METRES[units], channels=("colors", "intensity", "shape"))
+    cloud = open_cloud([path], settings)
+    for warnings in (cloud.read().warnings, cloud.voxels(LEVEL).warnings):
+        found = [line for line in warnings if "its float32 coordinates" in line]
+        assert len(found) == (step is not None)
+        assert all(line.startswith(f"{path}: ") and f"are rounded to {step}: " in line for line in found)
+
+
+def test_arrays_in_float32_far_from_the_origin_have_a_warning():
+    raw = seeded_cloud(2, 3000)
+    single = stream_of_arrays((raw.points_world + FAR).astype(np.float32), raw.colors).read()
+    double = stream_of_arrays(raw.points_world + FAR, raw.colors).read()
+    assert [len(cloud.warnings) for cloud in (single, double)] == [1, 0]
+
+
+def _write_pcd(path, points):
+    size = points.itemsize
+    head = (
+        f"VERSION .7\nFIELDS x y z\nSIZE {size} {size} {size}\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\n"
+    )
+    head += f"HEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA binary\n"
+    path.write_bytes(head.encode() + points.tobytes())
+    return path
 
 
 def same_voxels(a, b):

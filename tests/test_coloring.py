@@ -4,6 +4,7 @@ import functools
 import json
 
 import cv2
+import laspy
 import numpy as np
 import pytest
 import rooms
@@ -19,6 +20,7 @@ from piccolo.coloring.alignment import Anchor, add_pairs, align
 from piccolo.coloring.exposure import balance
 from piccolo.coloring.painting import find_medians, make_brushes, paint_points
 from piccolo.coloring.sight import look, weigh_points
+from piccolo.errors import InputError
 from piccolo.geometry.pose import pose_errors, step
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
@@ -150,6 +152,24 @@ def test_colours_are_written_in_each_format(tmp_path, suffix):
     distances, nearest = cKDTree(found.points + found.origin_world).query(points)
     assert distances.max() < 2e-3
     assert (found.colors[nearest] == wanted).all()
+
+
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
+    """The source fails between two chunks: nothing is left, and the library's writer has ended."""
+    source = tmp_path / "cloud.ply"
+    points = np.random.default_rng(4).uniform(0, 9, (3000, 3))
+    write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
+    closed, close = [], laspy.LasWriter.close
+    monkeypatch.setattr(laspy.LasWriter, "close", lambda self: closed.append(close(self)))
+
+    def fail(_):
+        raise InputError("the file was cut")
+
+    with pytest.raises(InputError, match="cut"):
+        write_colored(open_cloud([source]), fail, np.array([[0.0] * 3, [9.0] * 3]), tmp_path / f"a{suffix}")
+    assert len(closed) == 1
+    assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]
 
 
 def test_the_commands_colour_a_scan(tmp_path, capsys):

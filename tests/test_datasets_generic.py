@@ -105,7 +105,8 @@ def test_optical_axes_called_piccolo_fail_the_check_with_advice(folder, tmp_path
     ("change", "message"),
     [
         ({"qw": 3.0}, "found a quaternion of length"),
-        ({"tx": "inf"}, "not finite"),
+        ({"tx": "inf"}, "found a position [inf, "),
+        ({"tx": "1e30"}, "found a position [1e+30, "),
         ({"tx": "one"}, "could not convert"),
         ({"tx": ""}, "found no tx"),
         ({"axes": "blender"}, "found the axes blender"),

@@ -230,7 +230,7 @@ def test_poses_fit_and_splits_are_variants_of_omniscenes(omniscenes, tmp_path, c
     [
         ("1 0 0 0\n0 1 0 0\n", "found 8 numbers, wanted 3 x 4 numbers"),
         ("1 0 0 0\n0 1 0 0\n0 0 1 x\n", "could not convert"),
-        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n", "which is no rotation"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n", "found a matrix that is no rotation"),
     ],
 )
 def test_damaged_poses_are_refused_of_omniscenes(omniscenes, tmp_path, capsys, text, message):

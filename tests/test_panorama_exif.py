@@ -51,6 +51,21 @@ def test_a_phone_photo_is_read_with_no_option(tmp_path):
     assert len(columns) / panorama.rgb.shape[1] * 360.0 == pytest.approx(fov, abs=0.5)
 
 
+def test_a_photo_twice_as_wide_as_high_is_read_as_a_sphere_with_a_warning(tmp_path):
+    path = photo(tmp_path / "a.jpg", FILM, size=(480, 240))
+    panorama = read_panorama(path)
+    assert panorama.cameras == ()
+    (note,) = panorama.warnings
+    assert note.startswith("read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole")
+    assert note.endswith("EXIF's 35 mm equivalent of 26 mm")
+    assert len(read_panorama(path, ReadOptions(projection="pinhole")).cameras) == 1
+    for quiet in (ReadOptions(projection="equirectangular"), ReadOptions(fov_deg=360.0)):
+        assert read_panorama(path, quiet).warnings == ()
+    assert read_panorama(photo(tmp_path / "b.jpg", size=(480, 240))).warnings == ()
+    sphere = with_metadata(path.read_bytes(), xmp=xmp_packet({"ProjectionType": "equirectangular"}))
+    assert read_panorama(write(tmp_path / "c.jpg", sphere)).warnings == ()
+
+
 def test_the_resolution_of_the_sensor_goes_before_the_rounded_equivalent():
     size = (480, 360)
     assert read_focal_length(PLANE, size).focal == pytest.approx(360.0)  # 4.5 mm of a sensor 6 mm wide

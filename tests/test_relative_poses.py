@@ -8,6 +8,7 @@ import pytest
 from poses import SIZE, result, tilted_poses
 from refusals import assert_refused
 
+from piccolo.batch.frame_times import times_of
 from piccolo.batch.relative_poses import read_odometry, read_relative_poses
 from piccolo.errors import InputError
 from piccolo.scenes.export import Options, export
@@ -99,12 +100,16 @@ def test_a_photo_without_a_pose_is_refused(tmp_path, form, out, file, options, n
         ("1 0 0 0 0 0 0 one\n", "found could not convert string to float: 'one', wanted"),
         ("1 0 0 0 0 0 0 0\n", "found a quaternion without a length, wanted"),
         ("1 0 0 0 0 0 0 1e200\n", "found a quaternion without a length, wanted"),
-        ("1 0 0 0 0 0 0 nan\n", "found 1: a number that is not finite, wanted"),
-        ("1 inf 0 0 0 0 0 1\n", "found 1: a number that is not finite, wanted"),
+        ("1 0 0 0 0 0 0 nan\n", "found a quaternion without a length, wanted"),
+        ("1 inf 0 0 0 0 0 1\n", r"poses.txt, 1: found a position \[inf, 0.0, 0.0\], wanted finite numbers"),
+        (
+            "1 1e30 0 0 0 0 0 1\n",
+            r"1: found a position \[1e\+30, 0.0, 0.0\], wanted",
+        ),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "found 2 poses of 1.jpg, wanted one of each photo"),
         (_colmap_row("1.jpg", "0 0 0 0 1 2 3"), "found a quaternion without a length, wanted"),
-        (_colmap_row("1.jpg", "1 0 0 0 1 inf 3"), "found 1.jpg: a number that is not finite, wanted"),
-        (_colmap_row("1.jpg", "1 0 nan 0 1 2 3"), "found 1.jpg: a number that is not finite, wanted"),
+        (_colmap_row("1.jpg", "1 0 0 0 1 inf 3"), "1.jpg: found a position .*inf.*, wanted finite numbers"),
+        (_colmap_row("1.jpg", "1 0 nan 0 1 2 3"), "found a quaternion without a length, wanted"),
         (_colmap_row("1.jpg") + "2 1 0 0 0\n", "found 5 columns of a photo, wanted"),
         ("\0\1\2", "found 1 columns, wanted"),
     ],
@@ -134,19 +139,20 @@ def test_another_json_is_refused_in_one_line(tmp_path, document, message):
 @pytest.mark.parametrize(
     ("place", "value", "message"),
     [
-        ((0, 0), 2.0, "1.jpg: a matrix that is no rotation"),
-        ((0, 0), -1.0, "1.jpg: a matrix that is no rotation"),  # it mirrors
-        ((0, 1), 0.01, "1.jpg: a matrix that is no rotation"),
-        ((0, 0), 1e300, "1.jpg: a matrix that is no rotation"),
-        ((2, 2), np.nan, "1.jpg: a number that is not finite"),
-        ((1, 3), np.inf, "1.jpg: a number that is not finite"),
+        ((0, 0), 2.0, "1.jpg: found a matrix that is no rotation"),
+        ((0, 0), -1.0, "1.jpg: found a matrix that is no rotation"),  # it mirrors
+        ((0, 1), 0.01, "1.jpg: found a matrix that is no rotation"),
+        ((0, 0), 1e300, "1.jpg: found a matrix that is no rotation"),
+        ((2, 2), np.nan, "1.jpg: found a matrix that is no rotation"),
+        ((1, 3), np.inf, "1.jpg: found a position .*inf.*, wanted finite numbers"),
+        ((1, 3), 1e30, "1.jpg: found a position .*1e.30.*, wanted finite numbers"),
     ],
 )
 def test_matrices_that_are_no_poses_are_refused(tmp_path, place, value, message):
     T = np.eye(4)
     T[place] = value
     path = _transforms(tmp_path / "transforms.json", ("1.jpg", T.tolist()))
-    assert_refused(f"found {message}, wanted", read_relative_poses, path, [Path("1.jpg")])
+    assert_refused(f"transforms.json, {message}", read_relative_poses, path, [Path("1.jpg")])
 
 
 def test_a_file_that_is_none_is_refused(tmp_path):
@@ -176,13 +182,54 @@ def test_an_odometry_of_more_poses_is_matched_by_time_or_name(tmp_path):
     assert found[1] is None
 
 
+CLOCK = 1311868164.0  # [s] as frames and trajectories of TUM have it
+
+
+def _trajectory(path, clock):
+    """At each time of a clock, so many seconds after its beginning, a pose so many metres along x."""
+    return _write(path, "".join(f"{t:.6f} {t - clock[0]:.6f} 0 0 0 0 0 1\n" for t in clock))
+
+
+def test_frames_take_the_poses_of_their_clock(tmp_path):
+    frames = [Path(f"{CLOCK + 0.5 * k:.6f}.jpg") for k in range(6)]
+    times = times_of(frames, "names")
+    steps = CLOCK - 3.0 + 0.1 * np.arange(90)
+    found = read_odometry(_trajectory(tmp_path / "tum.txt", steps), frames, times)
+    np.testing.assert_allclose([pose.center_world[0] for pose in found], 3.0 + 0.5 * np.arange(6), atol=1e-5)
+    # as many poses as frames, but begun a second before: the last frames have none
+    path = _trajectory(tmp_path / "tum.txt", CLOCK - 1.0 + 0.5 * np.arange(6))
+    found = read_odometry(path, frames, times)
+    assert [pose and pose.center_world[0] for pose in found] == [1.0, 1.5, 2.0, 2.5, None, None]
+
+
+def test_a_trajectory_that_begins_with_the_first_frame_is_matched_by_the_time_since(tmp_path):
+    path = _trajectory(tmp_path / "tum.txt", 0.1 * np.arange(30))
+    for times, has_clock in ((CLOCK + 0.5 * np.arange(6), True), (0.5 * np.arange(6), False)):
+        found = read_odometry(path, [Path("a.jpg")] * 6, times, has_clock)
+        assert [pose.center_world[0] for pose in found] == [0.0, 0.5, 1.0, 1.5, 2.0, 2.5]
+
+
+def test_one_clock_goes_before_the_time_since_the_first_frame(tmp_path):
+    """An odometry that was begun 10 s before the first frame is not shifted by them."""
+    path = _trajectory(tmp_path / "tum.txt", 0.5 * np.arange(40))
+    found = read_odometry(path, [Path("a.jpg")] * 3, [10.0, 10.5, 11.0])
+    assert [pose.center_world[0] for pose in found] == [10.0, 10.5, 11.0]
+
+
+def test_frames_without_a_clock_are_taken_in_order(tmp_path):
+    """Their numbers are no seconds."""
+    path = _trajectory(tmp_path / "tum.txt", 1.1 * np.arange(10))
+    found = read_odometry(path, [Path("a.jpg")] * 10, np.arange(10.0), has_clock=False)
+    np.testing.assert_allclose([pose.center_world[0] for pose in found], 1.1 * np.arange(10), atol=1e-6)
+
+
 def test_what_is_no_odometry_of_the_frames_is_refused(tmp_path):
     times = [0.0, 1.0]
     wanted = "wanted a TUM or KITTI trajectory or a transforms.json"
     cases = {
         "words": ("these eight words are no numbers at all\n", "could not convert string to float"),
         "columns": ("1 2 3\n", "found 3 columns"),
-        "skew": ("1 0 0 0 0 2 0 0 0 0 1 0\n" * 2, "found a row: a matrix that"),
+        "skew": ("1 0 0 0 0 2 0 0 0 0 1 0\n" * 2, "a row: found a matrix that"),
         "late": ("50 0 0 0 0 0 0 1\n" * 3, "found 2 frames and no pose of them"),
         "kitti of others": ("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3, "found 2 frames and no pose of them"),
     }

@@ -121,7 +121,8 @@ def test_refusals_leave_nothing(run, scene, tmp_path):
         (3, [*at, "--out", tmp_path / "no" / "a.png"], "found no folder"),
         (3, ["--pose", tmp_path / "T.txt", *out], "wanted the 4 x 4 numbers"),
         (3, ["--pose", tmp_path / "no.txt", *out], "no.txt"),
-        (3, ["--at", 0, 0, 1e30, *out], "found a camera at [0.0, 0.0, 1e+30]"),
+        (3, ["--at", 0, 0, 1e30, *out], "--at: found a position [0.0, 0.0, 1e+30], wanted finite"),
+        (3, ["--at", 0, 0, 2e7, *out], "found a camera at [0.0, 0.0, 20000000.0]"),
         (3, [*at, *out, "--cloud", "no.ply"], "no.ply"),
     ):
         found, lines, err = run(*arguments)

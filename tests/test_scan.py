@@ -10,6 +10,7 @@ import rooms
 
 import piccolo
 from piccolo.files.cache import sha256_of_arrays
+from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 from piccolo.scan_map.prior import Prior
@@ -53,7 +54,9 @@ def test_a_mask_is_left_out_and_settings_are_repeated(scan):
     mask = np.zeros(image.shape[:2], bool)
     mask[-20:] = True
     spoilt = np.where(mask[..., None], np.uint8(255), image)
-    result = scan.localize(spoilt, mask=mask, gravity="known", heading_tolerance_deg=30.0)
+    heading_deg = heading_pitch_roll_deg(true_pose)[0] + 20.0
+    prior = {"heading_deg": heading_deg, "heading_tolerance_deg": 30.0}
+    result = scan.localize(spoilt, mask=mask, gravity="known", **prior)
     assert rooms.errors(result.pose, true_pose)[0] < 0.02
     assert result.storey == 1
     assert result.height_above_floor == pytest.approx(true_pose.center_world[2], abs=0.05)

@@ -82,8 +82,9 @@ def test_what_lacks_a_field_or_comes_twice_or_is_not_there_is_named(tmp_path):
     ("change", "message"),
     [
         ({"R_cam_from_world": np.diag([1.0, 1.0, -1.0]).tolist()}, "is no rotation"),
-        ({"R_cam_from_world": [1, 0, 0]}, "is no rotation"),
-        ({"center_world": [0, 0, float("inf")]}, "not three finite numbers"),
+        ({"R_cam_from_world": [1, 0, 0]}, r"found float64 \(3,\) and float64 \(3,\), wanted arrays"),
+        ({"center_world": [0, 0, 1e30]}, "found a position .*, wanted finite numbers"),
+        ({"center_world": [0, 0, float("inf")]}, "found a position .*, wanted finite numbers"),
         ({"center_world": "here"}, "wanted a queries.json"),
         ({"image": 3}, r"queries\[0\] with an image, a variant or labels that are no plain text"),
         ({"image": None}, "no plain text"),

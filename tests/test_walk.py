@@ -229,6 +229,61 @@ def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_p
     assert _command(folder, *words[:-2], "--out", str(out)) == 3  # the results are of another walk
 
 
+def test_odometry_has_the_clock_by_which_frames_are_named(building, tmp_path):
+    """As data sets of TUM: the trajectory begins before the walk; times in results count from its begin."""
+    folder, queries = building
+    some = [queries[k] for k in (0, 5, 7)]
+    clock = 1311868164.0
+    frames = [tmp_path / f"{clock + q.time:.6f}.png" for q in some]
+    for frame, query in zip(frames, some, strict=True):
+        frame.write_bytes(query.image.read_bytes())
+    moved = Pose(yaw_rotation(2.0), np.array([50.0, -3.0, 7.0]))
+    odometry = [(q.time, carry(q.pose, queries[0].pose, moved)) for q in queries]
+    odometry = [(-9.0, Pose(yaw_rotation(1.0), np.zeros(3))), *odometry]
+    lines = tum_lines([(f"{clock + time:.6f}", pose) for time, pose in odometry], "optical")
+    (tmp_path / "odometry.tum").write_text("\n".join(lines))
+    words = ["--walk", "--pano", *map(str, frames), "--times", "names", "--max-speed", "9"]
+    out = tmp_path / "a.jsonl"
+    assert _command(folder, *words, "--odometry", str(tmp_path / "odometry.tum"), "--out", str(out)) == 0
+    results = read_results([out])
+    _assert_right(results, some)
+    assert [r.walk.how for r in results] == ["alone", "tracked", "tracked"]
+    assert [r.walk.time for r in results] == [0.0, 2.5, 3.5]
+
+
+@pytest.mark.parametrize("place", ["1e30", "nan"])
+def test_an_odometry_that_is_none_is_refused(building, tmp_path, capsys, place):
+    folder, queries = building
+    (tmp_path / "big.tum").write_text(f"0 {place} 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n")
+    frames = [str(q.image) for q in queries[:2]]
+    assert _command(folder, "--walk", "--pano", *frames, "--odometry", str(tmp_path / "big.tum")) == 3
+    err = capsys.readouterr().err
+    assert "big.tum, 0: found a position" in err
+    assert err.count("\n") == 1
+
+
+def test_a_video_of_an_unknown_camera_is_refused_once(building, tmp_path, capsys):
+    """And the same command with a camera begins anew; a walk whose other frames can be read goes on."""
+    folder, queries = building
+    with writing_video(tmp_path / "a.mp4", 4.0, (320, 180)) as add:
+        for k in range(24):
+            add(np.full((180, 320, 3), 20 + 9 * k, np.uint8))
+    out = tmp_path / "a.jsonl"
+    words = ["--video", str(tmp_path / "a.mp4"), "--out", str(out)]
+    assert _command(folder, *words) == 3
+    err = capsys.readouterr().err
+    assert err.count("found a picture of 320 x 180") == err.count("\n") == 1
+    assert "the other 11 frames seem no better" in err
+    assert not out.exists()
+    assert not walk_command.frames_file(out).exists()
+    frames = [tmp_path / f"{k}.png" for k in range(5)]
+    for frame in frames[:-1]:
+        cv2.imwrite(str(frame), np.zeros((24, 32, 3), np.uint8))
+    frames[-1].write_bytes(queries[0].image.read_bytes())
+    assert _command(folder, "--walk", "--pano", *map(str, frames), "--out", str(out)) == 3
+    assert [r.status for r in read_results([out])] == ["unreadable"] * 4 + ["localized"]
+
+
 def test_a_walk_is_the_same_with_any_number_of_threads(building):
     folder, queries = building
     found = []

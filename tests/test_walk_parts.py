@@ -1,9 +1,12 @@
 """Parts of a walk: positions smoothed together, times from names, tables and EXIF, frames read again."""
 
+import time
+
 import cv2
 import numpy as np
 import pytest
 from rooms import write_room
+from test_gps import write_photo
 
 import piccolo
 from piccolo.batch.frame_times import times_of
@@ -98,11 +101,11 @@ def test_frames_far_apart_say_nothing_of_each_other():
 
 def test_times_by_names_tables_and_exif(tmp_path):
     frames = [tmp_path / f"walk_{text}.jpg" for text in ("10.5", "11", "13.25")]
-    assert times_of(frames, "names") == [0.0, 0.5, 2.75]
+    assert times_of(frames, "names") == [10.5, 11.0, 13.25]
     assert times_of(frames, "order") is None
     assert times_of(frames, None) is None  # no file, no EXIF
     (tmp_path / "t.csv").write_text("name,time\nwalk_10.5.jpg,3\nwalk_11.jpg,4\n")
-    assert times_of(frames[:2], str(tmp_path / "t.csv")) == [0.0, 1.0]
+    assert times_of(frames[:2], str(tmp_path / "t.csv")) == [3.0, 4.0]
     with pytest.raises(InputError, match=r"t\.csv: found no time of .*walk_13\.25\.jpg, wanted a CSV file"):
         times_of(frames, str(tmp_path / "t.csv"))
     (tmp_path / "t.csv").write_text("name,when\na,3\n")
@@ -114,6 +117,33 @@ def test_times_by_names_tables_and_exif(tmp_path):
         times_of([tmp_path / "walk.jpg"], "names")
     with pytest.raises(InputError, match=r"^`times` exif: found a frame without a time in EXIF"):
         times_of(frames, "exif")
+
+
+@pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/New_York"])
+def test_times_of_exif_are_those_of_no_machine(tmp_path, monkeypatch, zone):
+    """An hour that summer time repeats or leaves out folds no walk."""
+    monkeypatch.setenv("TZ", zone)
+    time.tzset()
+    spring = "2026:03:29 01:59:50", "2026:03:29 02:00:10", "2026:03:29 03:00:10"
+    autumn = "2026:10:25 01:59:50", "2026:10:25 02:30:10", "2026:10:25 03:00:10"
+    moved = "2026:05:01 10:00:00", "2026:05:01 09:00:02", "2026:05:01 10:00:05"
+    walks = {
+        "spring": (spring, ("", "", ""), 3600.0),
+        "autumn": (autumn, ("", "", ""), 1800.0),
+        "two zones": (moved, ("+02:00", "+01:00", "+02:00"), 3.0),
+        "one without": (spring, ("+02:00", "", "+02:00"), 3600.0),
+    }
+    rgb = np.zeros((8, 16, 3), np.uint8)
+    for name, (stamps, offsets, last_step) in walks.items():
+        frames = [
+            write_photo(tmp_path / f"{name} {k}.jpg", rgb, time=(stamp, "", offset))
+            for k, (stamp, offset) in enumerate(zip(stamps, offsets, strict=True))
+        ]
+        found = times_of(frames, None)
+        assert found is not None
+        assert found[2] - found[1] == last_step
+    monkeypatch.undo()
+    time.tzset()
 
 
 def test_a_frame_that_is_gone_or_another_is_not_read_again(tmp_path):

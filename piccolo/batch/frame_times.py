@@ -3,7 +3,7 @@
 import csv
 import re
 from collections.abc import Sequence
-from datetime import datetime
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,7 +20,7 @@ WANTED = "wanted a CSV file whose first line is name,time: frames by path or fil
 
 
 def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
-    """Seconds of each frame since the first; None where only their order counts.
+    """Seconds of each frame, by the clock of its source; None where only their order counts.
 
     By EXIF, by the last number in each name, or by a table; without a source by EXIF if it tells the times of
     all frames, one after another.
@@ -40,12 +40,16 @@ def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
     else:
         times = _times_in(Path(str(source)), frames)
     check_times(times)
-    return [time - times[0] for time in times]
+    return times
 
 
 def exif_times(frames: Sequence[Path]) -> list[float] | None:
-    """Seconds by EXIF; None if one has none, or can't be read."""
-    times: list[float] = []
+    """Seconds by EXIF; None if one has none, or can't be read.
+
+    Times without an offset from UTC are counted as they are: no time zone is guessed, where an hour may come
+    twice. If frames differ in this, no offset counts.
+    """
+    times: list[datetime] = []
     for frame in frames:
         try:
             text = read_photo_facts(frame).capture_time
@@ -53,8 +57,10 @@ def exif_times(frames: Sequence[Path]) -> list[float] | None:
             return None
         if text is None:
             return None
-        times.append(datetime.fromisoformat(text).timestamp())
-    return times
+        times.append(datetime.fromisoformat(text))
+    if not all(time.tzinfo for time in times):
+        times = [time.replace(tzinfo=UTC) for time in times]
+    return [time.timestamp() for time in times]
 
 
 def _number_in(frame: Path) -> float:

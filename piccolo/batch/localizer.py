@@ -196,13 +196,14 @@ class Localizer:
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask)
 
-    def answer_of_lost(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
-        """Return the answer to a task whose workers were lost."""
-        about = {
-            "settings": settings_json(task.settings, self.cloud_settings, self.read_options),
-            "source": Source(cloud_sha256),
-        }
-        text = f"{task.pano}: {error}"
+    def wait_for(self, task: Task, wait: Callable[[], Answer], cloud_sha256: str | None) -> Answer:
+        """Return the answer to a task, also to one whose workers were lost."""
+        try:
+            return wait()
+        except WorkerLostError as error:
+            text = f"{task.pano}: {error}"
+        settings = settings_json(task.settings, self.cloud_settings, self.read_options)
+        about = {"settings": settings, "source": Source(cloud_sha256)}
         return Answer(unreadable_result(text, self.name, str(task.pano), is_passing=True, **about))
 
     def _pictures(self, scan: OpenedScan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:

@@ -1,20 +1,20 @@
 """Relative poses of photos, as other tools write them."""
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
 from ..errors import InputError
 from ..files.json_file import DAMAGE, describe, read_json, read_text
-from ..geometry.pose import Array, Pose, check_rotation, orthonormal, rotation_from_quaternion_wxyz
+from ..geometry.pose import Array, Pose, check_transform, rotation_from_quaternion_wxyz
 from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
 
 WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio, or a TUM trajectory, in metres"
 ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
 NUM_KITTI = 12  # columns: T_world_from_cam without its last row
-MAX_SKEW = 1e-3  # of R R^T from the identity
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
 NamedPose = tuple[str, Pose]
@@ -52,11 +52,14 @@ def match_names(path: Path, poses: Sequence[NamedPose], photos: Sequence[Path]) 
     return chosen
 
 
-def read_odometry(path: Path, frames: Sequence[Path], times: Sequence[float]) -> list[Pose | None]:
+def read_odometry(
+    path: Path, frames: Sequence[Path], times: Sequence[float], has_clock: bool = True
+) -> list[Pose | None]:
     """Return each frame's pose in the frame of an odometry; None of a frame without one.
 
     A transforms.json names its frames. A trajectory has a pose of each frame in order, or, of TUM, poses by
-    time [s] as the frames have it: each frame takes the nearest, within half of the time to the next frame.
+    time [s]: each frame takes the nearest, within half of the time to the next frame. If `times` are by a
+    clock, that may be the trajectory's; or else the trajectory begins at 0 with the first frame.
 
     Raises InputError if the file is no odometry, or of other frames.
     """
@@ -66,18 +69,22 @@ def read_odometry(path: Path, frames: Sequence[Path], times: Sequence[float]) ->
         rows = [line.split() for line in read_text(path, ODOMETRY).splitlines() if line.strip()]
         rows = [row for row in rows if not row[0].startswith("#")]
         is_kitti = all(len(row) == NUM_KITTI for row in rows)
-        try:
+        with naming(path, ODOMETRY):
             poses = [read_kitti_row(row) if is_kitti else read_tum_row(row) for row in rows]
             clock = np.array([] if is_kitti else [row[0] for row in rows], float)
-        except ValueError as error:
-            raise InputError(f"{path}: found {error}, {ODOMETRY}") from error
-        in_order: list[Pose | None] = [pose for _, pose in poses]
-        found = in_order
-        if len(poses) != len(frames):
-            found = [None if k is None else in_order[k] for k in find_nearest(clock, np.array(times, float))]
+        numbers = match_times(clock, np.array(times, float), has_clock, len(poses) == len(frames))
+        found = [None if k is None else poses[k][1] for k in numbers]
     if not any(found):
         raise InputError(f"{path}: found {len(frames)} frames and no pose of them, {ODOMETRY}")
     return found
+
+
+def match_times(clock: Array, times: Array, has_clock: bool, is_in_order: bool) -> list[int | None]:
+    """Return the number of each frame's row: by a clock, or else in order or since the first."""
+    numbers = find_nearest(clock if has_clock else clock[:0], times)
+    if any(k is not None for k in numbers):
+        return numbers
+    return [*range(len(times))] if is_in_order else find_nearest(clock, times - times[0])
 
 
 def find_nearest(clock: Array, times: Array) -> list[int | None]:
@@ -89,27 +96,33 @@ def find_nearest(clock: Array, times: Array) -> list[int | None]:
     return [k if abs(clock[k] - time) <= slack else None for k, time in zip(nearest, times, strict=True)]
 
 
+@contextmanager
+def naming(path: Path, wanted: str) -> Iterator[None]:
+    """Within this, the error of a damaged row is an InputError that names the file."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{path}, {error}; {wanted}") from error
+    except DAMAGE as error:
+        raise InputError(f"{path}: found {describe(error)}, {wanted}") from error
+
+
 def read_kitti_row(row: Sequence[str]) -> NamedPose:
     """Return the pose of a row, without a name: T_world_from_cam, camera axes right, down, forward."""
-    T = np.array(row, float).reshape(3, 4)
-    check_finite(T, "a row")
-    return "", make_pose(OPTICAL_FROM_CAM.T @ T[:, :3].T, T[:, 3], "a row")
+    return "", check_transform(np.array(row, float).reshape(3, 4), "a row", OPTICAL_FROM_CAM)
 
 
 def read_transforms(path: Path) -> list[NamedPose]:
     """Return the poses in a transforms.json with the photos' paths: T_world_from_cam, right, up, back."""
     poses = []
     document = read_json(path, WANTED)
-    try:
+    with naming(path, WANTED):
         for frame in document["frames"]:
             T = np.array(frame["transform_matrix"], float)
             if T.shape != (4, 4):
                 raise ValueError(f"a transform_matrix of shape {T.shape}")
             name = str(frame["file_path"])
-            check_finite(T, name)
-            poses.append((name, make_pose(OPENGL_FROM_CAM.T @ T[:3, :3].T, T[:3, 3], name)))
-    except DAMAGE as error:
-        raise InputError(f"{path}: found {describe(error)}, {WANTED}") from error
+            poses.append((name, check_transform(T, name, OPENGL_FROM_CAM)))
     return poses
 
 
@@ -117,12 +130,10 @@ def read_lines(path: Path) -> list[NamedPose]:
     """Return the poses in a text file of COLMAP, by the photos' names, or of TUM, by times."""
     lines = [line for line in read_text(path, WANTED).splitlines() if not line.startswith("#")]
     rows = [line.split(None, NUM_COLMAP - 1) for line in lines]
-    try:
+    with naming(path, WANTED):
         if rows and len(rows[0]) == NUM_COLMAP:
             return [read_colmap_row(row) for row in rows[::2] if row]  # points follow each photo
         return [read_tum_row(row) for row in rows if row]
-    except ValueError as error:
-        raise InputError(f"{path}: found {error}, {WANTED}") from error
 
 
 def read_colmap_row(row: Sequence[str]) -> NamedPose:
@@ -130,10 +141,8 @@ def read_colmap_row(row: Sequence[str]) -> NamedPose:
     if len(row) != NUM_COLMAP:
         raise ValueError(f"{len(row)} columns of a photo")
     values = np.array(row[1:8], float)
-    check_finite(values, row[9])
-    R_optical_from_world = read_quaternion(values[:4])
-    center = -R_optical_from_world.T @ values[4:]
-    return row[9], make_pose(OPTICAL_FROM_CAM.T @ R_optical_from_world, center, row[9])
+    T = np.column_stack([read_quaternion(values[:4]), values[4:]])
+    return row[9], check_transform(T, row[9], OPTICAL_FROM_CAM, is_from_world=True)
 
 
 def read_tum_row(row: Sequence[str]) -> NamedPose:
@@ -141,21 +150,8 @@ def read_tum_row(row: Sequence[str]) -> NamedPose:
     if len(row) != NUM_TUM:
         raise ValueError(f"{len(row)} columns")
     values = np.array(row[1:], float)
-    check_finite(values, row[0])
-    R_world_from_optical = read_quaternion(np.roll(values[3:], 1))
-    return row[0], make_pose(OPTICAL_FROM_CAM.T @ R_world_from_optical.T, values[:3], row[0])
-
-
-def check_finite(values: Array, name: str) -> None:
-    """Raise ValueError if a pose has numbers that are not finite."""
-    if not np.isfinite(values).all():
-        raise ValueError(f"{name}: a number that is not finite")
-
-
-def make_pose(R_cam_from_world: Array, center_world: Array, name: str) -> Pose:
-    """Return a pose, its rotation without what was rounded; ValueError if it is no rotation."""
-    R = check_rotation(R_cam_from_world, MAX_SKEW, f"{name}: a matrix that")
-    return Pose(orthonormal(R), center_world)
+    T = np.column_stack([read_quaternion(np.roll(values[3:], 1)), values[:3]])
+    return row[0], check_transform(T, row[0], OPTICAL_FROM_CAM)
 
 
 def read_quaternion(wxyz: Array) -> Array:

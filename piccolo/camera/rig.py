@@ -1,6 +1,5 @@
 """Cameras that take one picture together: where each sits, which part of which picture is its own."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
@@ -9,11 +8,10 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import InputError, unreadable
-from ..geometry.pose import Array, Pose, check_rotation
+from ..geometry.pose import Array, Pose, check_pose
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
-MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
 MAX_OFFSET = 0.1  # [m] between cameras that pass for one without a warning
 MAX_CAMERAS = 64
 Rows = tuple[tuple[float, ...], ...]
@@ -36,9 +34,7 @@ class Mount:
 
     def __post_init__(self) -> None:
         """Refuse what is no place."""
-        check_rotation(self.rotation, MAX_SKEW, "R_lens_from_cam")
-        if len(self.center_cam) != 3 or not all(math.isfinite(x) for x in self.center_cam):
-            raise InputError(f"found center_cam {self.center_cam}, wanted three finite numbers [m]")
+        check_pose(Pose(self.rotation, np.array(self.center_cam)), "R_lens_from_cam, center_cam")
         if len(self.offset) != 2 or not all(isinstance(x, int) and x >= 0 for x in self.offset):
             raise InputError(f"found offset {self.offset}, wanted two whole numbers from 0 [px]")
 

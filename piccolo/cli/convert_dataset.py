@@ -60,9 +60,7 @@ def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
     elif dataset == "generic":
         option(parser, "--poses FILE", "list of poses (default: poses.csv, .json, .txt or .tum in --from)")
         option(parser, "--cloud FILE", "cloud of the scene (default: the only cloud in --from)")
-        option(
-            parser, "--images FOLDER", "folder of pictures named by their times (default: images in --from)"
-        )
+        option(parser, "--images FOLDER", "pictures named by their times (default: images in --from)")
         text = "piccolo: forward, left, up; optical: right, down, forward; opengl: right, up, back"
         option(parser, "--axes", f"axes of the camera; {text}", choices=AXES)
         text = "direction of the transform [R | t] of a row"

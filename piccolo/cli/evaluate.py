@@ -17,7 +17,6 @@ from ..files.atomic import check_output, is_stream, write_atomically
 from ..files.line_file import LineFile, open_locked
 from ..jobs.cluster import Cluster
 from ..jobs.memory import limit_memory
-from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan, settings_json
 from ..result import UNREADABLE, Result, check_scan, describe_failure, read_results
@@ -88,9 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--csv FILE", "write a line per query; - is stdout, also for the other files")
     option(group, "--markdown FILE", "write the tables to this file too")
     option(group, "--errors PNG", "plot: fraction of queries below each error, and recall over thresholds")
-    option(
-        group, "--risk PNG", "plot: fraction wrong over fraction accepted, for decreasing minimum confidence"
-    )
+    option(group, "--risk PNG", "plot: fraction wrong over fraction accepted, for falling minimum confidence")
     add_cloud_reading_options(parser.add_argument_group("clouds"))
     add_panorama_reading_options(parser.add_argument_group("panoramas"))
     add_method_options(parser)
@@ -257,11 +254,7 @@ class Evaluation:
             values = executor.values(tasks)
             pairs = interruption.each(show(iter(values), len(queries), scene.name), values.take_finished())
             for query, is_inside, (task, wait) in zip(queries, are_inside, pairs, strict=False):
-                try:
-                    result = wait().result
-                except WorkerLostError as error:
-                    result = localizer.answer_of_lost(task, error, None).result
-                self.record(scene, query, result, is_inside)
+                self.record(scene, query, localizer.wait_for(task, wait, None).result, is_inside)
 
     def select_labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:
         """Return the queries that have labels; the others are reported."""

@@ -44,24 +44,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(source, "--scenes FOLDER ...", "write the true poses of these scenes, as a reference", default=[])
     option(parser, "--format", "format of the poses, see below", choices=FORMATS, required=True)
     option(parser, "--out FILE", "file of the poses; for colmap and gpano a new folder", required=True)
-    option(
-        parser, "--images FOLDER", "write picture names relative to this folder (default: as in the results)"
-    )
+    option(parser, "--images FOLDER", "write picture names relative to this folder (default: as in results)")
     option(parser, "--all", "also write poses that are ambiguous or not localized")
     option(parser, "--cloud PATH ...", "only results of these clouds", default=[])
     option(parser, "--force", "also take results of clouds with other contents than --cloud")
     group = parser.add_argument_group("options of some formats")
     option(group, "--size W H", f"size of all pictures, which are then not opened ({_takers('size')})")
-    option(
-        group,
-        "--offset X Y Z",
-        f"subtract this from positions, and write it to a file next to --out ({_takers('offset')})",
-    )
+    text = f"subtract this from positions, and write it to a file next to --out ({_takers('offset')})"
+    option(group, "--offset X Y Z", text)
     text = "camera axes: optical (default): right, down, forward; piccolo: forward, left, up"
     option(group, "--axes", f"{text} ({_takers('axes')})", choices=CAMERA_AXES)
-    text = (
-        "index (default): 0, 1, ...; name: the number that is the picture's name; walk: times of the frames"
-    )
+    text = "index (default): 0, 1, ...; name: the number that is the picture's name; walk: the frames' times"
     option(group, "--timestamps", f"{text} ({_takers('timestamps')})", choices=["index", "name", "walk"])
     option(group, "--crs EPSG", f"coordinate system of the cloud, such as EPSG:25832 ({_takers('crs')})")
 

@@ -6,8 +6,8 @@ import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
@@ -20,12 +20,11 @@ from ..batch.priors import read_priors
 from ..batch.results_file import Records
 from ..batch.second_look import Look, list_looks
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..errors import printable
+from ..errors import InputError, printable
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..files.line_file import LineFile, open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.stopwatch import Stopwatch
-from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers, num_cores
 from ..localization.focal_length import WIDE
 from ..localization.settings import CoarseToFineSettings
@@ -50,6 +49,7 @@ from .executing import (
     executing,
     interruptible,
 )
+from .handedness import LEFT_HANDED, is_left_handed
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, show_progress, warn_once
@@ -73,6 +73,7 @@ class Run:
     left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
     counts: Counter[str]  # results written, by status
     cloud_sha256: str | None = None  # of the scan, when it has been opened
+    doubtful: list[str] = field(default_factory=list)  # spheres that were not localized
 
     @property
     def looks_again(self) -> bool:
@@ -189,22 +190,14 @@ def advise(result: Result) -> list[str]:
         return []
     focal = result.focal_length
     if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:
-        return [
-            "  if other photos of this camera are localized, repeat with --focal, the mean of what they find"
-        ]
+        return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
     if result.confidence >= MIN_FIT:
-        others = (
-            "add photos taken beside it" if result.cameras else "localize several photos of a walk (--walk)"
-        )
+        others = "add photos taken beside it" if result.cameras else "localize photos of a walk (--walk)"
         return [f"  to be sure, look at the --overlay, give --near, or {others}"]
-    causes = (
-        "another scan, bare walls, or a wrong focal length"
-        if result.cameras
-        else "another scan, or bare walls"
-    )
-    return [f"  it fits nowhere well: {causes}?"]
+    lens = ", a wrong focal length" if result.cameras else ""
+    return [f"  it fits nowhere well: another scan{lens}, or bare walls?"]
 
 
 def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequence[str]) -> None:
@@ -231,6 +224,8 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     print_result(arguments, result, answer.warnings)
     write(result.to_json())
     run.counts[result.status] += 1
+    if result.best_pose is not None and result.pose is None and not result.cameras:
+        run.doubtful.append(result.pano)
 
 
 def localize_all(
@@ -244,11 +239,7 @@ def localize_all(
         pairs = show_progress(values, is_quiet, **bar)
         # behind the photo after which a signal has ended it come those that are done already
         for task, wait in pairs if run.total == 1 else interruption.each(pairs, values.take_finished()):
-            try:
-                answer = wait()
-            except WorkerLostError as error:
-                answer = run.localizer.answer_of_lost(task, error, run.cloud_sha256)
-            record(run, answer, write)
+            record(run, run.localizer.wait_for(task, wait, run.cloud_sha256), write)
     return interruption
 
 
@@ -265,11 +256,7 @@ def look_again(run: Run, looks: Sequence[Look], executor: Executor, output: Outp
     with interruptible() as interruption:
         pairs = show_progress(values, run.arguments.quiet, desc="second look", total=len(looks), unit="")
         for look, (task, wait) in zip(looks, interruption.each(pairs, values.take_finished()), strict=False):
-            try:
-                answer = wait()
-            except WorkerLostError as error:
-                answer = localizer.answer_of_lost(task, error, run.cloud_sha256)
-            record_second(run, look, answer, output)
+            record_second(run, look, localizer.wait_for(task, wait, run.cloud_sha256), output)
     return interruption
 
 
@@ -285,6 +272,14 @@ def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
         record(run, answer, replace_line)
     else:
         replace_line(result.to_json())
+
+
+def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
+    """Say so if no photo was localized, but some are mirrored."""
+    is_over = interruption.number or run.counts[LOCALIZED] or records.counts[LOCALIZED]
+    with suppress(OSError, InputError):  # the results are written: it is only a hint
+        if not (is_over or run.arguments.quiet) and is_left_handed(run.localizer, run.doubtful, executor):
+            print_note(run.arguments, LEFT_HANDED)
 
 
 def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
@@ -331,10 +326,9 @@ def main(arguments: argparse.Namespace) -> int:
     if arguments.relative or arguments.color_scan:
         localizer = run.localizer
         opening = partial(open_scan, run, localizer, arguments.threads or num_cores())
-        run_together = run_bundle if arguments.relative else run_coloring
-        return run_together(
-            arguments, list(run.panoramas), localizer, opening, partial(print_result, arguments)
-        )
+        run_all = run_bundle if arguments.relative else run_coloring
+        printing = partial(print_result, arguments)
+        return run_all(arguments, list(run.panoramas), localizer, opening, printing)
     rig = run.localizer.read_options.rig
     with open_output(run) as (output, records):
         panoramas = iter(run.panoramas)
@@ -364,4 +358,5 @@ def main(arguments: argparse.Namespace) -> int:
             interruption = localize_all(run, records, rest, executor, output.write)
             if looks := [] if interruption.number else plan_looks(run, output):
                 interruption = look_again(run, looks, executor, output)
+            note_left_handed(run, records, executor, interruption)
         return finish(run, records, output, interruption, watch.seconds["all"])

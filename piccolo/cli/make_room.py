@@ -83,9 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--camera FILE", text)
     option(parser, "--size X Y Z", "size of a room [m]", default=[6.0, 5.0, 2.7])
     option(parser, "--rooms N", "number of rooms, at most 256", default=1)
-    option(
-        parser, "--labels", "also write a semantic label of each point and pixel, for localize.py --labels"
-    )
+    option(parser, "--labels", "also write semantic labels of points and pixels, for localize.py --labels")
     option(
         parser,
         "--scenes N",
@@ -93,9 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
     )
     group = parser.add_argument_group("buildings and walks")
-    text = (
-        "number of storeys of a building, where corridors, halls and stairs connect the rooms (1 with --walk)"
-    )
+    text = "number of storeys of a building, where corridors, halls and stairs join the rooms (1 with --walk)"
     option(group, "--storeys N", text, default=0)
     option(
         group,

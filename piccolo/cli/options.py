@@ -52,9 +52,7 @@ MIN_EVERY = 0.01  # [s]
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
     parser.add_argument("--version", action="version", version=f"piccolo {__version__}")
-    text = (
-        "one or several files of a coloured scan (formats: docs/USAGE.md), or a map of tools/prepare_map.py"
-    )
+    text = "files of one coloured scan (formats: docs/USAGE.md), or a map of tools/prepare_map.py"
     add_cloud_options(parser, text)
     group = parser.add_argument_group("photos")
     text = (
@@ -115,19 +113,15 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     option(group, "--fov DEG", text)
     text = "projection of the picture (default equirectangular; pinhole if EXIF has a focal length)"
     group.add_argument("--projection", choices=get_args(Projection), help=text)
-    option(
-        group, "--focal PX", "focal length of a pinhole photo, in its pixels, accurate to 1 %%", type=float
-    )
+    option(group, "--focal PX", "focal length of a pinhole photo, in its pixels, known to 1 %%", type=float)
     text = (
-        "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times as long"
+        "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times longer"
     )
     option(group, "--refine-focal", text)
     text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON as in docs/CAMERAS.md; "
     text += "or a folder with NAME.camera.json or NAME.json for each photo"
     option(group, "--camera FILE", text)
-    text = (
-        "calibration of a rig: COLMAP's rig_config.json, or JSON as in docs/CAMERAS.md; a query is a folder"
-    )
+    text = "calibration of a rig: COLMAP's rig_config.json, or JSON of docs/CAMERAS.md; a query is a folder"
     option(group, "--rig FILE", text)
     text = "down in camera axes (+x image centre, +y left, +z up), of any length; 0 0 -1: upright camera"
     option(group, "--gravity-vector X Y Z", text)
@@ -143,10 +137,8 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
 def add_method_options(parser: argparse.ArgumentParser) -> None:
     """Add the preset and its settings."""
     group = parser.add_argument_group("method")
-    text = (
-        "default: search of all positions on prepared views; paper: Kim et al., ICCV 2021, Algorithm 1; then "
-    )
-    text += "settings as NAME=VALUE, such as solver=lbfgs (docs/API.md)"
+    text = "default: search of all positions on prepared views; paper: Kim et al., ICCV 2021, Algorithm 1; "
+    text += "then settings as NAME=VALUE, such as solver=lbfgs (docs/API.md)"
     group.add_argument("--preset", nargs="+", default=["default"], metavar="NAME", help=text)
     text = "known: the camera was upright and z of the cloud is up; unknown: any rotation; auto: try both "
     text += "(default auto)"
@@ -159,18 +151,13 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     """Add what the user knows beforehand."""
     title = "prior knowledge (preset default only); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
-    text = (
-        "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, within, "
-    )
-    text += "gravity_x, gravity_y, gravity_z; they take precedence over the options for all photos"
+    text = "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, "
+    text += "within, gravity_x, gravity_y, gravity_z; they take precedence over the options for all photos"
     option(group, "--priors FILE", text)
     option(group, "--near X Y Z RADIUS", "the camera was within RADIUS of this position [m]")
     option(group, "--height MIN MAX", "height of the camera above the floor [m]")
-    option(
-        group,
-        "--heading DEG",
-        "heading of the image centre, clockwise from the cloud's +y; within 20 degrees",
-    )
+    text = "heading of the image centre, clockwise from the cloud's +y; within 20 degrees"
+    option(group, "--heading DEG", text)
     text = "the camera was in one of these scans of a map made with tools/prepare_map.py --add"
     option(group, "--within NAME ...", text)
 
@@ -186,17 +173,13 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--video FILE", "video of a walk, instead of --pano")
     text = "seconds from one frame of a video to the next, the sharpest around each time "
     option(group, "--every S", f"{text}(default {DEFAULT_EVERY})")
-    text = (
-        f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file with "
-    )
-    text += f"the columns name and time [s] (default {EXIF} if its times differ, else {ORDER})"
+    text = f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file "
+    text += f"with the columns name and time [s] (default {EXIF} if its times differ, else {ORDER})"
     option(group, "--times SOURCE", text)
     text = f"maximum speed of the camera [m/s] (default {MAX_SPEED:g}); if only the order is known, "
     option(group, "--max-speed X", text + f"maximum distance between frames [m] (default {MAX_STEP:g})")
-    text = (
-        "odometry of the camera [m], by which a walk tells identical places apart: TUM or KITTI trajectory, "
-    )
-    option(group, "--odometry FILE", text + "or transforms.json (ARKit)")
+    text = "odometry of the camera [m], by which a walk tells identical places apart: TUM or KITTI "
+    option(group, "--odometry FILE", text + "trajectory, or transforms.json (ARKit)")
 
 
 def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | None = None) -> None:

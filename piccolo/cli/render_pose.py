@@ -16,8 +16,8 @@ from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
-from ..geometry.pose import Pose, check_rotation, orthonormal, pose_errors
-from ..geometry.rotations import R_cam_from_angles
+from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
+from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
 from ..optimize.descent_animation import (
     FRAME_WIDTH,
@@ -60,7 +60,6 @@ stdout is an output.
 MAX_WIDTH = 32_768
 MIN_WIDTH = 16
 MAX_POSE_FILE = 65_536  # [byte] sixteen numbers and some comments
-MAX_SKEW = 1e-3  # off a rotation, for matrices written with few digits
 DESCENT_WIDTH = 1024  # of the panorama
 DESCENT = DescentSettings(solver="adam")
 START_DISTANCE = 0.3  # of a descent from the pose [m]
@@ -90,15 +89,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(one, "--queries FILE", "queries.json with true poses")
     option(one, "--pose FILE", "text file with the 4 x 4 numbers of T_world_from_cam")
     option(one, "--at X Y Z", "position in world coordinates [m]")
-    option(
-        group, "--pano NAME", "choose the pose of this panorama (file name); needed if --queries has several"
-    )
+    option(group, "--pano NAME", "choose the pose of this panorama (file name), if --queries has several")
     for angle in ("heading", "pitch", "roll"):
         option(group, f"--{angle} DEG", f"{angle} with --at (default 0)")
     group = parser.add_argument_group("picture")
-    option(
-        group, "--out FILE", ".png or .jpg; for several poses a new folder of .png, named like the panoramas"
-    )
+    option(group, "--out FILE", ".png or .jpg; for several poses a new folder of .png, named like the photos")
     option(group, "--width PX", "width of a spherical picture, twice its height", default=2048)
     text = "render the view of this camera (docs/CAMERAS.md; default: that of --result, else a sphere)"
     option(group, "--camera FILE", text)
@@ -169,7 +164,8 @@ def poses_from(arguments: argparse.Namespace) -> list[Shot]:
         raise InputError(f"{arguments.camera}: found {len(given)} cameras, wanted one")
     if arguments.at:
         angles = [angle or 0.0 for angle in (arguments.heading, arguments.pitch, arguments.roll)]
-        return [shot_of("at", Pose(R_cam_from_angles(*angles), np.array(arguments.at)), given)]
+        pose = check_pose(Pose(R_cam_from_angles(*angles), np.array(arguments.at)), "--at")
+        return [shot_of("at", pose, given)]
     if arguments.pose:
         return [shot_of(str(arguments.pose), read_pose_matrix(arguments.pose), given)]
     file = arguments.queries or arguments.result
@@ -197,13 +193,11 @@ def read_pose_matrix(path: Path) -> Pose:
         T = np.array(rows, dtype=np.float64)
     except ValueError as error:  # words, lines of several lengths
         raise InputError(f"{path}: found {error}, {wanted}") from error
-    if T.shape != (4, 4) or not np.isfinite(T).all():
-        shape = " x ".join(map(str, T.shape))
-        raise InputError(f"{path}: found {shape} numbers, not all finite or not as many, {wanted}")
+    if T.shape != (4, 4):
+        raise InputError(f"{path}: found {' x '.join(map(str, T.shape))} numbers, {wanted}")
     if not np.allclose(T[3], [0.0, 0.0, 0.0, 1.0]):
         raise InputError(f"{path}: the last row is not 0 0 0 1, {wanted}")
-    R_world_from_cam = check_rotation(T[:3, :3], MAX_SKEW, f"{path}: the matrix on the left")
-    return Pose(orthonormal(R_world_from_cam).T, T[:3, 3])
+    return check_transform(T, str(path), CAMERA_AXES["piccolo"])
 
 
 def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:

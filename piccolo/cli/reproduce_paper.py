@@ -42,9 +42,8 @@ PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFin
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options."""
-    parser.add_argument(
-        "names", nargs="+", choices=list(EXPERIMENTS), metavar="NAME", help="experiments, see below"
-    )
+    names = list(EXPERIMENTS)
+    parser.add_argument("names", nargs="+", choices=names, metavar="NAME", help="experiments, see below")
     option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
     option(parser, "--out FOLDER", "folder of the tables and runs; created if missing", required=True)
     option(parser, "--variants NAME ...", "only these splits of the data", default=[])

@@ -22,7 +22,7 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
-from ..result import FAILED
+from ..result import FAILED, UNREADABLE
 from ..scan_walk import Walk
 from ..walk.motion import Motion
 from .command import check_alone, check_only_with
@@ -33,6 +33,7 @@ from .progress import progress_bar, show_progress
 
 ONLY_WITH = ("times", "max_speed", "odometry")
 NOT_WITH = ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
+NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
 KEY_BEGINS = b'{"'
 
 
@@ -70,27 +71,23 @@ def walk_frames(
     arguments: argparse.Namespace, panoramas: Sequence[Path]
 ) -> Iterator[tuple[list[WalkInput], Motion]]:
     """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
-    if arguments.video is None:
-        times = times_of(panoramas, arguments.times)
-        numbers = times or [float(k) for k in range(len(panoramas))]
-        frames = [WalkInput(path, time, str(path)) for path, time in zip(panoramas, numbers, strict=True)]
-        motion = Motion(arguments.max_speed, is_timed=times is not None)
-        yield add_odometry(frames, arguments.odometry), motion
-        return
-    with temporary_folder() as folder:
-        found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
-        bar = {"desc": "read the video", "unit": " frames", "leave": False}
-        shots = show_progress(found, arguments.quiet, **bar)
-        frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
-        yield add_odometry(frames, arguments.odometry), Motion(arguments.max_speed)
-
-
-def add_odometry(frames: list[WalkInput], path: Path | None) -> list[WalkInput]:
-    """Return the frames with their poses in an odometry, if there is one."""
-    if path is None:
-        return frames
-    poses = read_odometry(path, [frame.path for frame in frames], [frame.time for frame in frames])
-    return [frame._replace(odometry=pose) for frame, pose in zip(frames, poses, strict=True)]
+    with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
+        times = None
+        if arguments.video:
+            found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
+            shots = show_progress(found, arguments.quiet, desc="read the video", unit=" frames", leave=False)
+            frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
+        else:
+            times = times_of(panoramas, arguments.times)
+            clock = times or [float(k) for k in range(len(panoramas))]
+            frames = [WalkInput(p, t - clock[0], str(p)) for p, t in zip(panoramas, clock, strict=True)]
+        if arguments.odometry:
+            paths = [frame.path for frame in frames]
+            when = times or [frame.time for frame in frames]
+            poses = read_odometry(arguments.odometry, paths, when, has_clock=times is not None)
+            frames = [f._replace(odometry=pose) for f, pose in zip(frames, poses, strict=True)]
+        is_timed = times is not None or arguments.video is not None
+        yield frames, Motion(arguments.max_speed, is_timed=is_timed)
 
 
 def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: Walk) -> int:
@@ -136,12 +133,25 @@ def follow_all(arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkI
             pairs = show_progress(prepared, arguments.quiet, **bar)
             for frame, wait in interruption.each(pairs) if file else pairs:
                 result = walk.follow(wait(), frame.time, frame.odometry)
+                if result.status == UNREADABLE and frame is frames[0]:
+                    check_others(walk, frames, str(result.error), path)
                 if result.error is not None:
                     print_error(arguments, result.error, EXIT_BAD_INPUT)
                 if file is not None:
                     file.append(walk.last_to_json())
         pool.shutdown(cancel_futures=True)
     return interruption
+
+
+def check_others(walk: Walk, frames: Sequence[WalkInput], error: str, path: Path | None) -> None:
+    """Refuse a walk whose first frames, and the last, can't be read for one reason; nothing is kept."""
+    others = [*frames[1:NUM_TRIED], frames[-1]]
+    found = (str(walk.prepare(other.path, other.name).blank.error) for other in others)
+    is_same = (text.replace(o.name, frames[0].name) == error for text, o in zip(found, others, strict=True))
+    if len(frames) > NUM_TRIED and all(is_same):
+        if path:
+            path.unlink()
+        raise InputError(f"{error}; the other {len(frames) - 1} frames seem no better")
 
 
 def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, is_new: bool) -> None:

@@ -66,8 +66,8 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
         pyproj = import_optional("a coordinate system in LAS", "pyproj", "tools")
         header.add_crs(pyproj.CRS.from_user_input(crs))
     is_packed = out.suffix.lower() == ".laz"
-    with replacing(out) as file:
-        writer = laspy.open(file, mode="w", header=header, do_compress=is_packed, closefd=False)
+    how = {"mode": "w", "header": header, "do_compress": is_packed, "closefd": False}
+    with replacing(out) as file, laspy.open(file, **how) as writer:
 
         def add(points: Array, colors: NDArray[np.uint8], num_photos: NDArray[np.uint8]) -> None:
             record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
@@ -77,7 +77,6 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
             writer.write_points(record)
 
         yield add
-        writer.close()
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
-from ..geometry.pose import Array, rotate_points
+from ..geometry.pose import MAX_COORDINATE, Array, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
 from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness
@@ -19,10 +19,10 @@ from .settings import Channel, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
-MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
 MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
 METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
 FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
+COARSE = 0.01  # [m] steps between float32 numbers that are reported, from 131 km on
 MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
 Chunk = tuple[NDArray[np.float64], NDArray[np.uint8]]  # finite points (N, 3) [m], colours (N, 3)
@@ -38,13 +38,15 @@ class PointValidator:
     num_finite: int = 0
     num_dropped: int = 0  # with NaN or infinite coordinates
     brightest: int = 0
+    step: float = 0.0  # [m] between numbers at the farthest point that is stored in float32
 
     def filter(self, raw: RawCloud) -> Chunk:
         """Count the points of a chunk; return the finite ones in metres."""
-        points = raw.points_world
-        colors = raw.colors
-        is_finite: NDArray[np.bool_] = np.all(np.isfinite(points), axis=1)
+        is_finite: NDArray[np.bool_] = np.all(np.isfinite(raw.points_world), axis=1)
         num_finite = int(np.count_nonzero(is_finite))
+        colors = raw.colors
+        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
+            points: Array = raw.points_world.astype(np.float64, copy=False)
         if num_finite < len(points):
             points = points[is_finite]
             colors = colors[is_finite]
@@ -57,6 +59,8 @@ class PointValidator:
             if farthest > MAX_COORDINATE:
                 found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
                 raise InputError(f"{self.path}: {found}; remove broken points or set `units`")
+            if raw.points_world.dtype == np.float32:
+                self.step = max(self.step, float(np.spacing(np.float32(farthest / self.scale))) * self.scale)
         return points, colors
 
     def check(self) -> None:
@@ -69,10 +73,14 @@ class PointValidator:
             raise InputError(f"{self.path}: {found}; numbers without a declared range are 0-255, not 0-1")
 
     def warnings(self) -> tuple[str, ...]:
-        """Return a warning if points were left out."""
+        """Return warnings if points were left out, or are stored with too few digits."""
+        found = []
         if self.num_dropped:
-            return (f"{self.path}: {self.num_dropped} points with NaN or infinite coordinates left out",)
-        return ()
+            found.append(f"{self.num_dropped} points with NaN or infinite coordinates left out")
+        if self.step >= COARSE:
+            what = f"its float32 coordinates, far from the origin, are rounded to {self.step:.2g} m"
+            found.append(f"{what}: export it in float64, or nearer to its origin")
+        return tuple(f"{self.path}: {text}" for text in found)
 
 
 def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
@@ -211,6 +219,8 @@ def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | N
     if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted arrays of shape (N, 3)")
+    if points.dtype.kind not in "fiu":
+        raise InputError(f"points: found {points.dtype}, wanted numbers")
     given = np.full(points.shape, GRAY, np.uint8) if colors is None else colors
     brightest = find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
     chunk = next(iter(color_chunks([(points, given)], brightest, lambda row: f"{ARRAYS}, row {row}")))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..cloud.octree import Octree
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel, pixel_rays
-from ..kernels.jit import F0, kernel
+from ..kernels.jit import F0, kernel, whole
 from ..local_features.view_image import render_gray
 from ..panorama.texels import in_camera, pose_float32
 
@@ -58,7 +58,7 @@ def weigh_points(
         x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
         rho2 = x * x + y * y
         u, v = direction_to_pixel(x, y, z, np.sqrt(rho2), np.float32(width))
-        i = min(int(v), height - 1)
-        j = min(int(u), width - 1)
+        i = min(whole(v), height - 1)
+        j = min(whole(u), width - 1)
         is_seen = np.sqrt(rho2 + z * z) <= ranges[i, j] * BEHIND + BEHIND_OFFSET
         found[n] = weights[i, j] if is_seen else F0

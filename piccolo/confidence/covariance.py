@@ -5,14 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.pose import Array
+from ..geometry.pose import Array, ByValue
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 
 SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction
 
 
-@dataclass(frozen=True)
-class PoseCovariance:
+@dataclass(frozen=True, eq=False)
+class PoseCovariance(ByValue):
     """Covariance (6, 6) of a pose: rotation [rad] about the camera's axes, then translation [m] in the world.
 
     The true pose is R_true = exp([w]x) R_cam_from_world, center_true = center_world + d, with (w, d) of mean

@@ -84,8 +84,10 @@ def document_of(text: str, form: str, label: str) -> Iterator[Any]:
     """
     try:
         document = json.loads(text)
-        if document["format"] != form:
-            raise InputError(f"{label}: found format {document['format']!r}, wanted {form!r}")
+        found = document.get("format") if isinstance(document, dict) else None
+        if found != form:
+            words = "no format" if found is None else f"format {found!r}"
+            raise InputError(f"{label}: found {words}, wanted {form!r}")
         yield document
     except InputError:
         raise

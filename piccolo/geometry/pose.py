@@ -15,11 +15,33 @@ Array = NDArray[np.float64]
 NEWTON_STEPS = 4  # from an error of 5 % to rounding
 MAX_DISTANCE = 0.1  # [m] the paper's line between correct and wrong
 MAX_ANGLE = math.radians(5.0)
+MAX_SKEW = 1e-3  # of R R^T from the identity, in poses from outside: matrices are written with few digits
+MAX_COORDINATE = 1e8  # [m], ten times the Earth: beyond it lie only broken numbers, and float32 gives way
 TINY = 1e-150  # sine of an angle; of smaller ones the direction is lost to underflow
 
 
-@dataclass(frozen=True)
-class Pose:
+class ByValue:
+    """A dataclass of arrays, compared and hashed by their values."""
+
+    def _values(self) -> tuple[object, ...]:
+        values = vars(self).values()
+        return tuple((v.shape, *v.flat) if isinstance(v, np.ndarray) else v for v in values)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, type(self)) and self._values() == other._values()
+
+    def __hash__(self) -> int:
+        return hash(self._values())
+
+    def freeze(self) -> None:
+        """Make the arrays read-only."""
+        for value in vars(self).values():
+            if isinstance(value, np.ndarray):
+                value.setflags(write=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose(ByValue):
     """Position and rotation of a camera: `x_cam = R_cam_from_world @ (x_world - center_world)`.
 
     Parameters
@@ -134,6 +156,40 @@ def check_rotation(R: Array, tolerance: float, label: str) -> Array:
     if not (is_tame and np.abs(R @ R.T - np.eye(3)).max() < tolerance and np.linalg.det(R) > 0.0):
         raise InputError(f"{label} is no rotation")
     return R
+
+
+def check_pose(pose: object, label: str, tolerance: float = MAX_SKEW) -> Pose:
+    """Return a copy of a pose from outside, in float64; InputError, naming it `label`, if it is none.
+
+    A pose is a rotation (3, 3), R R^T within `tolerance` of the identity, and a finite position (3,) [m].
+    """
+    if not isinstance(pose, Pose):
+        raise InputError(f"{label}: found {type(pose).__name__}, wanted a Pose")
+    parts = pose.R_cam_from_world, pose.center_world
+    is_numeric = all(isinstance(part, np.ndarray) and part.dtype.kind in "fiu" for part in parts)
+    if not is_numeric or [part.shape for part in parts] != [(3, 3), (3,)]:
+        kinds = [(getattr(part, "dtype", type(part).__name__), getattr(part, "shape", "")) for part in parts]
+        found = " and ".join(f"{kind} {shape}".strip() for kind, shape in kinds)
+        raise InputError(f"{label}: found {found}, wanted arrays of numbers, (3, 3) and (3,)")
+    R, center = (np.array(part, np.float64, order="C") for part in parts)
+    if not np.abs(center).max() <= MAX_COORDINATE:  # NaN is not either
+        wanted = f"wanted finite numbers up to {MAX_COORDINATE:.0e} m"
+        raise InputError(f"{label}: found a position {center.tolist()}, {wanted}")
+    return Pose(check_rotation(R, tolerance, f"{label}: found a matrix that"), center)
+
+
+def check_transform(
+    T: Array, label: str, other_from_cam: Array, is_from_world: bool = False, tolerance: float = MAX_SKEW
+) -> Pose:
+    """Return the pose of [R | t] (3 or 4, 4), from a tool's camera coordinates to the world's, or back.
+
+    The rotation is without what was rounded. InputError, naming it `label`, if it is no pose.
+    """
+    given = check_pose(Pose(T[:3, :3], T[:3, 3]), label, tolerance)
+    R = orthonormal(given.R_cam_from_world)
+    if is_from_world:
+        return Pose(other_from_cam.T @ R, -given.R_cam_from_world.T @ given.center_world)
+    return Pose(other_from_cam.T @ R.T, given.center_world)
 
 
 def angle_between(R_a: Array, R_b: Array) -> float:

@@ -220,6 +220,12 @@ def inline_kernel(function: Function) -> Function:
 
 
 @inline_kernel
+def whole(u: Scalar) -> np.int32:
+    """Return the whole part of a pixel coordinate; 0 for NaN, which would be an index out of any array."""
+    return np.int32(u) if u >= F0 else np.int32(0)
+
+
+@inline_kernel
 def copy_to(target: NDArray[Any], source: NDArray[Any]) -> None:
     """Write an array into another of its shape, both contiguous.
 

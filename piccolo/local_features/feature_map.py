@@ -12,7 +12,7 @@ from ..geometry.pose import Array, Pose
 from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
 from ..jobs.threads import Workers
-from ..kernels.jit import inline_kernel, kernel
+from ..kernels.jit import inline_kernel, kernel, whole
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .perspective_view import cover_sphere
 from .view_image import render_gray
@@ -266,7 +266,7 @@ def next_unseen(
             if across >= spacing * spacing or up >= LAYER:
                 continue
             u, v = direction_to_pixel(dx, dy, dz, np.sqrt(across), width)
-            limit = ranges[k, cells[min(int(v), height - 1), min(int(u), width - 1)]]
+            limit = ranges[k, cells[min(whole(v), height - 1), min(whole(u), width - 1)]]
             if limit == 0.0 or np.sqrt(across + dz * dz) < limit + SLACK:
                 is_covered = True
                 break

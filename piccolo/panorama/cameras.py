@@ -28,6 +28,7 @@ TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
 HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole set it exactly"
+AS_SPHERE = "read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole: it has "
 GUESS = "`refine_focal` needs EXIF, `focal_px`, `camera`, or `projection` pinhole and `fov_deg`"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
 # standard deviations of the logarithm of a focal length: a first guess, a number of pixels, a field of view
@@ -69,16 +70,14 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
     if lens in ("pinhole", "fisheye") and options.fov_deg is not None:
         return Cameras((Mount(camera_of_fov(lens, options.fov_deg, width, height)),), OF_FIELD)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
-    is_photo = lens is None and options.fov_deg is None and not has_gpano and not is_two_to_one
+    is_photo = lens is None and options.fov_deg is None and not has_gpano
     if not (is_photo or lens == "pinhole"):
         return Cameras()
     found = read_focal_length(picture.exif, picture.size)
-    if found is None:
-        if lens == "pinhole":
-            raise InputError(
-                f"{path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`"
-            )
-        return Cameras()
+    if found is None and lens == "pinhole":
+        raise InputError(f"{path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`")
+    if found is None or (is_two_to_one and lens is None):
+        return Cameras(notes=(f"{AS_SPHERE}{found.source}",) if found else ())
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
     note = (
         f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px from {found.source}"

@@ -73,10 +73,10 @@ def make_panorama(path: Path, picture: Picture, options: ReadOptions) -> Panoram
     fields = gpano_fields(picture.xmp)
     cameras = cameras_of(path, picture, options, bool(fields))
     gpano = attitude(fields) if fields else None
+    picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
     if cameras.mounts:
         if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
             gpano = GPano(elevation)
-        picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
         return _on_sphere(path, [(path, picture, cameras.mounts)], options, gpano, cameras.deviation)
     region, more = _region_of(path, picture, fields, options)
     picture = replace(picture, warnings=(*picture.warnings, *more))

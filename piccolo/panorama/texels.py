@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..geometry.colors import pack_rgbx
 from ..geometry.sphere import direction_to_pixel, solid_angles
-from ..kernels.jit import F1, HALF, Scalar, inline_kernel
+from ..kernels.jit import F1, HALF, Scalar, inline_kernel, whole
 
 BYTE = np.int32(255)
 CHUNK = 512  # points
@@ -71,8 +71,8 @@ def locate_texel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: int) -> tu
     """
     u, v = direction_to_pixel(x, y, z, rho, np.float32(width))
     u, v = u + HALF, v + HALF
-    j = np.int32(u)
-    i = np.int32(v)
+    j = whole(u)
+    i = whole(v)
     return np.int32(i * np.int32(width + 2) + j), u - np.float32(j), v - np.float32(i)
 
 

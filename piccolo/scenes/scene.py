@@ -15,7 +15,7 @@ from ..camera.files import document_of, read_mounts
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.json_file import DAMAGE, describe, read_json
-from ..geometry.pose import Pose, check_rotation
+from ..geometry.pose import Pose, check_pose
 from ..geometry.sphere import CONVENTION
 
 QUERIES_NAME = "queries.json"
@@ -110,12 +110,9 @@ def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
         raise ValueError(f"queries[{number}] with an image, a variant or labels that are no plain text")
     R_cam_from_world = np.array(entry["R_cam_from_world"], float)
     center_world = np.array(entry["center_world"], float)
-    if center_world.shape != (3,) or not np.isfinite(center_world).all():
-        raise ValueError(f"{entry['image']}: a center_world that is not three finite numbers")
-    check_rotation(R_cam_from_world, MAX_SKEW, f"{entry['image']}: an R_cam_from_world that")
     labels = folder / entry["labels"] if entry.get("labels") else None
     cameras = read_mounts(entry["camera"]) if entry.get("camera") else ()
-    pose = Pose(R_cam_from_world, center_world)
+    pose = check_pose(Pose(R_cam_from_world, center_world), entry["image"], MAX_SKEW)
     return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *_walk_of(entry))
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.pose import Array
 from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
-from ..kernels.jit import F0, F1, HALF, kernel
+from ..kernels.jit import F0, F1, HALF, kernel, whole
 from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscore
 from .zbuffer import VISIBLE_FACTOR
 
@@ -122,13 +122,13 @@ def locate(
         z = Z[i]
         rho2 = x * x + y * y
         ring = (HALF * PI - atan2(z, math.sqrt(rho2))) * per_pi
-        cells[i] = np.int32(min(max(ring, F0), num_rings - F1))
+        cells[i] = whole(min(ring, num_rings - F1))
         turns[i] = atan2(y, x) * per_turn + HALF
         ranges[i] = math.sqrt(rho2 + z * z)
     for i in range(len(cells)):
         ring = cells[i]
         n = num_columns[ring]
-        cells[i] = first[ring] + min(np.int32(turns[i] * np.float32(n)), n - np.int32(1))
+        cells[i] = first[ring] + min(whole(turns[i] * np.float32(n)), n - np.int32(1))
 
 
 @kernel

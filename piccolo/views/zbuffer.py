@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import direction_to_pixel, solid_angles
-from ..kernels.jit import kernel
+from ..kernels.jit import kernel, whole
 from ..panorama.texels import Pose32, channel, in_camera, pose_float32
 
 Coordinates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]  # x, y, z (N,) [m]
@@ -65,7 +65,7 @@ def cells_and_ranges(
         px, py, pz = in_camera(x[i], y[i], z[i], pose)
         rho2 = px * px + py * py
         u, v = direction_to_pixel(px, py, pz, math.sqrt(rho2), W)
-        cells[i] = min(np.int32(v), last_row) * np.int32(width) + min(np.int32(u), last_column)
+        cells[i] = min(whole(v), last_row) * np.int32(width) + min(whole(u), last_column)
         ranges[i] = math.sqrt(rho2 + pz * pz)
     return len(x)
 

@@ -29,6 +29,7 @@ from .reader import (
     find_full_brightness,
     in_chunks,
     point_label,
+    points_of,
     quote_line,
     read_records,
 )
@@ -108,7 +109,7 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
 def _bare_source(path: Path, rows: ArrayInFile) -> PointSource:
     """Return the source of points alone, in the first three columns."""
     return PointSource(
-        path, lambda: bare_points(np.asarray(r[:, :3], np.float64) for r in rows.read_rows()), rows.shape[0]
+        path, lambda: bare_points(points_of(list(r.T)) for r in rows.read_rows()), rows.shape[0]
     )
 
 

@@ -27,7 +27,7 @@ MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 b
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
-PointsWithScalar = tuple[NDArray[np.float64], NDArray[np.float64]]
+PointsWithScalar = tuple[NDArray[np.floating[Any]], NDArray[np.float64]]
 ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
 # The value that means full brightness, by the type of a field without its byte order.
 BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
@@ -56,7 +56,7 @@ class MissingChannelError(InputError):
 class RawCloud(NamedTuple):
     """Points in the file's order and unit, not yet checked."""
 
-    points_world: NDArray[np.float64]  # (N, 3) in the file's unit, maybe NaN or infinite
+    points_world: NDArray[np.floating[Any]]  # (N, 3) in the file's unit, maybe NaN; float32 if stored as such
     colors: NDArray[np.uint8]  # (N, 3) RGB
 
 
@@ -121,7 +121,7 @@ def color_chunks(
     num_before = 0
     for points, values in chunks:
         with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
-            points_world = points.astype(np.float64)
+            points_world = points.astype(float_type([points]))
         if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
             colors = np.array(values, dtype=np.uint8)
         else:  # a point without a finite position needs no colour: it becomes black
@@ -161,10 +161,15 @@ def in_chunks(columns: list[NDArray[Any]]) -> Iterator[list[NDArray[Any]]]:
         yield [column[begin : begin + CHUNK] for column in columns]
 
 
-def points_of(columns: Columns) -> NDArray[np.float64]:
+def float_type(columns: Columns) -> type[np.floating[Any]]:
+    """Return float32 for columns that are all stored so, in any order of bytes, else float64."""
+    return np.float32 if all(column.dtype.str[1:] == "f4" for column in columns) else np.float64
+
+
+def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
     """Return the points (N, 3) in the first three columns."""
     with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
-        return np.stack(columns[:3], axis=1, dtype=np.float64)
+        return np.stack(columns[:3], axis=1, dtype=float_type(columns[:3]))
 
 
 def column_source(
@@ -192,7 +197,7 @@ def _read_colored(path: Path, read_columns: ColumnReader, brightest: float) -> I
     return color_chunks(parts, brightest, partial(point_label, path))
 
 
-def bare_points(chunks: Iterable[NDArray[np.float64]]) -> Iterator[RawCloud]:
+def bare_points(chunks: Iterable[NDArray[np.floating[Any]]]) -> Iterator[RawCloud]:
     """Yield points (N, 3) of which only the shape counts, in grey."""
     return (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points in chunks)
 

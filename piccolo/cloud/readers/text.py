@@ -145,7 +145,7 @@ class NumberLines:
             else:
                 raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
 
-    def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+    def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
         """Yield the points (N, 3) of the lines that `read_rows` would read, with the other columns.
 
         These are colours (N, 3), checked to be 0-255, if six columns are read, else the fourth column (N,).

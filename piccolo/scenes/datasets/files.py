@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...cloud import FORMATS
-from ...cloud.stream import MAX_COORDINATE
 from ...errors import InputError
 from ...files.json_file import read_text
-from ...geometry.pose import Array, Pose, check_rotation, orthonormal
+from ...geometry.pose import Array, Pose, check_transform
 from ...geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from ...panorama.picture import read_picture
 from .model import Labels
@@ -50,27 +49,9 @@ def read_matrix(path: Path, num_rows: int) -> Array:
     return numbers.reshape(num_rows, 4)
 
 
-def check_pose(where: str, R_other_from_world: Array, center_world: Array, axes: str) -> Pose:
-    """Return the pose of a camera with axes by name; `where` names the file for refusals."""
-    check_transform(where, R_other_from_world, center_world)
-    return Pose(AXES[axes].T @ orthonormal(R_other_from_world), center_world)
-
-
-def check_transform(where: str, R: Array, t: Array) -> None:
-    """Refuse what is no rotation (3, 3) or no position (3,)."""
-    if not (np.isfinite(R).all() and np.isfinite(t).all() and np.abs(t).max() <= MAX_COORDINATE):
-        raise InputError(f"{where}: the pose has numbers that are not finite or too large")
-    check_rotation(R, MAX_SKEW, f"{where}: found the matrix {R.tolist()}, which")
-
-
 def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
-    """Return pose in a matrix (3 or 4, 4) [R | t] that takes camera coordinates to the world's, or back."""
-    R = T[:3, :3]
-    t = T[:3, 3]
-    check_transform(where, R, t)
-    if direction == CAM_FROM_WORLD:
-        return check_pose(where, R, -R.T @ t, axes)
-    return check_pose(where, R.T, t, axes)
+    """Return the pose in a matrix (3 or 4, 4) [R | t]; `where` names the file for refusals."""
+    return check_transform(T, where, AXES[axes], direction == CAM_FROM_WORLD, MAX_SKEW)
 
 
 def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:

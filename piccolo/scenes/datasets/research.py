@@ -13,7 +13,7 @@ from ...errors import InputError
 from ...files.json_file import read_json
 from ...geometry.pose import Pose, yaw_rotation
 from ...panorama.cube import SUFFIXES
-from .files import WORLD_FROM_CAM, check_pose, is_cloud, only_cloud_in, pose_of_transform, read_matrix
+from .files import WORLD_FROM_CAM, is_cloud, only_cloud_in, pose_of_transform, read_matrix
 from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
 
 LOC360 = "360loc"
@@ -144,7 +144,8 @@ def _omniscenes_panoramas(options: ConvertOptions, pictures: list[Path]) -> Iter
         variant = split.name.removesuffix("_pano")
         pose_file = split.parent / f"{variant}_pose" / path.parent.name / f"{path.stem}.txt"
         matrix = read_matrix(options.inside(pose_file), 3)
-        pose = check_pose(str(pose_file), matrix[:, :3], matrix[:, 3], "piccolo")
+        matrix[:, :3] = matrix[:, :3].T.copy()
+        pose = pose_of_transform(str(pose_file), matrix, WORLD_FROM_CAM, "piccolo")
         name = f"{variant}_{path.parent.name}_{path.name}"
         yield PosedPanorama(name, {name: path}, variant, pose)
 

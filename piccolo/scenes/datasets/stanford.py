@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from ...errors import InputError
 from ...files.json_file import read_json
 from ...geometry.pose import Array, Pose
-from .files import check_pose, labels_by_index
+from .files import WORLD_FROM_CAM, labels_by_index, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
 
 NAME = "stanford2d3ds"
@@ -138,7 +138,8 @@ def _read_pose(picture: Picture) -> Pose:
     angles = _three(picture.pose, document, "final_camera_rotation")
     center_world = _three(picture.pose, document, "camera_location")
     R_world_from_opengl = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, x first
-    pose = check_pose(str(picture.pose), R_world_from_opengl.T, center_world, "opengl")
+    T = np.column_stack([R_world_from_opengl, center_world])
+    pose = pose_of_transform(str(picture.pose), T, WORLD_FROM_CAM, "opengl")
     return AREA_5B.of_pose(pose) if picture.part == "5b" else pose
 
 
