@@ -24,7 +24,7 @@ from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
 from .localization.beside import Picture, localize_beside, locate
 from .localization.bundle import localize_bundle
-from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors
+from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
 from .localization.verification import is_near
@@ -184,9 +184,9 @@ class OpenedScan:
         read_options: ReadOptions,
         settings: Settings,
         is_masked: NDArray[np.bool_] | None = None,
-        is_scale_free: bool = False,
+        relative_scale: RelativeScale = "metres",
     ) -> list[Result]:
-        """Localize photos together whose poses in a common frame are known; its scale may be free.
+        """Localize photos together whose poses in a common frame are known; its scale may be unknown.
 
         Raises InputError for a photo that can't be read, for the preset paper, and for a focal length that is
         a guess.
@@ -204,7 +204,9 @@ class OpenedScan:
             photos = [read_photo_facts(panorama, read_options.rig) for panorama in panoramas]
         if any(map(has_guessed_focal, pictures)):
             raise InputError("`relative_poses`: found a focal length that is a guess, wanted a known one")
-        errors = RelativeErrors(log_scale=UNKNOWN_SCALE) if is_scale_free else RelativeErrors()
+        errors = RelativeErrors()
+        if relative_scale == "unknown":
+            errors = errors._replace(log_scale=UNKNOWN_SCALE)
         found = localize_bundle(prepared, pictures, poses, settings, self.workers, watch, errors)
         about = settings_json(settings, self.cloud_settings, read_options)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}

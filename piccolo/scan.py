@@ -15,6 +15,7 @@ from .errors import InputError
 from .files.atomic import check_output
 from .geometry.pose import Pose, check_pose
 from .geometry.rotations import Gravity
+from .localization.bundle_adjustment import RelativeScale
 from .opened_scan import File, OpenedScan, Settings, make_failed_result, make_prior, replace_settings
 from .optimize.refine import Solver
 from .panorama import ReadOptions
@@ -181,6 +182,7 @@ class Scan:
         panoramas: Iterable[File | Image],
         relative_poses: Sequence[Pose] | None = None,
         *,
+        relative_scale: RelativeScale = "metres",
         mask: File | Mask | None = None,
         mask_nadir_deg: float | None = None,
         fov_deg: float | None = None,
@@ -208,15 +210,17 @@ class Scan:
         photo that can't be read is "unreadable", or "failed" if another try may succeed; `error` says why.
 
         With `relative_poses`, one of each photo in any common frame [m], such as that of a phone's tracker,
-        the photos are localized together; one that can't be read is an InputError then.
+        the photos are localized together; one that can't be read is an InputError then. The scale of their
+        positions is fitted: within 1 % of metres, or freely if `relative_scale` is "unknown", as of COLMAP.
         """
         read_options, settings, is_masked = self._parse(check_arguments(Scan.localize_many, locals()))
         self._opened.check_options(read_options, settings)
         if relative_poses is not None:
             photos = list(panoramas)
             check_one_each("relative_poses", relative_poses, len(photos), "photo")
-            bundle = self._opened.localize_bundle(photos, relative_poses, read_options, settings, is_masked)
-            return iter(bundle)
+            together = self._opened.localize_bundle
+            scale = relative_scale
+            return iter(together(photos, relative_poses, read_options, settings, is_masked, scale))
 
         def localize(panorama: File | Image) -> Result:
             try:

@@ -11,8 +11,9 @@ from ..errors import InputError
 from ..files.json_file import DAMAGE, describe, read_json, read_text
 from ..geometry.pose import Array, Pose, check_transform, rotation_from_quaternion_wxyz
 from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
+from ..localization.bundle_adjustment import RelativeScale
 
-WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio, or a TUM trajectory, in metres"
+WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio [m], or a TUM trajectory [m]"
 ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
 NUM_KITTI = 12  # columns: T_world_from_cam without its last row
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
@@ -34,6 +35,16 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
         if pose is None:
             raise InputError(f"{path}: found 0 poses of {photo}, wanted one of each photo")
     return [pose for pose in found if pose is not None]
+
+
+def find_scale(path: Path) -> RelativeScale:
+    """Return the unit of a file's positions: structure from motion, as in COLMAP's files, has none."""
+    if path.suffix == ".json":
+        return "metres"
+    rows = (
+        line.split(None, NUM_COLMAP - 1) for line in read_text(path, WANTED).splitlines() if line[:1] != "#"
+    )
+    return "unknown" if len(next(filter(None, rows), [])) == NUM_COLMAP else "metres"
 
 
 def match_names(path: Path, poses: Sequence[NamedPose], photos: Sequence[Path]) -> list[Pose | None]:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from ..batch.localizer import Localizer
-from ..batch.relative_poses import read_relative_poses
+from ..batch.relative_poses import find_scale, read_relative_poses
 from ..batch.results_file import WAYS, write_results
 from ..files.atomic import is_stream
 from ..jobs.stopwatch import Stopwatch
@@ -48,7 +48,10 @@ def run_bundle(
     watch = Stopwatch()
     with watch.stage("all"):
         scan = open_scan()
-        results = scan.localize_bundle(photos, poses, localizer.read_options, localizer.settings)
+        scale = find_scale(arguments.relative)
+        results = scan.localize_bundle(
+            photos, poses, localizer.read_options, localizer.settings, relative_scale=scale
+        )
     write_results(arguments.out, results)
     for result in results:
         print_result(result, result.warnings[len(scan.warnings) :])

@@ -100,7 +100,7 @@ class Support(NamedTuple):
         """Odds (4,) that the own pose is right, that the photo misses its own, and that it does not belong.
 
         The last are of no place in the scan, and of another pose of the photo. The odds of a photo alone are
-        those of the best of all places; where the others say which place it is, they are as many times larger.
+        those of the best of all places; if the others say which place it is, they are as many times larger.
         """
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
@@ -169,6 +169,14 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
         return {k: judge_apart(member, reason) for k, member in members.items()}
     supports = tested[best]
     agreed = agree(members, bundles[best], supports, errors)
+    if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
+        near = agreed.adjusted.bundle
+        supports |= {
+            k: find_support(members[k], members[k].query.forget(), near)
+            for k, support in supports.items()
+            if not support.is_found
+        }
+        agreed = agree(members, near, supports, errors)
     if isinstance(agreed, str):
         return {k: judge_apart(member, agreed) for k, member in members.items()}
     others = [i for i in range(len(bundles)) if i != best]

@@ -6,13 +6,14 @@ tell how large these are, whether the positions are too long, and which photo do
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..geometry.pose import Array, Pose
 from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
 
+RelativeScale = Literal["metres", "unknown"]  # of the positions of relative poses
 UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known
 NUM_ADJUSTMENTS = 6
 NUM_ROUNDS = 4  # in which errors of relative poses and the bundle are estimated in turn
