@@ -97,3 +97,14 @@ def test_only_commands_know_argparse():
         imports = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Import)]
         imports = {a.name for n in imports for a in n.names}
         assert "argparse" not in imports or _folder(module) == "cli", module
+
+
+def test_one_module_makes_statuses():
+    """All others hand it probabilities."""
+    callers = {
+        str(path.relative_to(ROOT / "piccolo"))
+        for path in (ROOT / "piccolo").rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "classify"
+    }
+    assert callers == {"localization/judge.py"}

@@ -10,10 +10,13 @@ from test_gps import write_photo
 
 import piccolo
 from piccolo.batch.frame_times import times_of
+from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.optimize.smoothing import smooth_positions
+from piccolo.walk.frames import Frame
+from piccolo.walk.results import check_odometry
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
 MAX_SPEED = 2.0  # [m/s]
@@ -85,6 +88,29 @@ def test_errors_of_the_scan_are_not_smoothed_away(rate):
         error = path[20] - middle.pose.center_world
         squares.append(error @ np.linalg.solve(middle.covariance[3:, 3:], error) / 3.0)
     assert 0.7 < np.mean(squares) < 1.5
+
+
+@pytest.mark.parametrize(
+    ("factor", "noise", "words"),
+    [
+        (1.1, 0.03, ("`odometry`: it is 10 % too long",)),
+        (0.8, 0.03, ("`odometry`: it is 20 % too short",)),
+        (1.01, 0.03, ()),
+        (1.1, 0.6, ()),
+    ],
+)
+def test_an_odometry_of_another_length_is_named(factor, noise, words):
+    """Frames a step apart, seen to a noise [m]; one of them at another place is no reason."""
+    rng = np.random.default_rng(0)
+    centers = np.cumsum(rng.normal(size=(40, 3)) * [0.4, 0.4, 0.0], axis=0)
+    frames = [Frame(float(k), odometry=Pose(TURN, factor * c)) for k, c in enumerate(centers)]
+    seen = [Pose(TURN, c + noise * rng.normal(size=3)) for c in centers]
+    found = [Localization("localized", 0.99, pose=pose) for pose in seen]
+    found[7] = Localization("localized", 0.99, pose=Pose(TURN, centers[7] + 9.0))
+    assert check_odometry(frames, found) == words
+    assert check_odometry(frames[:3], found[:3]) == ()
+    lost = [Localization(pose=pose) for pose in seen]
+    assert check_odometry(frames, lost) == ()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -41,10 +41,9 @@ def find_scale(path: Path) -> RelativeScale:
     """Return the unit of a file's positions: structure from motion, as in COLMAP's files, has none."""
     if path.suffix == ".json":
         return "metres"
-    rows = (
-        line.split(None, NUM_COLMAP - 1) for line in read_text(path, WANTED).splitlines() if line[:1] != "#"
-    )
-    return "unknown" if len(next(filter(None, rows), [])) == NUM_COLMAP else "metres"
+    lines = read_text(path, WANTED).splitlines()
+    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
+    return "unknown" if len(first.split(None, NUM_COLMAP - 1)) == NUM_COLMAP else "metres"
 
 
 def match_names(path: Path, poses: Sequence[NamedPose], photos: Sequence[Path]) -> list[Pose | None]:

@@ -165,10 +165,9 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks, and of photos that belong together in another way."""
     group = parser.add_argument_group("photos together")
-    text = (
-        "relative poses of the photos, which are then localized together: COLMAP's images.txt of any scale, "
-    )
-    text += "or in metres a transforms.json (nerfstudio, phone apps), or a TUM trajectory with the photos' names as times"
+    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt (of any "
+    text += "scale), or in metres a transforms.json (nerfstudio, phone apps), or a TUM trajectory with the "
+    text += "photos' names as times"
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)

@@ -25,7 +25,7 @@ from ..panorama.video import frames_of
 from ..result import FAILED, UNREADABLE
 from ..scan_walk import Walk
 from ..walk.motion import Motion
-from .command import check_alone, check_only_with
+from .command import check_alone, check_only_with, print_warnings
 from .errors import EXIT_BAD_INPUT, UsageError, print_error, print_note
 from .executing import Interruption, choose_exit_code, interruptible
 from .options import DEFAULT_EVERY
@@ -109,6 +109,7 @@ def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: W
     if (path := frames_file(arguments.out)) and not counts[FAILED]:
         path.unlink(missing_ok=True)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
+    print_warnings(arguments, {w for r in results for w in r.warnings if w.startswith("`odometry`")})
     gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
     print_note(arguments, f"{len(results)} frames in {watch.seconds['all']:.0f} s: {words}; {gaps} gaps")
     return choose_exit_code(counts)

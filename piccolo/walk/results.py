@@ -1,23 +1,29 @@
 """The results of a walk's frames: positions smoothed with a constant-acceleration prior."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
+from ..confidence.confidence import LOCALIZED
 from ..confidence.covariance import describe_errors
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import probability_within, std_of
-from ..localization.judge import decide, take_pose
+from ..localization.judge import MOST_CONFLICT, decide, take_pose
 from ..localization.prior import contradictions
 from ..optimize.smoothing import smooth_positions
 from .beliefs import Belief
 from .frames import Frame
 from .path import EVEN, Gap, Path
 from .tracker import Tracker
+
+LEAST_WALKED = 1.0  # [m] between frames by which an odometry is checked
+LEAST_RATIOS = 4  # of distances; fewer say nothing
+TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
 
 
 @dataclass(frozen=True)
@@ -55,7 +61,35 @@ def make_localizations(
         parts = smooth_positions(located[lo:hi], times, motion.max_acceleration, motion.speed)
         for k, gaussian in zip(sure[lo:hi], parts, strict=True):
             found[k] = take_pose(found[k], gaussian, tracker.scan_map)
+    notes = check_odometry(frames, found)
+    for k, frame in enumerate(frames):
+        if frame.odometry is not None:
+            found[k] = replace(found[k], warnings=found[k].warnings + notes)
     return [(f, describe_frame(frames, k, path.gaps[k])) for k, f in enumerate(found)]
+
+
+def check_odometry(frames: Sequence[Frame], found: Sequence[Localization]) -> tuple[str, ...]:
+    """Return a warning if the sure frames say that the odometry is too long or too short.
+
+    Of the logarithms of ratios of distances the median counts, and their median deviation from it.
+    """
+    pairs = [(f.odometry, r.pose) for f, r in zip(frames, found, strict=True) if r.status == LOCALIZED]
+    sure = [(odometry, pose) for odometry, pose in pairs if odometry and pose]
+    ratios = []
+    begin = 0
+    for k in range(len(sure)):
+        walked = sure[k][0].distance(sure[begin][0])
+        if walked >= LEAST_WALKED:
+            ratios.append(math.log(walked / max(sure[k][1].distance(sure[begin][1]), 0.1 * walked)))
+            begin = k
+    if len(ratios) < LEAST_RATIOS:
+        return ()
+    middle = float(np.median(ratios))
+    std = 1.4826 * float(np.median(np.abs(np.array(ratios) - middle))) / math.sqrt(len(ratios))
+    if abs(middle) < max(TOLD_SCALE, MOST_CONFLICT * std):
+        return ()
+    percent = 100.0 * abs(math.expm1(middle))
+    return (f"`odometry`: it is {percent:.0f} % too {'long' if middle > 0.0 else 'short'}",)
 
 
 def describe_frame(frames: Sequence[Frame], k: int, gap: Gap | None) -> WalkFrame:
