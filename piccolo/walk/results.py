@@ -21,7 +21,7 @@ from .frames import Frame
 from .path import EVEN, Gap, Path
 from .tracker import Tracker
 
-LEAST_WALKED = 1.0  # [m] between frames by which an odometry is checked
+LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
 LEAST_RATIOS = 4  # of distances; fewer say nothing
 TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
 
