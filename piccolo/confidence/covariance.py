@@ -20,7 +20,7 @@ class PoseCovariance:
 
     matrix: Array
     least_constrained_direction: str  # of the translation, in words
-    std_of_fit: float | None = None  # [m] `largest_std` if the focal length were exact; None where it is
+    std_of_fit: float | None = None  # [m] `largest_std` if focal length, stitching and scan were exact
 
     @property
     def std_deg(self) -> Array:

@@ -8,12 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.covariance import PoseCovariance, least_constrained_direction
-from ..geometry.pose import Array, Pose, rotate_points, step
-from ..geometry.sphere import compute_indices, find_cell
+from ..geometry.pose import Array, Pose, log_so3, rotate_points, step, yaw_rotation
+from ..geometry.sphere import compute_indices, find_cell, make_grid
 from ..kernels.jit import kernel
-from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
+from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..panorama.texels import Texels
 from ..views.view import Cells
 from .comparison import mask_occluders
 from .query import Query
@@ -29,6 +30,13 @@ POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
 SHAPE_MOVE = 0.01  # [m]
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
+# Planes by which a photo is divided into halves (9, 3), by their normals in the camera's frame: upright ones
+# every 22.5 degrees, as the seam of two lenses may be anywhere, and the level one.
+NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
+MOST_SCORE = 2.5  # chi square over its mean of 1: of nine planes' halves chance gives one in ten more
+NUM_TRIED = 2  # planes
+NUM_ITERATIONS = 15
+TOLERANCE = 1e-5  # [rad + m]
 
 
 class DifferenceSteps(NamedTuple):
@@ -172,6 +180,75 @@ def merge_covariances(found: Sequence[Array]) -> Array:
     return np.asarray((axes / np.maximum(information, LEAST_INFORMATION * information[-1])) @ axes.T)
 
 
+def make_problem(points: Cells, image: Texels) -> ChannelProblem:
+    """Make the problem of points, and the image that they are compared with."""
+    return ChannelProblem(
+        points.offsets, to_levels(points.channels), points.weights, image.rgbx, image.width, SCALE
+    )
+
+
+def score_halves(sums: Array, is_ahead: NDArray[np.bool_]) -> Array:
+    """Score (S,) if halves ask for poses of their own, from blocks' sums (B, 29); 1 in the mean by chance.
+
+    `is_ahead` (S, B) tells the half of each block. The score is g^T A^-1 g of both halves' gradients, as in
+    the test of Rao (1948), over its mean by the gradients of blocks; 0 where a half has too few blocks.
+    """
+    gradients = sums[:, GRADIENT:MATRIX]
+    matrices = fill_symmetric(sums[:, MATRIX:])
+    left_out = jackknife_gradients(gradients, matrices)
+    mean = np.trace(np.linalg.pinv(matrices.sum(axis=0)) @ left_out.T @ left_out)
+    scores = np.zeros(len(is_ahead))
+    for is_half in (is_ahead, ~is_ahead):
+        g = is_half @ gradients - 0.5 * gradients.sum(axis=0)
+        inverse = np.linalg.pinv(np.tensordot(is_half.astype(float), matrices, 1), hermitian=True)
+        scores += np.einsum("si,sij,sj->s", g, inverse, g) / mean
+    num_blocks = is_ahead @ gradients.any(axis=1).astype(int), ~is_ahead @ gradients.any(axis=1).astype(int)
+    return np.where(np.minimum(*num_blocks) < LEAST_BLOCKS, 0.0, scores)
+
+
+def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
+    """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
+
+    The descent is in the finest of the images, coarsest first, or in one after the other, whichever ends
+    lower: lenses that are turned by degrees put points beyond what the finest image leads back.
+    """
+    ends = []
+    for way in (images, images[-1:]):
+        R = pose.R_cam_from_world.copy()
+        t = np.zeros(3)
+        loss = math.inf
+        for image in way:
+            loss = descend_channels(make_problem(points, image), NUM_ITERATIONS, TOLERANCE, R, t)
+        turn = log_so3(R @ pose.R_cam_from_world.T)
+        ends.append((loss, np.concatenate([turn, pose.R_cam_from_world @ t])))
+    return min(ends, key=lambda end: end[0])
+
+
+def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> Array:
+    """Return the covariance (6, 6) of what halves of a whole photo disagree about its pose, beyond chance.
+
+    Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
+    both. It is the mean square of the steps from the pose to theirs, with the `covariance` that these have.
+    """
+    points, begins = sort_by_block(points)
+    blocks = make_grid(ERROR_RINGS).directions[: len(begins) - 1].astype(float)
+    is_ahead = NORMALS @ rotate_points(blocks, pose.R_cam_from_world).T > 0.0
+    images = shown.photo.images.fine(), shown.photo.images.full()
+    scores = score_halves(sum_by_block(make_problem(points, images[-1]), pose, begins), is_ahead)
+
+    def separate(k: int) -> tuple[float, Array]:
+        is_point_ahead = np.repeat(is_ahead[k], np.diff(begins))
+        halves = [take(points, is_half) for is_half in (is_point_ahead, ~is_point_ahead)]
+        losses, steps = zip(*[descend_half(half, images, pose) for half in halves], strict=True)
+        return sum(losses), np.array(steps)
+
+    tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
+    if not tried:
+        return np.zeros((6, 6))
+    steps = min(shown.workers.map(separate, tried, "covariance"), key=lambda end: end[0])[1]
+    return np.asarray((1.0 - MOST_SCORE / scores[tried[0]]) * (covariance + 0.5 * steps.T @ steps))
+
+
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
@@ -242,13 +319,14 @@ def estimate_covariance(
     covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return None
+    excess = np.zeros((6, 6)) if is_partial else disagreement(shown, points, pose, covariance)
     J = np.eye(6)
     J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
     pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
     covariance_map = J @ covariance @ J.T + source_covariance(query, points, pixel_share)
-    std_of_fit = None
+    std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))
+    covariance_map += J @ excess @ J.T
     if of_camera is not None:
-        std_of_fit = math.sqrt(float(np.linalg.eigvalsh(covariance_map[3:, 3:])[-1]))
         covariance_map += of_camera
     J[3:, 3:] = query.scan_map.R_map_from_world.T
     covariance_world = J @ covariance_map @ J.T
