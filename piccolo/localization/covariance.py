@@ -33,7 +33,7 @@ SCALE = FULL_LOSS * LEVELS_PER_UNIT
 # Planes by which a photo is divided into halves (9, 3), by their normals in the camera's frame: upright ones
 # every 22.5 degrees, as the seam of two lenses may be anywhere, and the level one.
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
-MOST_SCORE = 2.5  # chi square over its mean of 1: of nine planes' halves chance gives one in ten more
+MOST_SCORE = 3.0  # of halves, 1 in the mean; of photos without a seam one in four has more, by nine planes
 NUM_TRIED = 2  # planes
 NUM_ITERATIONS = 15
 TOLERANCE = 1e-5  # [rad + m]
@@ -190,20 +190,22 @@ def make_problem(points: Cells, image: Texels) -> ChannelProblem:
 def score_halves(sums: Array, is_ahead: NDArray[np.bool_]) -> Array:
     """Score (S,) if halves ask for poses of their own, from blocks' sums (B, 29); 1 in the mean by chance.
 
-    `is_ahead` (S, B) tells the half of each block. The score is g^T A^-1 g of both halves' gradients, as in
-    the test of Rao (1948), over its mean by the gradients of blocks; 0 where a half has too few blocks.
+    `is_ahead` (S, B) tells the half of each block. The score is g^T A^-1 g of both halves' gradients at the
+    pose of all, as in the test of Rao (1948), over its mean by the gradients of blocks; 0 where a half has
+    too few blocks.
     """
     gradients = sums[:, GRADIENT:MATRIX]
     matrices = fill_symmetric(sums[:, MATRIX:])
+    inverse = np.linalg.pinv(matrices.sum(axis=0))
     left_out = jackknife_gradients(gradients, matrices)
-    mean = np.trace(np.linalg.pinv(matrices.sum(axis=0)) @ left_out.T @ left_out)
+    gradients = gradients - matrices @ (inverse @ gradients.sum(axis=0))
     scores = np.zeros(len(is_ahead))
-    for is_half in (is_ahead, ~is_ahead):
-        g = is_half @ gradients - 0.5 * gradients.sum(axis=0)
-        inverse = np.linalg.pinv(np.tensordot(is_half.astype(float), matrices, 1), hermitian=True)
-        scores += np.einsum("si,sij,sj->s", g, inverse, g) / mean
-    num_blocks = is_ahead @ gradients.any(axis=1).astype(int), ~is_ahead @ gradients.any(axis=1).astype(int)
-    return np.where(np.minimum(*num_blocks) < LEAST_BLOCKS, 0.0, scores)
+    for is_half in (is_ahead.astype(float), 1.0 - is_ahead):
+        g = is_half @ gradients
+        inverses = np.linalg.pinv(np.tensordot(is_half, matrices, 1), hermitian=True)
+        has_enough = is_half @ gradients.any(axis=1) >= LEAST_BLOCKS
+        scores = np.where(has_enough, scores + np.einsum("si,sij,sj->s", g, inverses, g), -np.inf)
+    return np.asarray(np.maximum(scores, 0.0) / np.trace(inverse @ left_out.T @ left_out))
 
 
 def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
@@ -246,7 +248,7 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     if not tried:
         return np.zeros((6, 6))
     steps = min(shown.workers.map(separate, tried, "covariance"), key=lambda end: end[0])[1]
-    return np.asarray((1.0 - MOST_SCORE / scores[tried[0]]) * (covariance + 0.5 * steps.T @ steps))
+    return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps))
 
 
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
