@@ -255,16 +255,14 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used. The image that determines the pose best counts. `is_partial` says that the photo
-    shows a part of the sphere, even without occluders: then both images count alike, and the covariance is
-    larger, as few blocks tell it (`few_blocks_factor`). The points are around the pose.
+    rough, a third is used; else both count alike. `is_partial` says that the photo shows a part of the
+    sphere, even without occluders: then the covariance is larger, as few blocks tell it
+    (`few_blocks_factor`). The points are around the pose.
     """
-    (offsets, channels, weights, _), begins = sort_by_block(points)
-    levels = to_levels(channels)
+    points, begins = sort_by_block(points)
 
     def by(steps: DifferenceSteps) -> Array | None:
-        image = shown.photo.images[steps.scale]()
-        problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
+        problem = make_problem(points, shown.photo.images[steps.scale]())
         hessian = compute_hessian(problem, pose, steps)
         gradients = block_gradients(problem, pose, begins)
         covariance = sandwich_covariance(hessian, gradients)
@@ -276,11 +274,7 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     has_shape = shown.scan_map.has_shape
     steps = SHAPE_STEPS if has_shape else STEPS
     found = [c for c in shown.workers.map(by, steps, "covariance") if c is not None]
-    if not found:
-        return by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
-    if is_partial:
-        return merge_covariances(found)
-    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
+    return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
 
 
 def source_covariance(query: Query, points: Cells, pixel_share: float) -> Array:
