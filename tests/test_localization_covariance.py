@@ -149,7 +149,7 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     monkeypatch.setattr(covariance, "compute_hessian", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose, False)
-    assert asked == ways[: 2 if num_rough == 1 else 3]
+    assert sorted(asked, key=lambda each: each[1].scale) == ways[: 2 if num_rough == 1 else 3]
     if num_rough == 3:
         assert matrix is None
     else:
@@ -175,7 +175,7 @@ def test_a_direction_that_one_image_does_not_tell_is_told_by_the_other():
 
 
 def block_sums(rng, is_ahead, apart):
-    """Sums (B, 29) of blocks with the best pose of all at zero, and of those ahead `apart` (6,) from others'."""
+    """Sums (B, 29) at the best pose of all blocks, where that of those ahead is `apart` (6,) from others'."""
     rows = rng.normal(size=(len(is_ahead), 40, 6))
     wanted = rng.normal(size=(len(is_ahead), 40)) + np.einsum("bni,i,b->bn", rows, apart, is_ahead - 0.5)
     matrices = np.swapaxes(rows, 1, 2) @ rows

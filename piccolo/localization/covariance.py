@@ -30,13 +30,11 @@ POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
 SHAPE_MOVE = 0.01  # [m]
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
-# Planes by which a photo is divided into halves (9, 3), by their normals in the camera's frame: upright ones
-# every 22.5 degrees, as the seam of two lenses may be anywhere, and the level one.
+# normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
 MOST_SCORE = 3.0  # of halves, 1 in the mean; of photos without a seam one in four has more, by nine planes
 NUM_TRIED = 2  # planes
-NUM_ITERATIONS = 15
-TOLERANCE = 1e-5  # [rad + m]
+HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
 
 class DifferenceSteps(NamedTuple):
@@ -211,38 +209,35 @@ def score_halves(sums: Array, is_ahead: NDArray[np.bool_]) -> Array:
 def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
     """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
 
-    The descent is in the finest of the images, coarsest first, or in one after the other, whichever ends
-    lower: lenses that are turned by degrees put points beyond what the finest image leads back.
+    It is in the images from coarse to fine or in the finest alone, whichever ends lower: that one does not
+    lead back over degrees, and in flat places a coarse one leads astray.
     """
     ends = []
     for way in (images, images[-1:]):
         R = pose.R_cam_from_world.copy()
         t = np.zeros(3)
-        loss = math.inf
-        for image in way:
-            loss = descend_channels(make_problem(points, image), NUM_ITERATIONS, TOLERANCE, R, t)
-        turn = log_so3(R @ pose.R_cam_from_world.T)
-        ends.append((loss, np.concatenate([turn, pose.R_cam_from_world @ t])))
+        losses = [descend_channels(make_problem(points, image), *HALF_LIMITS, R, t) for image in way]
+        delta = np.concatenate([log_so3(R @ pose.R_cam_from_world.T), pose.R_cam_from_world @ t])
+        ends.append((losses[-1], delta))
     return min(ends, key=lambda end: end[0])
 
 
 def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> Array:
-    """Return the covariance (6, 6) of what halves of a whole photo disagree about its pose, beyond chance.
+    """Return what halves that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
-    both. It is the mean square of the steps from the pose to theirs, with the `covariance` that these have.
+    both. The sum is the mean square of the steps from the pose to theirs, with errors of the same covariance.
     """
     points, begins = sort_by_block(points)
-    blocks = make_grid(ERROR_RINGS).directions[: len(begins) - 1].astype(float)
-    is_ahead = NORMALS @ rotate_points(blocks, pose.R_cam_from_world).T > 0.0
+    blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
+    is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
     images = shown.photo.images.fine(), shown.photo.images.full()
     scores = score_halves(sum_by_block(make_problem(points, images[-1]), pose, begins), is_ahead)
 
     def separate(k: int) -> tuple[float, Array]:
-        is_point_ahead = np.repeat(is_ahead[k], np.diff(begins))
-        halves = [take(points, is_half) for is_half in (is_point_ahead, ~is_point_ahead)]
-        losses, steps = zip(*[descend_half(half, images, pose) for half in halves], strict=True)
-        return sum(losses), np.array(steps)
+        is_half = np.repeat(is_ahead[k], np.diff(begins))
+        ends = [descend_half(take(points, half), images, pose) for half in (is_half, ~is_half)]
+        return ends[0][0] + ends[1][0], np.array([delta for _, delta in ends])
 
     tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
     if not tried:
@@ -315,7 +310,7 @@ def estimate_covariance(
     covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return None
-    excess = np.zeros((6, 6)) if is_partial else disagreement(shown, points, pose, covariance)
+    excess = disagreement(shown, points, pose, covariance) if not is_partial else np.zeros((6, 6))
     J = np.eye(6)
     J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
     pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
