@@ -3,6 +3,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 import pytest
 import rooms
@@ -13,6 +14,7 @@ from piccolo.cloud import stream_points
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.confidence.covariance import describe_errors
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
+from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization import covariance
@@ -114,7 +116,7 @@ def test_covariance_is_in_the_worlds_axes(found):
     prepared, pose, result = found
     R = exp_so3(np.array([0.2, -0.5, 1.1]))
     own = result.covariance.matrix
-    other = describe_errors(covariance.estimate_covariance(prepared, pose), R.T).matrix
+    other = describe_errors(covariance.estimate_covariance(prepared, pose).gaussian, R.T).matrix
     np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
 
@@ -148,24 +150,22 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     monkeypatch.setattr(covariance, "compute_hessian", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose, False)
-    assert asked == ways[: 2 if num_rough == 1 else 3]
+    assert sorted(asked, key=lambda each: each[1].scale) == ways[: 2 if num_rough == 1 else 3]
     if num_rough == 3:
         assert matrix is None
     else:
         np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
 
 
-@pytest.mark.parametrize(("is_partial", "factor"), [(False, 0.36), (True, 2.0 / (1.0 / 1.1 + 1.0 / 0.36))])
-def test_two_images_count_for_a_part_of_the_sphere_and_the_better_one_for_the_whole(
-    found, monkeypatch, is_partial, factor
-):
+@pytest.mark.parametrize("is_partial", [False, True])
+def test_two_images_count_alike(found, monkeypatch, is_partial):
     prepared, pose, _ = found
     points = _points(prepared, pose)
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "compute_hessian", lambda *_: np.eye(6))
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.compute_covariance(prepared, points, pose, is_partial)
-    expected = factor * gradients.T @ gradients
+    expected = 2.0 / (1.0 / 1.1 + 1.0 / 0.36) * gradients.T @ gradients
     np.testing.assert_allclose(matrix, 100.0 / 93.0 * expected if is_partial else expected)
 
 
@@ -173,6 +173,69 @@ def test_a_direction_that_one_image_does_not_tell_is_told_by_the_other():
     blind = np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 1e12])
     merged = covariance.merge_covariances([blind, np.eye(6)])
     np.testing.assert_allclose(merged, np.diag([1.0, 1.0, 1.0, 1.0, 1.0, 2.0]), rtol=1e-9)
+
+
+def block_sums(rng, is_ahead, apart):
+    """Sums (B, 29) at the best pose of all blocks, where that of those ahead is `apart` (6,) from others'."""
+    rows = rng.normal(size=(len(is_ahead), 40, 6))
+    wanted = rng.normal(size=(len(is_ahead), 40)) + np.einsum("bni,i,b->bn", rows, apart, is_ahead - 0.5)
+    matrices = np.swapaxes(rows, 1, 2) @ rows
+    right = np.einsum("bni,bn->bi", rows, wanted)
+    gradients = matrices @ np.linalg.solve(matrices.sum(axis=0), right.sum(axis=0)) - right
+    sums = np.zeros((len(is_ahead), 29))
+    sums[:, 2:8] = gradients
+    sums[:, 8:] = matrices[:, *np.triu_indices(6)]
+    return sums
+
+
+def test_halves_that_ask_for_other_poses_score_far_beyond_chance():
+    rng = np.random.default_rng(2)
+    is_ahead = rng.permuted(np.tile(np.arange(150) % 2 == 0, (40, 1)), axis=1)
+    by_chance = [covariance.score_halves(block_sums(rng, is_ahead[0], np.zeros(6)), is_ahead) for _ in "1234"]
+    assert np.mean(by_chance) == pytest.approx(1.0, abs=0.1)
+    assert np.percentile(by_chance, 95) < covariance.MOST_SCORE
+    sums = block_sums(rng, is_ahead[7], np.array([0.0, 0, 0, 0, 0, 0.4]))
+    scores = covariance.score_halves(sums, is_ahead)
+    assert scores.argmax() == 7
+    assert scores[7] > 3.0 * covariance.MOST_SCORE
+    sums[np.flatnonzero(is_ahead[7])[12:]] = 0.0
+    assert covariance.score_halves(sums, is_ahead)[7] == 0.0
+
+
+def test_a_pose_that_is_not_the_best_of_all_does_not_set_halves_apart():
+    """Nor if one half has most of the information, as with noise in some blocks that was not masked."""
+    rng = np.random.default_rng(3)
+    is_ahead = np.arange(150) % 2 == 0
+    sums = block_sums(rng, is_ahead, np.zeros(6))
+    sums[:20:2] *= 100.0
+    expected = covariance.score_halves(sums, is_ahead[None])
+    sums[:, 2:8] += covariance.fill_symmetric(sums[:, 8:]) @ np.full(6, 0.01)
+    np.testing.assert_allclose(covariance.score_halves(sums, is_ahead[None]), expected, rtol=0.3)
+    assert expected < covariance.MOST_SCORE
+
+
+def turn_half(rgb, azimuth, turn):
+    """A panorama whose half around an azimuth [rad] is turned by (3,) [rad], as two lenses put together."""
+    rays = pixel_rays(rgb.shape[1])
+    u, v = compute_pixels(rays @ exp_so3(turn), rgb.shape[1])
+    turned = cv2.remap(rgb, np.float32(u - 0.5), np.float32(v - 0.5), cv2.INTER_CUBIC, None, cv2.BORDER_WRAP)
+    is_ahead = rays @ yaw_rotation(azimuth)[0] > 0.0
+    return np.where(is_ahead[..., None], turned, rgb)
+
+
+@pytest.mark.parametrize(("seed", "azimuth", "turn"), [(1, 0.0, (0, 0, 0.03)), (3, 1.0, (0.02, 0, 0))])
+def test_a_half_that_is_turned_widens_the_covariance_until_it_covers_the_true_position(seed, azimuth, turn):
+    taken, scan_map = query(seed), rooms.scan_map(seed)
+    errors, stds = [], []
+    for rgb in (taken.rgb, turn_half(taken.rgb, azimuth, np.array(turn))):
+        found = localize(scan_map, as_panorama(rgb), SETTINGS, Workers(2), Stopwatch())
+        error = taken.pose.center_world - found.pose.center_world
+        errors.append(error @ np.linalg.solve(found.covariance.matrix[3:, 3:], error))
+        stds.append(found)
+        assert found.status == "localized"
+    assert max(errors) < 7.81
+    assert stds[0].covariance.largest_std < 1.1 * stds[0].std_of_fit
+    assert stds[1].covariance.largest_std > 1.5 * stds[1].std_of_fit
 
 
 def test_points_that_occluders_hide_are_removed():
@@ -191,8 +254,8 @@ def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(fou
     prepared, pose, _ = found
     own = covariance.estimate_covariance(prepared, pose)
     assert (
-        covariance.estimate_covariance(prepared, pose, seen_from=pose).covariance.tobytes()
-        == own.covariance.tobytes()
+        covariance.estimate_covariance(prepared, pose, seen_from=pose).gaussian.covariance.tobytes()
+        == own.gaussian.covariance.tobytes()
     )
     rgb = query(2).rgb.copy()
     rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
@@ -204,7 +267,7 @@ def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(fou
         covariance, "mask_occluders", lambda *_: replace(shown, photo=Photo(shown.photo.panorama))
     )
     left_out = covariance.estimate_covariance(hidden, pose, seen_from=pose)  # by the images that are there
-    variances = [np.diag(found.covariance)[3:] for found in (left_out, masked)]
+    variances = [np.diag(found.gaussian.covariance)[3:] for found in (left_out, masked)]
     np.testing.assert_allclose(*np.sqrt(variances), rtol=0.1)
 
 
@@ -239,5 +302,5 @@ def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
     kept = [len(covariance.remove_poles(with_one_at(d), pose).weights) for d in (down, away)]
     assert kept[1] == kept[0] + 1
     monkeypatch.setattr(type(prepared), "points_at", lambda query, pose: with_one_at(down))
-    told = covariance.estimate_covariance(prepared, pose).covariance
+    told = covariance.estimate_covariance(prepared, pose).gaussian.covariance
     np.testing.assert_allclose(told, result.covariance.matrix, rtol=0.02)

@@ -67,5 +67,5 @@ class Localization:
     # not in results:
     is_ruled_out: bool = False  # whatever others say: mirrored, or what the user says is contradicted
     gaussian: PoseGaussian | None = None  # pose and covariance, in the map
-    std_of_fit: float | None = None  # [m] largest deviation if the focal length were exact; None where it is
+    std_of_fit: float | None = None  # [m] largest deviation if focal length and stitching were exact
     standings: tuple[Standing, ...] = ()  # evidence for the pose and each alternative

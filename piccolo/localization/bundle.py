@@ -271,8 +271,8 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     gaussian = member.alone.gaussian
     std_of_fit = member.alone.std_of_fit
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
-        gaussian = estimate_covariance(query, found.pose, member.fit is None)
-        std_of_fit = std_of(gaussian)
+        errors = estimate_covariance(query, found.pose, member.fit is None)
+        gaussian, std_of_fit = errors or (None, None)
         if gaussian is not None and member.fit is not None:
             gaussian = gaussian.widen(member.fit.pose_covariance)
     p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(gaussian), std_of_fit)

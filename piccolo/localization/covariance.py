@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Array, Pose, rotate_points, step
-from ..geometry.pose_gaussian import PoseGaussian, turn_positions
-from ..geometry.sphere import compute_indices, find_cell
+from ..geometry.pose import Array, Pose, log_so3, rotate_points, step, yaw_rotation
+from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
+from ..geometry.sphere import compute_indices, find_cell, make_grid
 from ..kernels.jit import kernel
-from ..optimize.channel_loss import ChannelProblem, channel_equations, equations_by_part
+from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
 from .comparison import mask_occluders
@@ -32,6 +33,18 @@ SHAPE_MOVE = 0.01  # [m]
 TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
 ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common with other photos
 SCALE = FULL_LOSS * LEVELS_PER_UNIT
+# normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
+NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
+MOST_SCORE = 3.0  # of halves, 1 in the mean; of photos without a seam one in four has more, by nine planes
+NUM_TRIED = 2  # planes
+HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
+
+
+class Errors(NamedTuple):
+    """The errors of a pose that is found."""
+
+    gaussian: PoseGaussian  # the pose in the map with its covariance
+    std_of_fit: float  # [m] largest deviation if focal length and stitching were exact
 
 
 class DifferenceSteps(NamedTuple):
@@ -175,20 +188,86 @@ def merge_covariances(found: Sequence[Array]) -> Array:
     return np.asarray((axes / np.maximum(information, LEAST_INFORMATION * information[-1])) @ axes.T)
 
 
+def make_problem(points: Cells, image: Texels) -> ChannelProblem:
+    """Make the problem of points, and the image that they are compared with."""
+    return ChannelProblem(
+        points.offsets, to_levels(points.channels), points.weights, image.rgbx, image.width, SCALE
+    )
+
+
+def score_halves(sums: Array, is_ahead: NDArray[np.bool_]) -> Array:
+    """Score (S,) if halves ask for poses of their own, from blocks' sums (B, 29); 1 in the mean by chance.
+
+    `is_ahead` (S, B) tells the half of each block. The score is g^T A^-1 g of both halves' gradients at the
+    pose of all, as in the test of Rao (1948), over its mean by the gradients of blocks; 0 where a half has
+    too few blocks.
+    """
+    gradients = sums[:, GRADIENT:MATRIX]
+    matrices = fill_symmetric(sums[:, MATRIX:])
+    inverse = np.linalg.pinv(matrices.sum(axis=0))
+    left_out = jackknife_gradients(gradients, matrices)
+    gradients = gradients - matrices @ (inverse @ gradients.sum(axis=0))
+    scores = np.zeros(len(is_ahead))
+    for is_half in (is_ahead.astype(float), 1.0 - is_ahead):
+        g = is_half @ gradients
+        inverses = np.linalg.pinv(np.tensordot(is_half, matrices, 1), hermitian=True)
+        has_enough = is_half @ gradients.any(axis=1) >= LEAST_BLOCKS
+        scores = np.where(has_enough, scores + np.einsum("si,sij,sj->s", g, inverses, g), -np.inf)
+    return np.asarray(np.maximum(scores, 0.0) / np.trace(inverse @ left_out.T @ left_out))
+
+
+def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
+    """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
+
+    It is in the images from coarse to fine or in the finest alone, whichever ends lower: that one does not
+    lead back over degrees, and in flat places a coarse one leads astray.
+    """
+    ends = []
+    for way in (images, images[-1:]):
+        R = pose.R_cam_from_world.copy()
+        t = np.zeros(3)
+        losses = [descend_channels(make_problem(points, image), *HALF_LIMITS, R, t) for image in way]
+        delta = np.concatenate([log_so3(R @ pose.R_cam_from_world.T), pose.R_cam_from_world @ t])
+        ends.append((losses[-1], delta))
+    return min(ends, key=lambda end: end[0])
+
+
+def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> Array:
+    """Return what halves that disagree about the pose of a whole photo add to its `covariance` (6, 6).
+
+    Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
+    both. The sum is the mean square of the steps from the pose to theirs, with errors of the same covariance.
+    """
+    points, begins = sort_by_block(points)
+    blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
+    is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
+    images = shown.photo.images.fine(), shown.photo.images.full()
+    scores = score_halves(sum_by_block(make_problem(points, images[-1]), pose, begins), is_ahead)
+
+    def separate(k: int) -> tuple[float, Array]:
+        is_half = np.repeat(is_ahead[k], np.diff(begins))
+        ends = [descend_half(take(points, half), images, pose) for half in (is_half, ~is_half)]
+        return ends[0][0] + ends[1][0], np.array([delta for _, delta in ends])
+
+    tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
+    if not tried:
+        return np.zeros((6, 6))
+    steps = min(shown.workers.map(separate, tried, "covariance"), key=lambda end: end[0])[1]
+    return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps))
+
+
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used. The image that determines the pose best counts. `is_partial` says that the photo
-    shows a part of the sphere, even without occluders: then both images count alike, and the covariance is
-    larger, as few blocks tell it (`few_blocks_factor`). The points are around the pose.
+    rough, a third is used; else both count alike. `is_partial` says that the photo shows a part of the
+    sphere, even without occluders: then the covariance is larger, as few blocks tell it
+    (`few_blocks_factor`). The points are around the pose.
     """
-    (offsets, channels, weights, _), begins = sort_by_block(points)
-    levels = to_levels(channels)
+    points, begins = sort_by_block(points)
 
     def by(steps: DifferenceSteps) -> Array | None:
-        image = shown.photo.images[steps.scale]()
-        problem = ChannelProblem(offsets, levels, weights, image.rgbx, image.width, SCALE)
+        problem = make_problem(points, shown.photo.images[steps.scale]())
         hessian = compute_hessian(problem, pose, steps)
         gradients = block_gradients(problem, pose, begins)
         covariance = sandwich_covariance(hessian, gradients)
@@ -200,11 +279,7 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     has_shape = shown.scan_map.has_shape
     steps = SHAPE_STEPS if has_shape else STEPS
     found = [c for c in shown.workers.map(by, steps, "covariance") if c is not None]
-    if not found:
-        return by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
-    if is_partial:
-        return merge_covariances(found)
-    return min(found, key=lambda c: float(np.linalg.eigvalsh(c[3:, 3:])[-1]))
+    return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
 
 
 def photo_covariance(turn: float, median_range: float) -> Array:
@@ -240,7 +315,7 @@ def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
 
 def estimate_covariance(
     query: Query, pose: Pose, is_calibrated: bool = True, seen_from: Pose | None = None
-) -> PoseGaussian | None:
+) -> Errors | None:
     """Estimate the covariance of a pose in the map; None where the points do not fix it.
 
     Photos have the errors of the scan in common, and of a scan without colours all errors: edges lie beside
@@ -258,10 +333,14 @@ def estimate_covariance(
     covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return None
+    turned = pose.R_cam_from_world.T  # R_map_from_cam
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
     turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.photo.pixel
-    own = turn_positions(covariance, pose.R_cam_from_world.T) + photo_covariance(turn, median_range)
+    own = turn_positions(covariance, turned) + photo_covariance(turn, median_range)
     common = scan_covariance(query.scan_map, median_range)
     if query.scan_map.has_shape:
-        return PoseGaussian(pose, ALONE * own, common + (1.0 - ALONE) * own)
-    return PoseGaussian(pose, own, common)
+        own, common = ALONE * own, common + (1.0 - ALONE) * own
+    std_of_fit = largest_std(own + common)
+    if not (is_partial or query.scan_map.has_shape):
+        own = own + turn_positions(disagreement(shown, points, pose, covariance), turned)
+    return Errors(PoseGaussian(pose, own, common), std_of_fit)

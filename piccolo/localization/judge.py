@@ -51,7 +51,7 @@ class Measured(NamedTuple):
 
     pose: Pose  # in the map
     gaussian: PoseGaussian | None  # with its covariance; None where the points do not fix it
-    std_of_fit: float | None  # [m] largest deviation if the focal length were exact; None where it is
+    std_of_fit: float | None  # [m] largest deviation if focal length and stitching were exact
     loss: float
     evidence: Evidence
 
@@ -179,12 +179,11 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
         lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),
     ]
-    gaussian, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
+    errors, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return None
-    std_of_fit = None
+    gaussian, std_of_fit = errors or (None, None)
     if gaussian is not None and fit is not None:
-        std_of_fit = gaussian.largest_std
         gaussian = gaussian.widen(fit.pose_covariance)
     return Measured(pose, gaussian, std_of_fit, loss, collect_evidence(query, found, agreement, fractions))
 

@@ -39,12 +39,13 @@ def refine_near(query: Query, start: Pose) -> Near:
     pose = descend(query.points_at(middle), query.photo.images.full(), middle, FULL_LIMITS)
     end = score_pose(query, pose, seen_from if pose.distance(seen_from) < NEARLY else None)
     end = settle(query, end) if query.photo.is_partial else end
-    found = None
+    errors = None
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
-        found = estimate_covariance(query, end.pose, seen_from=middle if sees_same else None)
-    probability = float(posterior([assess_end(query, end)], std_of(found))[0])
-    return Near(end.pose, end.score, found, probability)
+        errors = estimate_covariance(query, end.pose, seen_from=middle if sees_same else None)
+    gaussian, std_of_fit = errors or (None, None)
+    probability = float(posterior([assess_end(query, end)], std_of(gaussian), std_of_fit)[0])
+    return Near(end.pose, end.score, gaussian, probability)
 
 
 def assess_end(query: Query, end: Hypothesis) -> Standing:
