@@ -12,22 +12,19 @@ from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
-from piccolo.geometry.pose_gaussian import add
+from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
-from piccolo.localization.bundle import (
-    CONTRADICTS,
-    NOT_FOUND,
-    UNSEEN,
+from piccolo.localization.bundle import CONTRADICTS, NOT_FOUND, UNSEEN, compare_errors, localize_bundle
+from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
+from piccolo.localization.bundle_search import (
     Member,
     Support,
     is_same_bundle,
-    localize_bundle,
     move_origin_near,
     propose_with_scale,
     weigh_bundles,
 )
-from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.localization.localize import localize
 from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
@@ -109,6 +106,18 @@ def test_a_photo_belongs_to_the_others_or_does_not():
     assert MISSES.shares.argmax() == 1, "shows nothing"
     assert MISSES.shares[1] < 0.9, "so it may be of another place"
     assert _support(0.0, 30.0, is_found=False).shares.argmax() == 3, "it is surely elsewhere"
+
+
+def test_an_own_pose_far_from_the_one_expected_is_doubted():
+    pose = tilted_poses(1, NEAR)[0]
+    expected = PoseGaussian(pose, np.diag([0.01**2] * 3 + [0.03**2] * 3), np.zeros((6, 6)))
+    ratios = []
+    for off in (0.0, 0.05, 0.12, 0.2):
+        own = add(pose, np.array([0.0, 0.0, 0.0, off, 0.0, 0.0]))
+        ratios.append(compare_errors(expected, PoseGaussian(own, 1e-6 * np.eye(6), np.zeros((6, 6)))))
+    assert ratios == sorted(ratios, reverse=True)
+    assert ratios[0] > 10.0
+    assert ratios[-1] < 1e-3
 
 
 def _members(far):

@@ -1,0 +1,218 @@
+"""The poses that a bundle of photos may have, by the photos' own poses, and how likely each is."""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..confidence.alternatives import Hypothesis
+from ..confidence.confidence import CONTRADICTED, posterior
+from ..confidence.localization import Localization
+from ..geometry.pose import Array, Pose, angle_between, log_so3
+from ..geometry.pose_gaussian import PoseGaussian, std_of
+from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
+from .comparison import score_pose
+from .covariance import estimate_covariance
+from .focal_length import FocalFit
+from .last_descent import HOPELESS_SCORE
+from .query import Query
+from .refinement import descend_fine
+from .selection import Selection, assess_poses
+from .verification import verify
+
+MISSED = 0.25  # chosen: of photos, those whose right pose is not found (BENCHMARK.md, phone photos: a sixth)
+MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
+SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
+CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
+LEAST_NONE = 1e-6
+NUM_BUNDLES = 4  # poses of the bundle that are tested
+SAME_PLACE = 0.5  # [m] a photo's pose this near to that by the bundle,
+SAME_TURN = math.radians(6.0)  # and this, supports it
+SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
+LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
+NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most probability
+
+
+@dataclass(frozen=True)
+class Member:
+    """A photo of the bundle, found by itself."""
+
+    query: Query  # without what takes memory
+    selection: Selection
+    fit: FocalFit | None
+    alone: Localization
+    cam_from_bundle: Pose
+
+    @property
+    def own_poses(self) -> list[tuple[Hypothesis, float]]:
+        """Poses in the map with their probabilities, best first; none if the best one is ruled out."""
+        if self.alone.is_ruled_out:
+            return []
+        hypotheses = [self.selection.best, *self.selection.alternatives]
+        own = [self.alone.confidence, *(a.probability or 0.0 for a in self.alone.alternatives)]
+        return list(zip(hypotheses, own, strict=False))
+
+
+class Support(NamedTuple):
+    """Evidence of a photo for a pose of the bundle."""
+
+    own: Hypothesis  # its own pose there
+    gaussian: PoseGaussian | None  # that pose with its covariance; None where the points do not fix it
+    is_found: bool  # by the photo alone
+    odds: float  # of that pose, against that none of the photo's poses is right
+    odds_elsewhere: float  # of the photo's other poses
+    num_places: int  # of the scan where a photo alone may be
+
+    @property
+    def weights(self) -> Array:
+        """Odds (4,) that the own pose is right, that the photo misses its own, and that it does not belong.
+
+        The last are of no place in the scan, and of another pose of the photo. The odds of a photo alone are
+        those of the best of all places; if the others say which place it is, they are as many times larger.
+        """
+        belongs = 1.0 - CONTRADICTED
+        here = self.odds * self.num_places
+        missed = MISSED / (1.0 + self.odds)
+        right = belongs * (1.0 - missed) * here
+        of_others = [CONTRADICTED, CONTRADICTED * self.odds_elsewhere]
+        return np.array([right, belongs * (missed * here + SILENT), *of_others])
+
+    @property
+    def shares(self) -> Array:
+        """Probabilities (4,) of `weights`."""
+        return np.asarray(self.weights / self.weights.sum())
+
+
+def move_origin_near(cams_from_bundle: Sequence[Pose]) -> list[Pose]:
+    """Move the origin of the common frame to the photos' mean position, so that turns hardly move them."""
+    mean = np.mean([pose.center_world for pose in cams_from_bundle], axis=0)
+    return [Pose(pose.R_cam_from_world, pose.center_world - mean) for pose in cams_from_bundle]
+
+
+def propose_bundles(members: Sequence[Member], errors: RelativeErrors) -> list[Bundle]:
+    """Return distinct poses of the bundle in the map, the likeliest first, by the photos' own poses."""
+    proposed = [
+        Bundle(member.cam_from_bundle.inverse() @ own.pose)
+        for member in members
+        for own, _ in member.own_poses
+    ]
+    for one, other in itertools.combinations(members, 2):
+        for (a, _), (b, _) in itertools.product(one.own_poses[:NUM_LIKELY], other.own_poses[:NUM_LIKELY]):
+            proposed += propose_with_scale(one, a.pose, other, b.pose, errors)
+    votes = [sum(vote(member, bundle) for member in members) for bundle in proposed]
+    kept: list[Bundle] = []
+    for i in np.argsort(-np.array(votes), kind="stable"):
+        bundle = join_near(members, proposed[i], errors)
+        if len(kept) < NUM_BUNDLES and not any(is_same_bundle(members, bundle, other) for other in kept):
+            kept.append(bundle)
+    return kept
+
+
+def propose_with_scale(
+    one: Member, own: Pose, other: Member, own_of_other: Pose, errors: RelativeErrors
+) -> list[Bundle]:
+    """Return the bundle whose scale is that of two photos' own poses; nothing if these do not fit."""
+    relative = other.cam_from_bundle @ one.cam_from_bundle.inverse()
+    found = own_of_other @ own.inverse()
+    given_apart = float(np.linalg.norm(relative.center_world))
+    found_apart = float(np.linalg.norm(found.center_world))
+    if angle_between(relative.R_cam_from_world, found.R_cam_from_world) > SAME_TURN:
+        return []
+    is_free = errors.log_scale > 1.0
+    if found_apart < LEAST_APART or given_apart <= 0.0:
+        return []
+    scale = found_apart / given_apart
+    if not is_free and not SCALES[0] < scale < SCALES[1]:
+        return []
+    scaled = Bundle(own, math.log(scale)).scale(one.cam_from_bundle)
+    return [Bundle(scaled.inverse() @ own, math.log(scale))]
+
+
+def join_near(members: Sequence[Member], bundle: Bundle, errors: RelativeErrors) -> Bundle:
+    """Adjust a bundle to the photos' poses near it, all of one deviation."""
+    nothing = np.zeros((6, 6))
+    near = []
+    for member in members:
+        expected = bundle.place(member.cam_from_bundle)
+        own = next((own for own, _ in member.own_poses if is_same(own.pose, expected)), None)
+        if own:
+            near.append(Estimate(PoseGaussian(own.pose, nothing, nothing), member.cam_from_bundle))
+    loose = errors._replace(log_scale=max(errors.log_scale, 1.0))
+    return adjust(bundle, near, loose).bundle if len(near) > 1 else bundle
+
+
+def is_same_bundle(members: Sequence[Member], bundle: Bundle, other: Bundle) -> bool:
+    """Return True if two poses of the bundle put every photo at the same place."""
+    return all(is_same(bundle.place(m.cam_from_bundle), other.place(m.cam_from_bundle)) for m in members)
+
+
+def vote(member: Member, bundle: Bundle) -> float:
+    """Return the probability of a photo's own pose that supports a pose of the bundle."""
+    expected = bundle.place(member.cam_from_bundle)
+    return max((p for own, p in member.own_poses if is_same(own.pose, expected)), default=0.0)
+
+
+def is_same(pose: Pose, other: Pose) -> bool:
+    """Return True if two poses may be one, with the errors of relative poses."""
+    turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
+    return bool(turn < SAME_TURN and pose.distance(other) < SAME_PLACE)
+
+
+def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
+    """Return a photo's evidence for a bundle pose: its best own pose near the prediction."""
+    expected = bundle.place(member.cam_from_bundle)
+    poses = [own for own, _ in member.own_poses]
+    own = next((h for h in poses if is_same(h.pose, expected)), None)
+    found = own or max(refine_near(query, expected), key=lambda h: h.score)
+    if own is None:
+        poses.append(found)
+    gaussian = member.alone.gaussian
+    std_of_fit = member.alone.std_of_fit
+    if found is not member.selection.best and found.score > HOPELESS_SCORE:
+        errors = estimate_covariance(query, found.pose, member.fit is None)
+        gaussian, std_of_fit = errors or (None, None)
+        if gaussian is not None and member.fit is not None:
+            gaussian = gaussian.widen(member.fit.pose_covariance)
+    p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(gaussian), std_of_fit)
+    k = next(k for k, h in enumerate(poses) if h is found)
+    none = max(float(p[-1]), LEAST_NONE)
+    odds_elsewhere = float(p[:-1].sum() - p[k]) / none
+    num_places = len(query.scan_map.sparse)
+    return Support(found, gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places)
+
+
+def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
+    """Return a photo's poses near the one expected: by whole views, by matches, and that itself."""
+    poses = [descend_fine(query, expected).pose]
+    if query.photo.is_partial:
+        poses.append(verify(query, expected).pose)
+    near = [pose for pose in poses if is_same(pose, expected)]
+    return [score_pose(query, pose) for pose in (*near, expected)]
+
+
+def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
+    """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
+
+    The photos are independent evidence. A third of them may show nothing, or not belong to the others. If
+    more have missed a pose, these count as one: bare walls and changed places lie together. Photos that have
+    found the same pose of the bundle are more than chance, if they are more than chance would give among all
+    poses that were proposed. If the relative poses are wrong, each photo may have any of its own poses; that
+    counts as none.
+    """
+    num_proposed = max(sum(len(member.own_poses) for member in members), 1)
+    logits = []
+    for of_one in tested:
+        odds_of_seen = sorted(s.odds for s in of_one)[int(len(of_one) * MOST_UNSEEN) :]
+        missed = min(math.log((o + MISSED) / (o + 1.0)) for o in odds_of_seen)
+        gain = (1 - sum(s.is_found for s in of_one)) * math.log(CHANCE)
+        coincidence = max(gain - math.log(num_proposed), min(gain, 0.0))
+        of_photos = sum(math.log1p(s.odds + CONTRADICTED * s.odds_elsewhere) for s in of_one)
+        logits.append(of_photos + missed + coincidence)
+    alone = [sum(p for _, p in member.own_poses) for member in members]
+    apart = math.log(CONTRADICTED) - sum(math.log(max(1.0 - p, LEAST_NONE)) for p in alone)
+    odds = np.exp(np.array([*logits, 0.0, apart]) - max([*logits, 0.0, apart]))
+    odds = np.append(odds[:-2], odds[-2:].sum())
+    return np.asarray(odds / odds.sum())
