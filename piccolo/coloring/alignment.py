@@ -37,6 +37,7 @@ WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000
 LEAST_POINTS = 40_000
 MOST_SEEN = 6  # photos that count for a point: those that see it best
+AT_ONCE = 16  # photos whose weights for all points are held
 LOSS_SCALE = 20.0  # [8-bit levels] of the length of a colour difference
 NOISE = 10.0  # [8-bit levels] of one
 NUM_ALIKE = 30.0  # points whose differences err alike: with fewer, weak constraints outweigh where poses were
@@ -58,6 +59,7 @@ class Sightings(NamedTuple):
     first: NDArray[np.int64]  # (N + 1,)
     point: NDArray[np.int64]  # (S,)
     photo: NDArray[np.int64]  # (S,)
+    own: list[NDArray[np.int64]]  # those of each photo
 
 
 class Aligned(NamedTuple):
@@ -101,14 +103,18 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
         weigh_points(points, *sight, pose.R_cam_from_world, pose.center_world, found)
         return found
 
-    weights = np.stack(workers.map(weigh, poses, "see"), axis=1)
-    if len(poses) > MOST_SEEN:
-        least = np.partition(weights, -MOST_SEEN, axis=1)[:, -MOST_SEEN, None]
-        weights[weights < least] = 0.0
-    is_seen = weights > 0.0
+    best = np.zeros((len(points), MOST_SEEN), np.float32)
+    photos = np.full(best.shape, len(poses))
+    for begin in range(0, len(poses), AT_ONCE):
+        for k, found in enumerate(workers.map(weigh, poses[begin : begin + AT_ONCE], "see"), begin):
+            keep_best(found, k, best, photos)
+    photos.sort(axis=1)
+    is_seen = photos < len(poses)
     is_seen &= is_seen.sum(axis=1, keepdims=True) > 1
-    point, photo = np.nonzero(is_seen)
-    return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo)
+    point = np.nonzero(is_seen)[0]
+    photo = photos[is_seen]
+    own = np.split(np.argsort(photo, kind="stable"), np.cumsum(np.bincount(photo, minlength=len(poses)))[:-1])
+    return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo, own)
 
 
 def read_all(
@@ -124,11 +130,10 @@ def read_all(
     readings = Readings(np.empty((count, 3), np.float32), np.empty((count, 3, 6), np.float32))
 
     def read(k: int) -> None:
-        own = np.flatnonzero(sightings.photo == k)
         pose = poses[k]
         image = texels[k]
         read_photo(
-            points, own, sightings.point, image.rgbx, image.width, gains[k],
+            points, sightings.own[k], sightings.point, image.rgbx, image.width, gains[k],
             pose.R_cam_from_world, pose.center_world, *readings,
         )  # fmt: skip
 
@@ -187,6 +192,19 @@ def measure_step(pose: Pose, other: Pose) -> Array:
     """Return the step (6,) [rad, m], in the camera's frame, from a pose to another near it."""
     turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
     return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
+
+
+@kernel
+def keep_best(weights: Array32, photo: int, best: Array32, photos: NDArray[np.int64]) -> None:
+    """Put a photo, where its weights (N,) are higher, in the place of the least of the best (N, M) so far."""
+    for n in range(len(weights)):
+        least = 0
+        for m in range(1, best.shape[1]):
+            if best[n, m] < best[n, least]:
+                least = m
+        if weights[n] > best[n, least]:
+            best[n, least] = weights[n]
+            photos[n, least] = photo
 
 
 @kernel
