@@ -20,7 +20,7 @@ from .stream import CloudStream
 SUFFIXES = (".ply", ".las", ".laz", ".e57")
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a scan in the axes of its file
 LAS_STEP = 1e-4  # [m] of coordinates in LAS
-E57_BYTES = 75  # of a point, beside itself, when its file is written
+E57_BYTES = 45  # of a point, beside the array of it that is held, while the file is written
 Colors = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # RGB (N, 3), and how many photos (N,) gave each
 Add = Callable[[Array, NDArray[np.uint8], NDArray[np.uint8]], None]  # points (N, 3) in the files' unit
 

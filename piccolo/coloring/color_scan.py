@@ -136,7 +136,7 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
     panoramas = [read_unmasked(found[0][0])]
     num_bytes = len(found) * (PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES)
     num_bytes += PAIR_BYTES * len(found) ** 2
-    check_memory(num_bytes, f"colours of {len(found)} photos", "localize fewer at once")
+    check_memory(num_bytes, f"colouring by {len(found)} photos", "localize fewer at once")
     panoramas += workers.map(read_unmasked, [result for result, _ in found[1:]], "read")
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
