@@ -16,8 +16,8 @@ from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.colored_writer import write_colored, writing_e57
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
-from piccolo.coloring import color_scan
-from piccolo.coloring.alignment import Anchor, add_pairs, align, keep_best
+from piccolo.coloring import alignment, color_scan
+from piccolo.coloring.alignment import Anchor, add_pairs, align
 from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligned_brushes
 from piccolo.coloring.exposure import balance
 from piccolo.coloring.painting import find_medians, make_brushes, paint_points
@@ -130,12 +130,12 @@ def test_photos_that_were_moved_are_aligned_and_paint_the_room():
     moved = [step(pose, np.repeat([0.004, 0.02], 3) * rng.normal(size=6)) for pose in poses]
     information = np.diag([1 / 0.01**2] * 3 + [1 / 0.04**2] * 3)
     anchors = [Anchor(pose, information) for pose in moved]
-    aligned = align(octree, photos, moved, anchors, Workers(2))
+    aligned, _ = align(octree, photos, moved, anchors, Workers(2))
     before = [pose_errors(a, b)[0] for a, b in zip(moved, poses, strict=True)]
-    after = [pose_errors(a, b)[0] for a, b in zip(aligned.poses, poses, strict=True)]
+    after = [pose_errors(a, b)[0] for a, b in zip(aligned, poses, strict=True)]
     assert np.mean(after) < 0.5 * np.mean(before)
-    again = align(octree, photos, moved, anchors, Workers(1))
-    pairs = zip(aligned.poses, again.poses, strict=True)
+    again, _ = align(octree, photos, moved, anchors, Workers(1))
+    pairs = zip(aligned, again, strict=True)
     assert all(np.array_equal(a.center_world, b.center_world) for a, b in pairs)
     brushes = make_brushes(octree, photos, poses, np.ones((3, 3), np.float32), Workers(2))
     leaves = octree.level(octree.leaf_size)
@@ -209,15 +209,23 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
     assert max(errors) < 0.02
 
 
-def test_the_photos_that_see_a_point_best_are_kept():
+def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
     rng = np.random.default_rng(5)
-    weights = np.maximum(rng.normal(size=(9, 50)), 0.0).astype(np.float32)
-    best, photos = np.zeros((50, 4), np.float32), np.full((50, 4), 9)
-    for k in range(9):
-        keep_best(weights[k], k, best, photos)
+    weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
+
+    def weigh(points, ranges, sight, R_cam_from_map, center_map, found):
+        found[:] = weights[int(center_map[0])]
+
+    monkeypatch.setattr(alignment, "look", lambda octree, pose: (None, None))
+    monkeypatch.setattr(alignment, "weigh_points", weigh)
+    poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
+    sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))
     for n in range(50):
-        wanted = [k for k in np.argsort(-weights[:, n])[:4] if weights[k, n] > 0.0]
-        assert set(photos[n]) - {9} == set(wanted)
+        wanted = sorted(k for k in np.argsort(-weights[:, n])[:6] if weights[k, n] > 0.0)
+        own = slice(*sightings.first[n : n + 2])
+        assert (sightings.point[own] == n).all()
+        assert sightings.photo[own].tolist() == wanted
+    assert all((sightings.photo[own] == k).all() for k, own in enumerate(sightings.own))
 
 
 def test_colours_that_need_too_much_memory_are_refused(tmp_path, monkeypatch):

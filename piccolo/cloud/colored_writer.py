@@ -88,13 +88,11 @@ def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add
     pye57 = import_optional(out, "pye57")
     middle = np.floor(box.mean(axis=0))  # coordinates are written in float32
     parts: list[tuple[Any, ...]] = []
-    num_points = 0
 
     def add(points: Array, colors: NDArray[np.uint8], _num_photos: NDArray[np.uint8]) -> None:
-        nonlocal num_points
-        num_points += len(points)
-        check_memory(E57_BYTES * num_points, f"{out}: {num_points} points at once", "write LAZ or PLY")
         parts.append((*(points - middle).T, *colors.T))
+        count = sum(len(part[0]) for part in parts)
+        check_memory(E57_BYTES * count, f"{out}: {count} points at once", "write LAZ or PLY")
 
     yield add
     names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"

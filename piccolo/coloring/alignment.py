@@ -62,13 +62,6 @@ class Sightings(NamedTuple):
     own: list[NDArray[np.int64]]  # those of each photo
 
 
-class Aligned(NamedTuple):
-    """Photos that agree."""
-
-    poses: list[Pose]  # in the map
-    gains: Array32  # (photos, 3) by which colours are multiplied, so that exposures agree
-
-
 class Readings(NamedTuple):
     """The colours that photos show at points, for each sighting."""
 
@@ -78,8 +71,11 @@ class Readings(NamedTuple):
 
 def align(
     octree: Octree, panoramas: Sequence[Panorama], poses: list[Pose], anchors: list[Anchor], workers: Workers
-) -> Aligned:
-    """Move the poses of photos in a map until the photos agree on its surfaces, near their anchors."""
+) -> tuple[list[Pose], Array32]:
+    """Move the poses of photos in a map until the photos agree on its surfaces, near their anchors.
+
+    Return also the gains (photos, 3) by which colours are multiplied, so that exposures agree.
+    """
     leaves = octree.level(octree.leaf_size)
     num_points = max(LEAST_POINTS, POINTS_PER_PHOTO * len(poses))
     points = np.ascontiguousarray(leaves[:: -(-len(leaves) // num_points), :3])
@@ -91,7 +87,7 @@ def align(
         values = read_all(points, sightings, texels, np.ones_like(gains), poses, workers).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
         poses = descend(points, sightings, texels, gains, poses, anchors, workers)
-    return Aligned(poses, gains)
+    return poses, gains
 
 
 def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], workers: Workers) -> Sightings:
@@ -107,13 +103,17 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
     photos = np.full(best.shape, len(poses))
     for begin in range(0, len(poses), AT_ONCE):
         for k, found in enumerate(workers.map(weigh, poses[begin : begin + AT_ONCE], "see"), begin):
-            keep_best(found, k, best, photos)
+            least = np.arange(len(points)), best.argmin(axis=1)
+            is_better = found > best[least]
+            photos[least] = np.where(is_better, k, photos[least])
+            best[least] = np.where(is_better, found, best[least])
     photos.sort(axis=1)
     is_seen = photos < len(poses)
     is_seen &= is_seen.sum(axis=1, keepdims=True) > 1
     point = np.nonzero(is_seen)[0]
     photo = photos[is_seen]
-    own = np.split(np.argsort(photo, kind="stable"), np.cumsum(np.bincount(photo, minlength=len(poses)))[:-1])
+    counts = np.bincount(photo, minlength=len(poses))
+    own = np.split(np.argsort(photo, kind="stable"), np.cumsum(counts)[:-1])
     return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo, own)
 
 
@@ -192,19 +192,6 @@ def measure_step(pose: Pose, other: Pose) -> Array:
     """Return the step (6,) [rad, m], in the camera's frame, from a pose to another near it."""
     turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
     return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
-
-
-@kernel
-def keep_best(weights: Array32, photo: int, best: Array32, photos: NDArray[np.int64]) -> None:
-    """Put a photo, where its weights (N,) are higher, in the place of the least of the best (N, M) so far."""
-    for n in range(len(weights)):
-        least = 0
-        for m in range(1, best.shape[1]):
-            if best[n, m] < best[n, least]:
-                least = m
-        if weights[n] > best[n, least]:
-            best[n, least] = weights[n]
-            photos[n, least] = photo
 
 
 @kernel

@@ -55,9 +55,9 @@ def localize_by_colors(
     """
     results = list(by_shape)
     leaves = list_leaves(scan_map)
-    for _ in range(NUM_ROUNDS if count_localized(results) >= LEAST_PHOTOS else 0):
+    for _ in range(NUM_ROUNDS):
         painters = [k for k, result in enumerate(results) if result.pose is not None]
-        if not painters:
+        if len(painters) < LEAST_PHOTOS:
             break
         brushes = dict(zip(painters, make_aligned_brushes(scan_map, results, workers), strict=True))
         idle = [k for k in range(len(results)) if k not in brushes]
@@ -86,11 +86,6 @@ def list_leaves(scan_map: ScanMap) -> Array32:
     return np.ascontiguousarray(scan_map.octree.level(scan_map.octree.leaf_size)[:, :3])
 
 
-def count_localized(results: Sequence[Result]) -> int:
-    """Return how many photos are localized."""
-    return sum(result.pose is not None for result in results)
-
-
 def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -> Colored:
     """Write the points of a scan's files in the colours of photos that were localized in it.
 
@@ -103,8 +98,6 @@ def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -
         raise InputError(f"{paths[0]}: found no files of points, wanted those of a scan to be coloured")
     check_suffix(out)
     workers = scan.workers
-    if (count := count_localized(results)) < LEAST_PHOTOS:
-        raise InputError(f"found {count} localized photos, wanted {LEAST_PHOTOS} or more for colours")
     brushes = make_aligned_brushes(scan_map, results, workers)
 
     def color(points_world: Array) -> Paint:
@@ -124,24 +117,24 @@ def check_suffix(out: Path) -> None:
 
 def box_world(scan_map: ScanMap) -> Array:
     """Return a box (2, 3) [m] in the world around all points of a map."""
-    leaves = list_leaves(scan_map)
-    corners = np.array(np.meshgrid(*np.stack([leaves.min(axis=0), leaves.max(axis=0)], axis=1))).reshape(3, 8)
-    world = corners.T @ scan_map.R_map_from_world + scan_map.origin_world
+    world = list_leaves(scan_map) @ scan_map.R_map_from_world + scan_map.origin_world
     return np.stack([world.min(axis=0), world.max(axis=0)])
 
 
 def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> list[Brush]:
-    """Align the photos that are localized, one or more, and return them as what gives colours."""
+    """Align the photos that are localized, and return them as what gives colours."""
     found = [(result, result.pose) for result in results if result.pose is not None]
+    if len(found) < LEAST_PHOTOS:
+        text = f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours"
+        raise InputError(text)
     panoramas = [read_unmasked(found[0][0])]
-    num_bytes = len(found) * (PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES)
-    num_bytes += PAIR_BYTES * len(found) ** 2
-    check_memory(num_bytes, f"colouring by {len(found)} photos", "localize fewer at once")
+    bytes_each = PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES + PAIR_BYTES * len(found)
+    check_memory(len(found) * bytes_each, f"colouring by {len(found)} photos", "localize fewer at once")
     panoramas += workers.map(read_unmasked, [result for result, _ in found[1:]], "read")
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
-    aligned = align(scan_map.octree, panoramas, poses, anchors, workers)
-    return make_brushes(scan_map.octree, panoramas, aligned.poses, aligned.gains, workers)
+    poses, gains = align(scan_map.octree, panoramas, poses, anchors, workers)
+    return make_brushes(scan_map.octree, panoramas, poses, gains, workers)
 
 
 def read_unmasked(result: Result) -> Panorama:

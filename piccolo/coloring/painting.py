@@ -63,7 +63,7 @@ def make_brushes(
 def paint_points(points: Array32, brushes: Sequence[Brush], workers: Workers) -> Paint:
     """Return the colours of points (N, 3) of the map."""
     paint = Paint(np.empty((len(points), 3), np.uint8), np.empty(len(points), np.uint8))
-    at_once = max(1, SAMPLES // max(1, len(brushes)))
+    at_once = max(1, SAMPLES // len(brushes))
 
     def run(lo: int) -> None:
         part = slice(lo, lo + at_once)
