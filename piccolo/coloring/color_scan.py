@@ -65,7 +65,7 @@ def localize_by_colors(
             paint = paint_points(leaves, [brush for k, brush in brushes.items() if k not in own], workers)
             shown = [k for k in own if k in idle or sees_paint(brushes[k], leaves, paint)]
             painted = color_map(scan_map, paint, workers) if shown else scan_map
-            for k in own:
+            for k in workers.show(iter(own), len(own), "photos"):
                 results[k] = localize(painted, k) if k in shown else by_shape[k]
     return results
 
