@@ -105,7 +105,9 @@ def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -
         return paint_points(points_map.astype(np.float32), brushes, Workers(workers.num_threads))
 
     cloud = open_cloud(paths, scan.cloud_settings, workers.show)
-    counts = write_colored(cloud, color, box_world(scan_map), out, scan_map.crs)
+    leaves_world = list_leaves(scan_map) @ scan_map.R_map_from_world + scan_map.origin_world
+    box_world = np.stack([leaves_world.min(axis=0), leaves_world.max(axis=0)])
+    counts = write_colored(cloud, color, box_world, out, scan_map.crs)
     return Colored(len(brushes), *counts)
 
 
@@ -113,12 +115,6 @@ def check_suffix(out: Path) -> None:
     """Refuse a name that does not say in which format a scan is to be written."""
     if out.suffix.lower() not in SUFFIXES:
         raise InputError(f"{out}: wanted a name that ends with {', '.join(SUFFIXES)}")
-
-
-def box_world(scan_map: ScanMap) -> Array:
-    """Return a box (2, 3) [m] in the world around all points of a map."""
-    world = list_leaves(scan_map) @ scan_map.R_map_from_world + scan_map.origin_world
-    return np.stack([world.min(axis=0), world.max(axis=0)])
 
 
 def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> list[Brush]:
