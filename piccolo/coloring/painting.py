@@ -26,7 +26,7 @@ from .sight import Sight, look, weigh_points
 
 WIDTH = 4096  # [px] of a photo, at most
 SAMPLES = 1 << 21  # of photos at points, that a task holds
-LEAST_PAINTED = 0.25  # of what a photo sees: of 16 right ones with less, colours refused 13
+LEAST_PAINTED = 0.25  # of what a photo sees: of 17 right ones with less, colours refused 14
 MOST_PHOTOS = 255  # that are counted for a point
 FULL = np.float32(255.0)
 Array32 = NDArray[np.float32]
