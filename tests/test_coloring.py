@@ -2,6 +2,7 @@
 
 import functools
 import json
+from dataclasses import replace
 
 import cv2
 import laspy
@@ -13,17 +14,25 @@ from scipy.spatial import cKDTree
 from piccolo.cli import color_scan as tool
 from piccolo.cli import localize as command_line
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.colored_writer import write_colored
+from piccolo.cloud.colored_writer import write_colored, writing_e57
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.coloring import alignment, color_scan
 from piccolo.coloring.alignment import Anchor, add_pairs, align
+from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligned_brushes
 from piccolo.coloring.exposure import balance
 from piccolo.coloring.painting import find_medians, make_brushes, paint_points
 from piccolo.coloring.sight import look, weigh_points
-from piccolo.errors import InputError
-from piccolo.geometry.pose import pose_errors, step
+from piccolo.confidence.covariance import PoseCovariance
+from piccolo.errors import InputError, ResourceError
+from piccolo.geometry.pose import Pose, pose_errors, step
+from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
+from piccolo.result import Result
+from piccolo.scan_map.scan_map import prepare_map
 
 SEED = 1
 NUM_POINTS = 200_000
@@ -122,12 +131,12 @@ def test_photos_that_were_moved_are_aligned_and_paint_the_room():
     moved = [step(pose, np.repeat([0.004, 0.02], 3) * rng.normal(size=6)) for pose in poses]
     information = np.diag([1 / 0.01**2] * 3 + [1 / 0.04**2] * 3)
     anchors = [Anchor(pose, information) for pose in moved]
-    aligned = align(octree, photos, moved, anchors, Workers(2))
+    aligned, _ = align(octree, photos, moved, anchors, Workers(2))
     before = [pose_errors(a, b)[0] for a, b in zip(moved, poses, strict=True)]
-    after = [pose_errors(a, b)[0] for a, b in zip(aligned.poses, poses, strict=True)]
+    after = [pose_errors(a, b)[0] for a, b in zip(aligned, poses, strict=True)]
     assert np.mean(after) < 0.5 * np.mean(before)
-    again = align(octree, photos, moved, anchors, Workers(1))
-    pairs = zip(aligned.poses, again.poses, strict=True)
+    again, _ = align(octree, photos, moved, anchors, Workers(1))
+    pairs = zip(aligned, again, strict=True)
     assert all(np.array_equal(a.center_world, b.center_world) for a, b in pairs)
     brushes = make_brushes(octree, photos, poses, np.ones((3, 3), np.float32), Workers(2))
     leaves = octree.level(octree.leaf_size)
@@ -135,6 +144,105 @@ def test_photos_that_were_moved_are_aligned_and_paint_the_room():
     is_seen = paint.num_photos > 1
     assert is_seen.mean() > 0.3
     assert np.median(np.abs(paint.colors / 255.0 - leaves[:, 3:]).max(axis=1)[is_seen]) < 12 / 255
+
+
+def _gray_map(cloud):
+    """A map of a scan's shape alone."""
+    gray = replace(cloud, colors=np.full_like(cloud.colors, 128), has_colors=False)
+    return prepare_map(gray, Workers(2), has_features=False)
+
+
+def _result(path, rgb, pose):
+    """A photo that was localized at a pose in the world, to 3 cm and 0.3 degrees."""
+    cv2.imwrite(str(path), rgb[..., ::-1])
+    covariance = PoseCovariance(np.diag([0.005**2] * 3 + [0.03**2] * 3), "")
+    return Result("localized", 0.95, "scan", str(path), best_pose=pose, covariance=covariance)
+
+
+@pytest.mark.parametrize("num_folds", [2, 8])
+def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch, num_folds):
+    monkeypatch.setattr(color_scan, "MOST_FOLDS", num_folds)
+    cloud = rooms.room(SEED)[1]
+    apart = cloud.points + np.float32([20.0, 0.0, 0.0])
+    both = replace(cloud, points=np.concatenate([cloud.points, apart]), colors=np.tile(cloud.colors, (2, 1)))
+    scan_map = _gray_map(both)
+    poses = [rooms.query(SEED, index=k).pose for k in range(3)]
+    poses.append(Pose(poses[0].R_cam_from_world, poses[0].center_world + np.array([20.0, 0.0, 0.0])))
+    colors = np.uint8([[255, 0, 0], [0, 255, 0], [0, 0, 255], [20, 20, 20]])
+    pictures = [np.full((64, 128, 3), color) for color in colors]
+    photos = zip(pictures, poses, strict=True)
+    by_shape = [_result(tmp_path / f"{k}.png", *photo) for k, photo in enumerate(photos)]
+    shown = []
+
+    def localize(painted, k):
+        leaves = painted.octree.level(painted.octree.leaf_size)
+        shown.append((k, {c for c in range(3) if leaves[:, 3 + c].max() > 0.5}))
+        return replace(by_shape[k], status="not_localized" if k == 2 else "localized", confidence=0.5)
+
+    results = localize_by_colors(scan_map, by_shape, localize, Workers(2))
+    first, second = dict(shown[:3]), dict(shown[3:])
+    if num_folds == 8:
+        assert first == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}}
+    else:  # the first and the third are one fold
+        assert first == {0: {1}, 1: {0, 2}, 2: {1}}
+    assert second == {0: {1}, 1: {0}, 2: {0, 1}}  # the one that was refused does not paint
+    assert [result.confidence for result in results] == [0.5, 0.5, 0.5, 0.95]  # the last one is alone
+
+
+def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
+    monkeypatch.setattr(color_scan, "NUM_ROUNDS", 1)
+    scan_map = _gray_map(rooms.room(SEED, NUM_POINTS)[1])
+    settings = CoarseToFineSettings(gravity="known")
+    right = [rooms.query(SEED, index=k, width=WIDTH) for k in range(3)]
+    there = step(right[0].pose, np.array([0.0, 0.0, 0.7, 0.9, 0.5, 0.0]))
+    photos = [(one.rgb, one.pose) for one in right] + [(rooms.query(2, width=WIDTH).rgb, there)]
+    by_shape = [_result(tmp_path / f"{k}.png", *photo) for k, photo in enumerate(photos)]
+
+    def localize_one(painted, k):
+        panorama = rooms.as_panorama(photos[k][0])
+        found = localize(painted, panorama, settings, Workers(2), Stopwatch())
+        about = {name: getattr(found, name) for name in ("status", "confidence", "covariance")}
+        return replace(by_shape[k], best_pose=found.pose, **about)
+
+    results = localize_by_colors(scan_map, by_shape, localize_one, Workers(2))
+    assert [result.status for result in results] == ["localized"] * 3 + ["not_localized"]
+    errors = [pose_errors(r.pose, one.pose)[0] for r, one in zip(results, right, strict=False)]
+    assert max(errors) < 0.02
+
+
+def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
+    rng = np.random.default_rng(5)
+    weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
+
+    def weigh(points, ranges, sight, R_cam_from_map, center_map, found):
+        found[:] = weights[int(center_map[0])]
+
+    monkeypatch.setattr(alignment, "look", lambda octree, pose: (None, None))
+    monkeypatch.setattr(alignment, "weigh_points", weigh)
+    poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
+    sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))
+    for n in range(50):
+        wanted = sorted(k for k in np.argsort(-weights[:, n])[:6] if weights[k, n] > 0.0)
+        own = slice(*sightings.first[n : n + 2])
+        assert (sightings.point[own] == n).all()
+        assert sightings.photo[own].tolist() == wanted
+    assert all((sightings.photo[own] == k).all() for k, own in enumerate(sightings.own))
+
+
+def test_colours_that_need_too_much_memory_are_refused(tmp_path, monkeypatch):
+    scan_map = _gray_map(rooms.room(SEED)[1])
+    one = rooms.query(SEED)
+    results = [_result(tmp_path / "0.png", one.rgb, one.pose)] * 2
+    monkeypatch.setattr("piccolo.jobs.memory.memory_left", lambda: 4e6)
+    with pytest.raises(ResourceError, match=r"^colouring by 2 photos needs .* localize fewer at once"):
+        make_aligned_brushes(scan_map, results, Workers(1))
+    points = np.zeros((100_000, 3))
+    colors = points.astype(np.uint8)
+    with (
+        pytest.raises(ResourceError, match=r"out.e57: 100000 points at once needs .* write LAZ or PLY"),
+        writing_e57(tmp_path / "out.e57", np.zeros((2, 3)), 1.0, "") as add,
+    ):
+        add(points, colors, colors[:, 0])
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".las", ".laz", ".e57"])
@@ -172,47 +280,58 @@ def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
     assert [path.name for path in tmp_path.iterdir()] == ["cloud.ply"]
 
 
-def test_the_commands_colour_a_scan(tmp_path, capsys):
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Options of a scan in a file and its cache, and two photos of it."""
+    folder = tmp_path_factory.mktemp("coloring")
     scan = rooms.room(SEED, NUM_POINTS)[1]
-    write_ply(tmp_path / "scan.ply", vertex_rows(scan.points + scan.origin_world, scan.colors))
-    photos = []
-    for k in range(2):
-        path = tmp_path / f"photo {k}.png"
-        cv2.imwrite(str(path), rooms.query(SEED, index=k, width=WIDTH).rgb[..., ::-1])
-        photos.append(str(path))
-    cloud = ["--cloud", str(tmp_path / "scan.ply"), "--cache", str(tmp_path / "cache")]
+    write_ply(folder / "scan.ply", vertex_rows(scan.points + scan.origin_world, scan.colors))
+    photos = [str(folder / f"photo {k}.png") for k in range(2)]
+    for k, path in enumerate(photos):
+        cv2.imwrite(path, rooms.query(SEED, index=k, width=WIDTH).rgb[..., ::-1])
+    return ["--cloud", str(folder / "scan.ply"), "--cache", str(folder / "cache")], photos
+
+
+def test_the_commands_colour_a_scan(files, tmp_path, capsys):
+    cloud, photos = files
     out, lines = tmp_path / "colored.ply", tmp_path / "poses.jsonl"
     given = [*cloud, "--pano", *photos, "--gravity", "known", "--color-scan", str(out), "--out", str(lines)]
     assert command_line.main(given) == 0
     assert "of the points coloured" in capsys.readouterr().err
-    assert [json.loads(line)["status"] for line in lines.read_text().splitlines()] == ["localized"] * 2
+    found = [json.loads(line) for line in lines.read_text().splitlines()]
+    assert [result["status"] for result in found] == ["localized"] * 2
+    assert all(PAINTED in result["warnings"] for result in found)
     again = tmp_path / "again.ply"
     assert tool.main([*cloud, "--results", str(lines), "--out", str(again)]) == 0
     assert json.loads(capsys.readouterr().out)["photos"] == 2
-    assert len(read_cloud(again).points) == len(scan.points)
+    assert len(read_cloud(again).points) == NUM_POINTS
     assert command_line.main(given) == 2
     assert "has results already" in capsys.readouterr().err
-    for wrong in (["--jobs", "2"], ["--color-scan", str(tmp_path / "a.xyz")]):
-        assert command_line.main([*given, "--overwrite", *wrong]) in (2, 3)
-    broken = tmp_path / "broken.jpg"
-    broken.write_bytes(b"no picture")
-    one = [
-        *cloud,
-        "--pano",
-        photos[0],
-        str(broken),
-        "--gravity",
-        "known",
-        "--out",
-        str(tmp_path / "one.jsonl"),
-    ]
-    assert command_line.main([*one, "--color-scan", str(tmp_path / "none.ply")]) == 3
-    err = capsys.readouterr().err
-    assert "broken.jpg: " in err
-    assert "none.ply is not written: wanted 2 localized photos or more" in err
-    assert not (tmp_path / "none.ply").exists()
-    found = [json.loads(line)["status"] for line in (tmp_path / "one.jsonl").read_text().splitlines()]
-    assert found == ["localized", "unreadable"]
     lines.write_text(lines.read_text().splitlines()[0] + "\n")
     assert tool.main([*cloud, "--results", str(lines), "--out", str(again)]) == 3
     assert "found 1 localized photos, wanted 2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("wrong", "text"),
+    [(["--jobs", "2"], "--jobs: not with --color-scan"), (["--color-scan", "a.xyz"], "a.xyz: wanted a name")],
+)
+def test_what_does_not_go_with_colouring_is_refused(files, capsys, wrong, text):
+    cloud, photos = files
+    assert command_line.main([*cloud, "--pano", *photos, "--color-scan", "a.ply", *wrong]) == 2
+    assert text in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("is_broken", "code"), [(False, 1), (True, 3)])
+def test_with_nothing_to_colour_by_the_command_says_so(files, tmp_path, capsys, is_broken, code):
+    cloud, photos = files
+    broken = tmp_path / "broken.jpg"
+    broken.write_bytes(b"no picture")
+    panos = [photos[0], str(broken)][: 1 + is_broken]
+    out, lines = tmp_path / "none.ply", tmp_path / "one.jsonl"
+    given = [*cloud, "--pano", *panos, "--gravity", "known", "--color-scan", str(out), "--out", str(lines)]
+    assert command_line.main([*given, "--quiet"]) == code
+    assert "none.ply is not written: wanted 2 localized photos or more" in capsys.readouterr().err
+    assert not out.exists()
+    found = [json.loads(line)["status"] for line in lines.read_text().splitlines()]
+    assert found == ["localized", "unreadable"][: 1 + is_broken]

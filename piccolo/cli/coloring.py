@@ -9,7 +9,7 @@ from pathlib import Path
 from ..batch.inputs import is_from_stdin
 from ..batch.localizer import Localizer
 from ..batch.results_file import write_results
-from ..coloring.color_scan import LEAST_PHOTOS, check_suffix, color_map, write_colored_scan
+from ..coloring.color_scan import LEAST_PHOTOS, PAINTED, check_suffix, localize_by_colors, write_colored_scan
 from ..confidence.confidence import LOCALIZED
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
@@ -17,11 +17,9 @@ from ..result import Result
 from ..scan_map.scan_map import ScanMap
 from .bundle import check_new_results
 from .command import check_alone
-from .errors import UsageError, print_note
-from .executing import choose_exit_code
-from .progress import progress_bar
+from .errors import UsageError, print_error, print_note
+from .executing import EXIT_SOME_NOT, choose_exit_code
 
-NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
 NOT_WITH = ("walk", "video", "relative", "jobs", "dask", "overlay", "occlusion_mask", "labels")
 
 
@@ -43,33 +41,32 @@ def run_coloring(
     open_scan: Callable[[], OpenedScan],
     print_result: Callable[[Result, Sequence[str]], None],
 ) -> int:
-    """Localize the photos, write the scan in their colours, then the results; return the exit code.
+    """Localize the photos, write the results, then the scan in their colours; return the exit code.
 
-    If too few are localized to colour the scan, the results alone are written.
+    If too few are localized to colour the scan, the results alone are written, and the code is not 0.
     """
     if not isinstance(localizer.settings, CoarseToFineSettings):
         raise UsageError("--color-scan: not an option of the preset paper")
-    show = progress_bar(arguments.quiet)
     scan = open_scan()
+    assert isinstance(scan.prepared, ScanMap)
 
-    def localize_all() -> list[Result]:
-        shown = show(iter(photos), len(photos), "photos")
-        return [localizer.answer(scan, localizer.task(photo)).result for photo in shown]
+    def localize(scan_map: ScanMap, k: int) -> Result:
+        return localizer.answer(replace(scan, prepared=scan_map), localizer.task(photos[k])).result
 
-    results = localize_all()
-    counts = Counter(result.status for result in results)
-    note = f"{arguments.color_scan} is not written: wanted {LEAST_PHOTOS} localized photos or more"
-    if counts[LOCALIZED] >= LEAST_PHOTOS:
-        for _ in range(NUM_ROUNDS):
-            assert isinstance(scan.prepared, ScanMap)
-            scan = replace(scan, prepared=color_map(scan.prepared, results, scan.workers))
-            results = localize_all()
-        colored = write_colored_scan(scan, results, arguments.color_scan)
-        counts = Counter(result.status for result in results)
-        note = f"{100.0 * colored.num_colored / max(colored.num_points, 1):.0f} % of the points coloured"
+    order = scan.workers.show(iter(range(len(photos))), len(photos), "photos")
+    by_shape = [localize(scan.prepared, k) for k in order]
+    results = localize_by_colors(scan.prepared, by_shape, localize, scan.workers)
     write_results(arguments.out, results)
+    of_scan = {*scan.warnings, PAINTED}
     for result in results:
-        print_result(result, result.warnings[len(scan.warnings) :])
+        print_result(result, [warning for warning in result.warnings if warning not in of_scan])
+    counts = Counter(result.status for result in results)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
-    print_note(arguments, f"{len(results)} photos: {words}; {note}")
-    return choose_exit_code(counts)
+    code = choose_exit_code(counts)
+    if counts[LOCALIZED] < LEAST_PHOTOS:
+        why = f"{arguments.color_scan} is not written: wanted {LEAST_PHOTOS} localized photos or more"
+        return print_error(arguments, f"{len(results)} photos: {words}; {why}", code or EXIT_SOME_NOT)
+    colored = write_colored_scan(scan, results, arguments.color_scan)
+    part = f"{100.0 * colored.num_colored / max(colored.num_points, 1):.0f} % of the points coloured"
+    print_note(arguments, f"{len(results)} photos: {words}; {part}")
+    return code

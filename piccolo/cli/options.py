@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--overlay PNG", text + folder)
     text = "mask of the photo's size: white contradicts the scan, grey was not scanned, black elsewhere; "
     option(group, "--occlusion-mask PNG", text + folder)
-    text = "colour the scan by the photos (.ply, .las, .laz, .e57), and localize them again by these colours"
+    text = "colour the scan by the photos (.ply, .las, .laz, .e57), and localize each by the others' colours"
     option(group, "--color-scan FILE", text)
     option(group, "--cache FOLDER", CACHE_TEXT)
     add_method_options(parser)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..files.atomic import replacing
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Array
+from ..jobs.memory import check_memory
 from ..optional import import_optional
 from .ply_writer import needs_double, vertex_rows, writing_ply
 from .stream import CloudStream
@@ -19,6 +20,7 @@ from .stream import CloudStream
 SUFFIXES = (".ply", ".las", ".laz", ".e57")
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a scan in the axes of its file
 LAS_STEP = 1e-4  # [m] of coordinates in LAS
+E57_BYTES = 45  # of a point, beside the array of it that is held, while the file is written
 Colors = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # RGB (N, 3), and how many photos (N,) gave each
 Add = Callable[[Array, NDArray[np.uint8], NDArray[np.uint8]], None]  # points (N, 3) in the files' unit
 
@@ -85,7 +87,13 @@ def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add
     pye57 = import_optional(out, "pye57")
     middle = np.floor(box.mean(axis=0))  # coordinates are written in float32
     parts: list[tuple[Any, ...]] = []
-    yield lambda points, colors, _num_photos: parts.append((*(points - middle).T, *colors.T))
+
+    def add(points: Array, colors: NDArray[np.uint8], _num_photos: NDArray[np.uint8]) -> None:
+        parts.append((*(points - middle).T, *colors.T))
+        count = sum(len(part[0]) for part in parts)
+        check_memory(E57_BYTES * count, f"{out}: {count} points at once", "write LAZ or PLY")
+
+    yield add
     names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"
     columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
     with temporary_folder() as folder, replacing(out) as file:

@@ -37,6 +37,7 @@ WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000
 LEAST_POINTS = 40_000
 MOST_SEEN = 6  # photos that count for a point: those that see it best
+AT_ONCE = 16  # photos whose weights for all points are held
 LOSS_SCALE = 20.0  # [8-bit levels] of the length of a colour difference
 NOISE = 10.0  # [8-bit levels] of one
 NUM_ALIKE = 30.0  # points whose differences err alike: with fewer, weak constraints outweigh where poses were
@@ -58,13 +59,7 @@ class Sightings(NamedTuple):
     first: NDArray[np.int64]  # (N + 1,)
     point: NDArray[np.int64]  # (S,)
     photo: NDArray[np.int64]  # (S,)
-
-
-class Aligned(NamedTuple):
-    """Photos that agree."""
-
-    poses: list[Pose]  # in the map
-    gains: Array32  # (photos, 3) by which colours are multiplied, so that exposures agree
+    own: list[NDArray[np.int64]]  # those of each photo
 
 
 class Readings(NamedTuple):
@@ -76,8 +71,11 @@ class Readings(NamedTuple):
 
 def align(
     octree: Octree, panoramas: Sequence[Panorama], poses: list[Pose], anchors: list[Anchor], workers: Workers
-) -> Aligned:
-    """Move the poses of photos in a map until the photos agree on its surfaces, near their anchors."""
+) -> tuple[list[Pose], Array32]:
+    """Move the poses of photos in a map until the photos agree on its surfaces, near their anchors.
+
+    Return also the gains (photos, 3) by which colours are multiplied, so that exposures agree.
+    """
     leaves = octree.level(octree.leaf_size)
     num_points = max(LEAST_POINTS, POINTS_PER_PHOTO * len(poses))
     points = np.ascontiguousarray(leaves[:: -(-len(leaves) // num_points), :3])
@@ -89,7 +87,7 @@ def align(
         values = read_all(points, sightings, texels, np.ones_like(gains), poses, workers).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
         poses = descend(points, sightings, texels, gains, poses, anchors, workers)
-    return Aligned(poses, gains)
+    return poses, gains
 
 
 def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], workers: Workers) -> Sightings:
@@ -101,14 +99,22 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
         weigh_points(points, *sight, pose.R_cam_from_world, pose.center_world, found)
         return found
 
-    weights = np.stack(workers.map(weigh, poses, "see"), axis=1)
-    if len(poses) > MOST_SEEN:
-        least = np.partition(weights, -MOST_SEEN, axis=1)[:, -MOST_SEEN, None]
-        weights[weights < least] = 0.0
-    is_seen = weights > 0.0
+    best = np.zeros((len(points), MOST_SEEN), np.float32)
+    photos = np.full(best.shape, len(poses))
+    for begin in range(0, len(poses), AT_ONCE):
+        for k, found in enumerate(workers.map(weigh, poses[begin : begin + AT_ONCE], "see"), begin):
+            least = np.arange(len(points)), best.argmin(axis=1)
+            is_better = found > best[least]
+            photos[least] = np.where(is_better, k, photos[least])
+            best[least] = np.where(is_better, found, best[least])
+    photos.sort(axis=1)
+    is_seen = photos < len(poses)
     is_seen &= is_seen.sum(axis=1, keepdims=True) > 1
-    point, photo = np.nonzero(is_seen)
-    return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo)
+    point = np.nonzero(is_seen)[0]
+    photo = photos[is_seen]
+    counts = np.bincount(photo, minlength=len(poses))
+    own = np.split(np.argsort(photo, kind="stable"), np.cumsum(counts)[:-1])
+    return Sightings(np.searchsorted(point, np.arange(len(points) + 1)), point, photo, own)
 
 
 def read_all(
@@ -124,11 +130,10 @@ def read_all(
     readings = Readings(np.empty((count, 3), np.float32), np.empty((count, 3, 6), np.float32))
 
     def read(k: int) -> None:
-        own = np.flatnonzero(sightings.photo == k)
         pose = poses[k]
         image = texels[k]
         read_photo(
-            points, own, sightings.point, image.rgbx, image.width, gains[k],
+            points, sightings.own[k], sightings.point, image.rgbx, image.width, gains[k],
             pose.R_cam_from_world, pose.center_world, *readings,
         )  # fmt: skip
 

@@ -1,6 +1,6 @@
 """A scan in the colours of photos that were localized in it, by its shape or by colours it has already."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,9 +10,9 @@ import numpy as np
 from ..cloud import open_cloud
 from ..cloud.colored_writer import SUFFIXES, write_colored
 from ..cloud.octree import recolor
-from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..geometry.pose import Array, Pose
+from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan, read_options_of
 from ..panorama import Panorama, read_panorama
@@ -21,12 +21,17 @@ from ..result import Result
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, align
-from .painting import WIDTH, Brush, Paint, make_brushes, paint_points
+from .painting import WIDTH, Array32, Brush, Paint, make_brushes, paint_points, sees_paint
 
 LEAST_PHOTOS = 2
+NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
+MOST_FOLDS = 8  # of photos that do not see each other's paint: each fold has a map of its own
+PIXEL_BYTES = 8  # of a photo that gives colours: RGB, whether it counts, and both packed
+PHOTO_BYTES = 40e6  # beside: its smaller copy, ranges around it, and its share of points that are aligned
+PAIR_BYTES = 5 * 6 * 6 * 8  # of two photos: normal equations, and copies of them in a step
 UNKNOWN_STD = np.radians(0.5), 0.03  # [rad], [m] of a pose without a covariance
 PAINT_STD = 0.008  # [m] of positions in a scan whose colours are all of photos that found each other
-PAINTED = "photos are localized by the colours that they gave to the scan"
+PAINTED = "photos are localized by the colours that others gave to the scan"
 
 
 class Colored(NamedTuple):
@@ -37,20 +42,48 @@ class Colored(NamedTuple):
     num_colored: int  # points that a photo sees
 
 
-def color_map(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> ScanMap:
-    """Return a map in the colours of the photos that were localized in it."""
-    octree = scan_map.octree
-    leaves = np.ascontiguousarray(octree.level(octree.leaf_size)[:, :3])
-    paint = paint_points(leaves, make_aligned_brushes(scan_map, results, workers), workers)
+def localize_by_colors(
+    scan_map: ScanMap,
+    by_shape: Sequence[Result],
+    localize: Callable[[ScanMap, int], Result],
+    workers: Workers,
+) -> list[Result]:
+    """Localize photos in the colours that the others give to a map, by `localize(painted_map, photo)`.
+
+    A photo that is refused there does not paint in the next round. One that sees hardly any paint of others
+    gets its result of `by_shape`.
+    """
+    results = list(by_shape)
+    leaves = list_leaves(scan_map)
+    for _ in range(NUM_ROUNDS):
+        painters = [k for k, result in enumerate(results) if result.pose is not None]
+        if len(painters) < LEAST_PHOTOS:
+            break
+        brushes = dict(zip(painters, make_aligned_brushes(scan_map, results, workers), strict=True))
+        idle = [k for k in range(len(results)) if k not in brushes]
+        for own in filter(None, [*(painters[n::MOST_FOLDS] for n in range(MOST_FOLDS)), idle]):
+            paint = paint_points(leaves, [brush for k, brush in brushes.items() if k not in own], workers)
+            shown = [k for k in own if k in idle or sees_paint(brushes[k], leaves, paint)]
+            painted = color_map(scan_map, paint, workers) if shown else scan_map
+            for k in workers.show(iter(own), len(own), "photos"):
+                results[k] = localize(painted, k) if k in shown else by_shape[k]
+    return results
+
+
+def color_map(scan_map: ScanMap, paint: Paint, workers: Workers) -> ScanMap:
+    """Return a map in other colours of its leaves; those without get one from around them."""
     colors = np.asarray(paint.colors / np.float32(255.0), np.float32)
-    painted = recolor(octree, colors, (paint.num_photos > 0).astype(np.float32))
-    notes = [note for note in scan_map.warnings if note not in (SHAPE_ALONE, PAINTED)]
-    is_painted = PAINTED in scan_map.warnings  # its variance has that of photos already
+    painted = recolor(scan_map.octree, colors, (paint.num_photos > 0).astype(np.float32))
     return replace(
         change_colors(scan_map, painted, workers),
-        surface_variance=scan_map.surface_variance + (not is_painted) * PAINT_STD**2 * np.eye(3),
-        warnings=(*notes, PAINTED),
+        surface_variance=scan_map.surface_variance + PAINT_STD**2 * np.eye(3),
+        warnings=(*(note for note in scan_map.warnings if note != SHAPE_ALONE), PAINTED),
     )
+
+
+def list_leaves(scan_map: ScanMap) -> Array32:
+    """Return the positions (N, 3) of a map's leaves."""
+    return np.ascontiguousarray(scan_map.octree.level(scan_map.octree.leaf_size)[:, :3])
 
 
 def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -> Colored:
@@ -72,7 +105,9 @@ def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -
         return paint_points(points_map.astype(np.float32), brushes, Workers(workers.num_threads))
 
     cloud = open_cloud(paths, scan.cloud_settings, workers.show)
-    counts = write_colored(cloud, color, box_world(scan_map), out, scan_map.crs)
+    leaves_world = list_leaves(scan_map) @ scan_map.R_map_from_world + scan_map.origin_world
+    box_world = np.stack([leaves_world.min(axis=0), leaves_world.max(axis=0)])
+    counts = write_colored(cloud, color, box_world, out, scan_map.crs)
     return Colored(len(brushes), *counts)
 
 
@@ -82,25 +117,20 @@ def check_suffix(out: Path) -> None:
         raise InputError(f"{out}: wanted a name that ends with {', '.join(SUFFIXES)}")
 
 
-def box_world(scan_map: ScanMap) -> Array:
-    """Return a box (2, 3) [m] in the world around all points of a map."""
-    leaves = scan_map.octree.level(scan_map.octree.leaf_size)[:, :3]
-    corners = np.array(np.meshgrid(*np.stack([leaves.min(axis=0), leaves.max(axis=0)], axis=1))).reshape(3, 8)
-    world = corners.T @ scan_map.R_map_from_world + scan_map.origin_world
-    return np.stack([world.min(axis=0), world.max(axis=0)])
-
-
 def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: Workers) -> list[Brush]:
     """Align the photos that are localized, and return them as what gives colours."""
-    found = [(r, r.pose) for r in results if r.status == LOCALIZED and r.pose is not None]
+    found = [(result, result.pose) for result in results if result.pose is not None]
     if len(found) < LEAST_PHOTOS:
         text = f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours"
         raise InputError(text)
-    panoramas = workers.map(read_unmasked, [result for result, _ in found], "read")
+    panoramas = [read_unmasked(found[0][0])]
+    bytes_each = PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES + PAIR_BYTES * len(found)
+    check_memory(len(found) * bytes_each, f"colouring by {len(found)} photos", "localize fewer at once")
+    panoramas += workers.map(read_unmasked, [result for result, _ in found[1:]], "read")
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
-    aligned = align(scan_map.octree, panoramas, poses, anchors, workers)
-    return make_brushes(scan_map.octree, panoramas, aligned.poses, aligned.gains, workers)
+    poses, gains = align(scan_map.octree, panoramas, poses, anchors, workers)
+    return make_brushes(scan_map.octree, panoramas, poses, gains, workers)
 
 
 def read_unmasked(result: Result) -> Panorama:
