@@ -24,6 +24,7 @@ LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
 LEAST_BLOCKS = 13  # fewer do not tell six dimensions
 MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
+UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
@@ -244,7 +245,8 @@ def estimate_covariance(
         return None
     J = np.eye(6)
     J[3:, 3:] = pose.R_cam_from_world.T  # R_map_from_cam
-    pixel_share = PIXEL_SHARE if of_camera is None else UNCALIBRATED_SHARE
+    prior = query.photo.given.focal_prior
+    pixel_share = PIXEL_SHARE if prior is None or prior.deviation < UNCALIBRATED else UNCALIBRATED_SHARE
     covariance_map = J @ covariance @ J.T + source_covariance(query, points, pixel_share)
     std_of_fit = None
     if of_camera is not None:

@@ -23,6 +23,8 @@ from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
+from ..local_features.hypotheses import exact_pose
+from ..local_features.matching import Matches
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
@@ -33,6 +35,7 @@ from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
 from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
 from .selection import Selection
+from .verification import matches_near
 
 FOCALS = "f", "fx", "fy"
 RADIAL = "k1"
@@ -40,8 +43,13 @@ WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted t
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
 NUM_VALUES = 7  # of the parameter in a design of one
 NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
-FIRST_REACH = (0.04, 0.1)  # of a design to either side: at first, least and most
+FIRST_REACH = 0.1  # of a design to either side, at first
+NEXT_REACH = 0.04
 LAST_REACH = 0.02
+NARROWER = 0.4  # times the reach, where a design has a crest
+MATCHED_CHANGES = np.linspace(-0.4, 0.4, 21)  # of the focal length, that are tried with the matches
+MATCH_ERROR = math.radians(0.25)
+LEAST_GAIN = 1.5  # matches by which another focal length must be better
 K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
 MOST_DESIGNS = 6
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
@@ -51,6 +59,8 @@ MOST_SHARE = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
+CHANCE = 1.5  # deviations between the focal length found and that given: fewer are taken for chance
+MOST_CONFLICT = 4.0  # more contradict what was given
 EDGE = 5  # [px] within the picture's edge that no point may come near
 NEARBY = Limits(FINE_LOSS, 12, 1e-4)
 CLOSE = Limits(FULL_LOSS, 30, 1e-6)
@@ -112,6 +122,11 @@ class Crest(NamedTuple):
     information: Array  # (p, p) inverse of its covariance; 0 where the profile has no crest
     motion: Array  # (6, p) as of FocalFit
 
+    @property
+    def variance(self) -> float:
+        """Variance of the logarithm of the focal length; infinite where there is no crest."""
+        return float(np.linalg.pinv(self.information)[0, 0]) if self.information.any() else math.inf
+
 
 def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     """Fit the focal length of a photo with a focal_prior whose pose in the map is roughly known.
@@ -128,24 +143,26 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         k1 = names.index(RADIAL)
         expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
     precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
-    reach = min(max(2.5 * prior.deviation, FIRST_REACH[0]), FIRST_REACH[1]) if is_first else LAST_REACH
-    crest = find_crest(query, pose, num, reach)
+    crest = find_crest(query, pose, num, FIRST_REACH if is_first else NEXT_REACH)
     if crest.information.any():
         per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
         covariance = np.linalg.pinv(crest.information)
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
         crest = crest._replace(information=np.linalg.pinv(covariance))
-    total = np.linalg.inv(crest.information + precision)
-    change = total @ (crest.information @ crest.change + precision @ expected)
     conflict = 0.0
     if crest.information[0, 0] > 0.0:
         spread = np.linalg.pinv(crest.information)[0, 0] + prior.deviation**2
         conflict = abs(crest.change[0] - expected[0]) / math.sqrt(spread)
+    # the more picture and prior disagree, the less the prior counts, and the wider is all
+    doubt = (min(max(conflict, CHANCE), MOST_CONFLICT) / CHANCE) ** 2
+    precision /= doubt**2
+    total = doubt * np.linalg.inv(crest.information + precision)
+    change = total @ (crest.information @ crest.change + precision @ expected) / doubt
     return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
-    """Search the crest of the profile about a pose in ever narrower designs, moved if they miss it.
+    """Search the crest of the profile about a pose in ever narrower designs, moved downhill if they miss it.
 
     Its information is 0 if no design has a crest: then the picture does not determine the calibration.
     """
@@ -157,15 +174,20 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
         crest = fit_crest(changes, losses, ends, pose)
         has_crest = bool(crest.information.any())
         is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
-        if not is_inside and (found is not None or not has_crest):
-            break
-        middle = np.clip(crest.change, middle - reach, middle + reach)
-        pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
         if is_inside:
-            found = crest
+            found = crest if found is None or crest.variance < found.variance else found
             if reach <= LAST_REACH:
                 break
-            reach = max(0.5 * reach, LAST_REACH)
+        elif found is not None:
+            break
+        lowest = int(losses.sum(axis=1).argmin())
+        goal = crest.change if has_crest else changes[lowest]
+        if not is_inside and not has_crest and np.all(np.abs(goal - middle) < 0.99 * reach):
+            break
+        middle = np.clip(goal, middle - reach, middle + reach)
+        pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
+        if is_inside:
+            reach = max(NARROWER * reach, LAST_REACH)
     return found or Crest(np.zeros(num), np.zeros((num, num)), crest.motion)
 
 
@@ -259,17 +281,59 @@ def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFi
 
     If the picture says nothing of it in the end, the conflict is that of the last fit in which it did.
     """
-    conflict = 0.0
-    for k in range(MAX_CALIBRATIONS + 1):
-        fit = fit_focal(query, found.best.pose, is_first=k == 0)
-        conflict = fit.conflict or conflict
-        if fit.is_at_rest or k == MAX_CALIBRATIONS:
+    query, found, is_other = follow_matches(query, found)
+    fit = fit_focal(query, found.best.pose)
+    if is_other and fit.conflict == 0.0:
+        fit = fit._replace(change=np.zeros_like(fit.change), conflict=math.inf)
+    for _ in range(MAX_CALIBRATIONS):
+        if fit.is_at_rest:
             break
-        query = recalibrate(query, fit.change)
-        poses = [fit.move(found.best.pose), *(h.pose for h in found.alternatives)]
-        moved = query.workers.map(partial(score_pose, query), poses, "compare")
-        found = refine_to_the_end(query, moved)
-    return query, found, fit._replace(conflict=conflict)
+        query, found = refine_with(query, found, fit.change, fit.move(found.best.pose))
+        after = fit_focal(query, found.best.pose, is_first=False)
+        fit = after if after.conflict else fit._replace(change=np.zeros_like(fit.change))
+    return query, found, fit
+
+
+def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tuple[Query, Selection]:
+    """Refine the poses with another calibration, of which the best is `best`."""
+    query = recalibrate(query, change)
+    poses = [best, *(h.pose for h in found.alternatives)]
+    moved = query.workers.map(partial(score_pose, query), poses, "compare")
+    return query, refine_to_the_end(query, moved)
+
+
+def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection, bool]:
+    """Begin with the focal length by which most matches agree, if that is another; return also whether.
+
+    The matches are those with the scan drawn at the best pose.
+    """
+    if not query.num_parts:
+        return query, found, False
+    pose = found.best.pose
+    matches = matches_near(query, pose)
+    before = query.photo.given.cameras[0]
+
+    def agree(value: float) -> tuple[float, Pose]:
+        after = before.with_camera(change_camera(before.camera, np.array([value])))
+        turned = matches._replace(rays=_turn_rays(matches.rays, before, after))
+        end = exact_pose(turned, pose, None)
+        return (0.0, pose) if end is None else (support(turned, end.pose), end.pose)
+
+    tried = [agree(value) for value in MATCHED_CHANGES]
+    best = int(np.argmax([count for count, _ in tried]))
+    if tried[best][0] < tried[len(tried) // 2][0] + LEAST_GAIN:
+        return query, found, False
+    other = refine_with(query, found, np.array([MATCHED_CHANGES[best]]), tried[best][1])
+    if other[1].best.score < found.best.score:
+        return query, found, False
+    return *other, True
+
+
+def support(matches: Matches, pose: Pose) -> float:
+    """Return the number of matches that agree with a pose, those with larger errors counted less."""
+    offsets = rotate_points(matches.points - pose.center_world, pose.R_cam_from_world)
+    rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+    return float(np.sum(1.0 / (1.0 + ((rays - matches.rays) ** 2).sum(axis=1) / MATCH_ERROR**2)))
 
 
 def recalibrate(query: Query, change: Array) -> Query:
