@@ -49,6 +49,7 @@ LAST_REACH = 0.02
 NARROWER = 0.4  # times the reach, where a design has a crest
 MATCHED_CHANGES = np.linspace(-0.4, 0.4, 21)  # of the focal length, that are tried with the matches
 MATCH_ERROR = math.radians(0.25)
+MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 LEAST_GAIN = 1.5  # matches by which another focal length must be better
 K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
 MOST_DESIGNS = 6
@@ -59,8 +60,7 @@ MOST_SHARE = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
-CHANCE = 1.5  # deviations between the focal length found and that given: fewer are taken for chance
-MOST_CONFLICT = 4.0  # more contradict what was given
+MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
 EDGE = 5  # [px] within the picture's edge that no point may come near
 NEARBY = Limits(FINE_LOSS, 12, 1e-4)
 CLOSE = Limits(FULL_LOSS, 30, 1e-6)
@@ -153,11 +153,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     if crest.information[0, 0] > 0.0:
         spread = np.linalg.pinv(crest.information)[0, 0] + prior.deviation**2
         conflict = abs(crest.change[0] - expected[0]) / math.sqrt(spread)
-    # the more picture and prior disagree, the less the prior counts, and the wider is all
-    doubt = (min(max(conflict, CHANCE), MOST_CONFLICT) / CHANCE) ** 2
-    precision /= doubt**2
-    total = doubt * np.linalg.inv(crest.information + precision)
-    change = total @ (crest.information @ crest.change + precision @ expected) / doubt
+    doubt = min(max(conflict, 1.0), MOST_CONFLICT) ** 2  # the more both disagree, the less the prior counts
+    total = np.linalg.inv(crest.information + precision / doubt**2)
+    change = total @ (crest.information @ crest.change + precision / doubt**2 @ expected)
     return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
@@ -324,7 +322,7 @@ def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection, bo
     if tried[best][0] < tried[len(tried) // 2][0] + LEAST_GAIN:
         return query, found, False
     other = refine_with(query, found, np.array([MATCHED_CHANGES[best]]), tried[best][1])
-    if other[1].best.score < found.best.score:
+    if other[1].best.score < MIN_SCORE_LEFT * found.best.score:
         return query, found, False
     return *other, True
 
