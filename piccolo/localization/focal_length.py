@@ -47,12 +47,15 @@ FIRST_REACH = 0.1  # of a design to either side, at first
 NEXT_REACH = 0.04
 LAST_REACH = 0.02
 NARROWER = 0.4  # times the reach, where a design has a crest
+WIDER = 2.0  # and where it has none
+LIMIT = 0.4  # of the change that is searched
+END_DEVIATION = 0.05  # of a crest that lies there or beyond
 MATCHED_CHANGES = np.linspace(-0.4, 0.4, 21)  # of the focal length, that are tried with the matches
 MATCH_ERROR = math.radians(0.25)
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 LEAST_GAIN = 1.5  # matches by which another focal length must be better
 K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
-MOST_DESIGNS = 6
+MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
 LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
@@ -162,7 +165,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     """Search the crest of the profile about a pose in ever narrower designs, moved downhill if they miss it.
 
-    Its information is 0 if no design has a crest: then the picture does not determine the calibration.
+    Of the designs that have a crest, that which tells it best counts. If none has, the picture does not
+    determine the calibration: the information is 0. If the loss still falls at the end of the range, it does
+    contradict what was given, and the crest is the end.
     """
     middle = np.zeros(num)
     found: Crest | None = None
@@ -172,21 +177,28 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
         crest = fit_crest(changes, losses, ends, pose)
         has_crest = bool(crest.information.any())
         is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
+        lowest = changes[int(losses.sum(axis=1).argmin())]
         if is_inside:
-            found = crest if found is None or crest.variance < found.variance else found
-            if reach <= LAST_REACH:
-                break
-        elif found is not None:
+            found = min(crest, found or crest, key=lambda one: one.variance)
+        is_lost = not has_crest and bool(np.all(np.abs(lowest - middle) < 0.99 * reach))
+        if reach <= LAST_REACH if is_inside else found or is_lost:
             break
-        lowest = int(losses.sum(axis=1).argmin())
-        goal = crest.change if has_crest else changes[lowest]
-        if not is_inside and not has_crest and np.all(np.abs(goal - middle) < 0.99 * reach):
-            break
-        middle = np.clip(goal, middle - reach, middle + reach)
+        if abs(lowest[0]) > LIMIT:
+            return crest._replace(change=lowest, information=fit_end(changes, losses))
+        middle = np.clip(crest.change if has_crest else lowest, middle - reach, middle + reach)
         pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
-        if is_inside:
-            reach = max(NARROWER * reach, LAST_REACH)
+        reach = max(NARROWER * reach, LAST_REACH) if is_inside else min(WIDER * reach, FIRST_REACH)
     return found or Crest(np.zeros(num), np.zeros((num, num)), crest.motion)
+
+
+def fit_end(changes: Array, losses: Array) -> Array:
+    """Return the information of the end of a profile: 0 unless most blocks' losses (K, B) fall to it alike."""
+    shown = losses[:, losses.any(axis=0)]
+    slopes = np.linalg.lstsq(np.column_stack([np.ones(len(changes)), changes]), shown, rcond=None)[0][1]
+    spread = math.sqrt(INFLATION * len(slopes)) * float(slopes.std())
+    information = np.zeros((changes.shape[1], changes.shape[1]))
+    information[0, 0] = END_DEVIATION**-2 if abs(slopes.sum()) > 2.0 * spread else 0.0
+    return information
 
 
 def make_design(num: int, reach: float) -> Array:
