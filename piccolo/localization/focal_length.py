@@ -192,7 +192,7 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
 
 
 def fit_end(changes: Array, losses: Array) -> Array:
-    """Return the information of the end of a profile: 0 unless most blocks' losses (K, B) fall to it alike."""
+    """Return the information of the end of a profile: 0 unless most blocks' losses fall to it."""
     shown = losses[:, losses.any(axis=0)]
     slopes = np.linalg.lstsq(np.column_stack([np.ones(len(changes)), changes]), shown, rcond=None)[0][1]
     spread = math.sqrt(INFLATION * len(slopes)) * float(slopes.std())
