@@ -153,12 +153,14 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
         crest = crest._replace(information=np.linalg.pinv(covariance))
     conflict = 0.0
-    if crest.information[0, 0] > 0.0:
-        spread = np.linalg.pinv(crest.information)[0, 0] + prior.deviation**2
-        conflict = abs(crest.change[0] - expected[0]) / math.sqrt(spread)
-    doubt = min(max(conflict, 1.0), MOST_CONFLICT) ** 2  # the more both disagree, the less the prior counts
-    total = np.linalg.inv(crest.information + precision / doubt**2)
-    change = total @ (crest.information @ crest.change + precision / doubt**2 @ expected)
+    if crest.information.any():
+        off = abs(crest.change[0] - expected[0])
+        spread = crest.variance + prior.deviation**2
+        conflict = off / math.sqrt(spread)
+        excess = max(off**2 - spread, 0.0)  # by which both disagree: the prior is less good than it claims
+        precision[0, 0] = 1.0 / (prior.deviation**2 + excess)
+    total = np.linalg.inv(crest.information + precision)
+    change = total @ (crest.information @ crest.change + precision @ expected)
     return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
