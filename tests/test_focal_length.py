@@ -196,6 +196,7 @@ def test_the_more_picture_and_user_disagree_the_less_the_prior_counts(monkeypatc
     query = prepare_query(_panorama(rgb, focal_px=TRUE), scan_map(5), CoarseToFineSettings(), Workers(2))
     found = focal.Crest(np.array([crest]), np.array([[0.01**-2]]), np.ones((6, 1)))
     monkeypatch.setattr(focal, "find_crest", lambda *args: found)
+    monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
     fit = focal.fit_focal(query, scan().from_world(pose))
     assert fit.conflict == pytest.approx(crest / 0.01 / math.sqrt(2.0), rel=0.02)
     assert most - 0.15 < fit.change[0] / crest <= most
@@ -211,11 +212,12 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
         _panorama(rgb, focal_px=0.8 * TRUE), scan_map(5), CoarseToFineSettings(), Workers(2)
     )
     found = Selection(score_pose(query, scan().from_world(pose)), ())
-    query, found, is_other = focal.follow_matches(query, found)
-    assert is_other
+    query, found = focal.follow_matches(query, found)
     assert query.photo.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert scan().to_world(found.best.pose).distance(pose) < 0.15
-    assert not focal.follow_matches(query, found)[2]
+    change, information, _ = focal.fit_matches(query, found.best.pose)
+    assert abs(change) < 2.5 / math.sqrt(information)
+    assert focal.follow_matches(query, found) == (query, found)
 
 
 def test_other_poses_with_other_guesses_share_the_probability():

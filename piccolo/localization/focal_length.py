@@ -23,8 +23,7 @@ from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
-from ..local_features.hypotheses import exact_pose
-from ..local_features.matching import Matches
+from ..local_features.matching import NO_MATCHES
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
@@ -50,10 +49,14 @@ NARROWER = 0.4  # times the reach, where a design has a crest
 WIDER = 2.0  # and where it has none
 LIMIT = 0.4  # of the change that is searched
 END_DEVIATION = 0.05  # of a crest that lies there or beyond
-MATCHED_CHANGES = np.linspace(-0.4, 0.4, 21)  # of the focal length, that are tried with the matches
-MATCH_ERROR = math.radians(0.25)
+MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
+STEP = 1e-4  # [rad, m] with which that is differentiated
+MOST_STEP = 0.5
+AGREES = 0.25  # least weight of a match that agrees
+ENOUGH_AGREEING = 12  # fewer tell nothing
+MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
+CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
-LEAST_GAIN = 1.5  # matches by which another focal length must be better
 K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
 MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
@@ -152,6 +155,13 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         covariance = np.linalg.pinv(crest.information)
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
         crest = crest._replace(information=np.linalg.pinv(covariance))
+    change, information, _ = fit_matches(query, pose)
+    of_matches = np.zeros((num, num))
+    of_matches[0, 0] = information
+    both = crest.information + of_matches
+    if information > 0.0:
+        middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
+        crest = crest._replace(change=middle, information=both)
     conflict = 0.0
     if crest.information.any():
         off = abs(crest.change[0] - expected[0])
@@ -293,10 +303,8 @@ def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFi
 
     If the picture says nothing of it in the end, the conflict is that of the last fit in which it did.
     """
-    query, found, is_other = follow_matches(query, found)
+    query, found = follow_matches(query, found)
     fit = fit_focal(query, found.best.pose)
-    if is_other and fit.conflict == 0.0:
-        fit = fit._replace(change=np.zeros_like(fit.change), conflict=math.inf)
     for _ in range(MAX_CALIBRATIONS):
         if fit.is_at_rest:
             break
@@ -314,38 +322,46 @@ def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tu
     return query, refine_to_the_end(query, moved)
 
 
-def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection, bool]:
-    """Begin with the focal length by which most matches agree, if that is another; return also whether.
+def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection]:
+    """Begin with the focal length by which most matches agree, if that is clearly another."""
+    change, information, end = fit_matches(query, found.best.pose)
+    if abs(change) * math.sqrt(information) < CLEARLY:
+        return query, found
+    other = refine_with(query, found, np.array([change]), end)
+    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (query, found)
 
-    The matches are those with the scan drawn at the best pose.
+
+def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
+    """Fit focal length and pose to the matches with the scan drawn at a pose, from a wide to a narrow loss.
+
+    Return the change of the focal length's logarithm, its information (0 if few matches agree), and the pose.
     """
-    if not query.num_parts:
-        return query, found, False
-    pose = found.best.pose
-    matches = matches_near(query, pose)
+    matches = matches_near(query, pose) if query.num_parts else NO_MATCHES
     before = query.photo.given.cameras[0]
 
-    def agree(value: float) -> tuple[float, Pose]:
-        after = before.with_camera(change_camera(before.camera, np.array([value])))
-        turned = matches._replace(rays=_turn_rays(matches.rays, before, after))
-        end = exact_pose(turned, pose, None)
-        return (0.0, pose) if end is None else (support(turned, end.pose), end.pose)
+    def find_residuals(delta: Array) -> Array:
+        after = before.with_camera(change_camera(before.camera, delta[6:]))
+        offsets = rotate_points(matches.points - pose.center_world - delta[3:6], turn(delta))
+        rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+        return np.asarray(rays - _turn_rays(matches.rays, before, after))
 
-    tried = [agree(value) for value in MATCHED_CHANGES]
-    best = int(np.argmax([count for count, _ in tried]))
-    if tried[best][0] < tried[len(tried) // 2][0] + LEAST_GAIN:
-        return query, found, False
-    other = refine_with(query, found, np.array([MATCHED_CHANGES[best]]), tried[best][1])
-    if other[1].best.score < MIN_SCORE_LEFT * found.best.score:
-        return query, found, False
-    return *other, True
+    def turn(delta: Array) -> Array:
+        return np.asarray(exp_so3(delta[:3]) @ pose.R_cam_from_world)
 
-
-def support(matches: Matches, pose: Pose) -> float:
-    """Return the number of matches that agree with a pose, those with larger errors counted less."""
-    offsets = rotate_points(matches.points - pose.center_world, pose.R_cam_from_world)
-    rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-    return float(np.sum(1.0 / (1.0 + ((rays - matches.rays) ** 2).sum(axis=1) / MATCH_ERROR**2)))
+    if len(matches.rays) < ENOUGH_AGREEING:
+        return 0.0, 0.0, pose
+    delta = np.zeros(7)
+    for scale in MATCH_SCALES:
+        steps = [find_residuals(delta + h) - find_residuals(delta - h) for h in STEP * np.eye(7)]
+        J = np.stack(steps, axis=-1) / (2.0 * STEP)
+        residuals = find_residuals(delta)
+        weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure's loss
+        slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
+        inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, J, J) + 1e-6 * np.eye(7))
+        delta -= np.clip(inverse @ slopes.sum(axis=0), -MOST_STEP, MOST_STEP)
+    variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
+    is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
+    return float(delta[6]), is_known / variance, Pose(turn(delta), pose.center_world + delta[3:6])
 
 
 def recalibrate(query: Query, change: Array) -> Query:
