@@ -207,6 +207,8 @@ def fit_end(changes: Array, losses: Array) -> Array:
     """Return the information of the end of a profile: 0 unless most blocks' losses fall to it."""
     shown = losses[:, losses.any(axis=0)]
     slopes = np.linalg.lstsq(np.column_stack([np.ones(len(changes)), changes]), shown, rcond=None)[0][1]
+    if len(slopes) < LEAST_BLOCKS:
+        return np.zeros((changes.shape[1], changes.shape[1]))
     spread = math.sqrt(INFLATION * len(slopes)) * float(slopes.std())
     information = np.zeros((changes.shape[1], changes.shape[1]))
     information[0, 0] = END_DEVIATION**-2 if abs(slopes.sum()) > 2.0 * spread else 0.0
