@@ -51,7 +51,6 @@ LIMIT = 0.4  # of the change that is searched
 END_DEVIATION = 0.05  # of a crest that lies there or beyond
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 STEP = 1e-4  # [rad, m] with which that is differentiated
-MOST_STEP = 0.5
 AGREES = 0.25  # least weight of a match that agrees
 ENOUGH_AGREEING = 12  # fewer tell nothing
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
@@ -156,17 +155,15 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
         crest = crest._replace(information=np.linalg.pinv(covariance))
     change, information, _ = fit_matches(query, pose)
-    of_matches = np.zeros((num, num))
-    of_matches[0, 0] = information
+    of_matches = np.diag([information, 0.0][:num])
     both = crest.information + of_matches
-    if information > 0.0:
-        middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
-        crest = crest._replace(change=middle, information=both)
+    middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
+    crest = crest._replace(change=middle, information=both)
     conflict = 0.0
     if crest.information.any():
         off = abs(crest.change[0] - expected[0])
         spread = crest.variance + prior.deviation**2
-        conflict = off / math.sqrt(spread)
+        conflict = float(off / math.sqrt(spread))
         excess = max(off**2 - spread, 0.0)  # by which both disagree: the prior is less good than it claims
         precision[0, 0] = 1.0 / (prior.deviation**2 + excess)
     total = np.linalg.inv(crest.information + precision)
@@ -205,14 +202,13 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
 
 def fit_end(changes: Array, losses: Array) -> Array:
     """Return the information of the end of a profile: 0 unless most blocks' losses fall to it."""
-    shown = losses[:, losses.any(axis=0)]
-    slopes = np.linalg.lstsq(np.column_stack([np.ones(len(changes)), changes]), shown, rcond=None)[0][1]
+    num = changes.shape[1]
+    terms = np.column_stack([np.ones(len(changes)), changes])
+    slopes = np.linalg.lstsq(terms, losses[:, losses.any(axis=0)], rcond=None)[0][1]
     if len(slopes) < LEAST_BLOCKS:
-        return np.zeros((changes.shape[1], changes.shape[1]))
-    spread = math.sqrt(INFLATION * len(slopes)) * float(slopes.std())
-    information = np.zeros((changes.shape[1], changes.shape[1]))
-    information[0, 0] = END_DEVIATION**-2 if abs(slopes.sum()) > 2.0 * spread else 0.0
-    return information
+        return np.zeros((num, num))
+    is_steep = abs(slopes.mean()) > 2.0 * math.sqrt(INFLATION / len(slopes)) * slopes.std()
+    return np.diag([END_DEVIATION**-2 * is_steep, 0.0][:num])
 
 
 def make_design(num: int, reach: float) -> Array:
@@ -303,7 +299,7 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
-    If the picture says nothing of it in the end, the conflict is that of the last fit in which it did.
+    The last fit in which the picture says something of it counts.
     """
     query, found = follow_matches(query, found)
     fit = fit_focal(query, found.best.pose)
@@ -341,14 +337,15 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
     matches = matches_near(query, pose) if query.num_parts else NO_MATCHES
     before = query.photo.given.cameras[0]
 
+    def move(delta: Array) -> Pose:
+        return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:6])
+
     def find_residuals(delta: Array) -> Array:
         after = before.with_camera(change_camera(before.camera, delta[6:]))
-        offsets = rotate_points(matches.points - pose.center_world - delta[3:6], turn(delta))
+        end = move(delta)
+        offsets = rotate_points(matches.points - end.center_world, end.R_cam_from_world)
         rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
         return np.asarray(rays - _turn_rays(matches.rays, before, after))
-
-    def turn(delta: Array) -> Array:
-        return np.asarray(exp_so3(delta[:3]) @ pose.R_cam_from_world)
 
     if len(matches.rays) < ENOUGH_AGREEING:
         return 0.0, 0.0, pose
@@ -360,10 +357,11 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure's loss
         slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
         inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, J, J) + 1e-6 * np.eye(7))
-        delta -= np.clip(inverse @ slopes.sum(axis=0), -MOST_STEP, MOST_STEP)
+        delta -= inverse @ slopes.sum(axis=0)
+        delta[6] = np.clip(delta[6], -1.0, 1.0)  # the focal length stays one
     variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
     is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
-    return float(delta[6]), is_known / variance, Pose(turn(delta), pose.center_world + delta[3:6])
+    return float(delta[6]), is_known / variance, move(delta)
 
 
 def recalibrate(query: Query, change: Array) -> Query:

@@ -19,7 +19,7 @@ from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate, change_camera
-from .last_descent import HOPELESS_SCORE, is_faint, refine_to_the_end
+from .last_descent import is_faint, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .selection import Selection
@@ -127,7 +127,7 @@ def find_once(
 def finish(query: Query, hypotheses: Sequence[Hypothesis]) -> Found:
     """Refine the best of several poses to the end, of the photo of one camera with the focal length."""
     found = refine_to_the_end(query, hypotheses)
-    if query.photo.given.focal_prior is None or found.best.score < HOPELESS_SCORE or is_faint(query, found):
+    if query.photo.given.focal_prior is None or is_faint(query, found):
         return Found(query, found, None)
     return Found(*calibrate(query, found))
 
