@@ -13,13 +13,17 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
-from piccolo.confidence.localization import Evidence, Localization
+from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
-from piccolo.localization.localize import select_likeliest
+from piccolo.localization import localize as module
+from piccolo.localization.comparison import score_pose
+from piccolo.localization.localize import localize, select_likeliest
 from piccolo.localization.query import prepare_query
+from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
 from piccolo.scenes.synthetic.world import render_picture
@@ -130,17 +134,90 @@ def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
     rgb, _ = _photo(pinhole(640, 480, TRUE))
     result = scan().localize(rgb, focal_px=290.0, gravity="known")
     assert result.status == "not_localized"
-    assert "px contradicts the given 290 +- 3 px" in result.warnings[-1]
-    far = scan().localize(rgb, focal_px=285.0)  # so far that the last fit has no crest
+    assert result.warnings[-1].endswith(" px, not 290: check `focal_px`")
+    assert result.focal_length.px == pytest.approx(TRUE, rel=0.03)
+    wrong = Calibration("of another zoom", (Mount(pinhole(640, 480, 1.15 * TRUE)),))
+    panorama = _panorama(rgb, calibration=wrong)
+    far = localize(scan_map(5), panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
     assert far.status == "not_localized"
-    assert far.warnings[-1] == "the picture contradicts the focal length given 285 +- 3 px"
+    assert far.warnings[-1].endswith(" px, not 368: check `camera`")
+    assert far.focal_length.px == pytest.approx(TRUE, rel=0.03)
 
 
-def test_an_exact_calibration_stays_exact():
+def test_each_source_of_a_focal_length_has_its_deviation():
     rgb, _ = _photo(pinhole(640, 480, TRUE))
-    mount = Mount(pinhole(640, 480, TRUE))
-    assert _panorama(rgb, calibration=Calibration("exact", (mount,))).focal_prior is None
-    assert _panorama(rgb, projection="fisheye", fov_deg=90.0).focal_prior.deviation == 0.03
+    of_file = _panorama(rgb, calibration=Calibration("a", (Mount(pinhole(640, 480, TRUE)),))).focal_prior
+    assert (of_file.deviation, of_file.source) == (0.003, "`camera`")
+    of_field = _panorama(rgb, projection="fisheye", fov_deg=90.0).focal_prior
+    assert (of_field.deviation, of_field.source) == (0.03, "`fov_deg`")
+    assert _panorama(np.zeros((64, 128, 3), np.uint8)).focal_prior is None
+
+
+def _fake_profile(true, noise=0.0):
+    """A profile whose blocks' losses are least at a change of the camera, in place of descents."""
+
+    def take(query, pose, changes):
+        pulls = np.tile([0.3, -0.3, 0.1, -0.1], 4)
+        off = changes[:, 0] - true
+        losses = np.abs(off)[:, None] / 16.0 + 1e-2 * off[:, None] * pulls + noise * np.sin(977.0 * changes)
+        return losses, [Pose(np.eye(3), np.array([c[0], 0.0, 0.0])) for c in changes]
+
+    return take
+
+
+@pytest.mark.parametrize("true", [0.0, 0.23, -0.31])
+def test_a_profile_without_a_minimum_is_followed_downhill(monkeypatch, true):
+    monkeypatch.setattr(focal, "take_profile", _fake_profile(true))
+    crest = focal.find_crest(None, Pose(np.eye(3), np.zeros(3)), 1, focal.NEXT_REACH)
+    assert crest.change[0] == pytest.approx(true, abs=0.01)
+    assert crest.variance < 0.01
+
+
+def test_a_loss_that_falls_beyond_the_range_contradicts_and_one_that_does_not_fall_tells_nothing(monkeypatch):
+    monkeypatch.setattr(focal, "take_profile", _fake_profile(0.8))
+    crest = focal.find_crest(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
+    assert crest.change[0] > focal.LIMIT
+    assert crest.variance == pytest.approx(focal.END_DEVIATION**2)
+    changes = focal.make_design(1, 0.1)
+    assert not focal.fit_end(changes, changes * np.tile([1.0, -0.9], 8) + 1.0).any()
+
+
+def test_a_crest_is_that_of_the_design_that_tells_most(monkeypatch):
+    """Among neighbouring focal lengths noise may hide it."""
+    monkeypatch.setattr(focal, "take_profile", _fake_profile(0.03, noise=5e-4))
+    crest = focal.find_crest(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
+    assert crest.change[0] == pytest.approx(0.03, abs=0.02)
+    assert crest.information.any()
+
+
+@pytest.mark.parametrize(("crest", "most"), [(0.01, 0.6), (0.03, 0.97), (0.06, 1.0)])
+def test_the_more_picture_and_user_disagree_the_less_the_prior_counts(monkeypatch, crest, most):
+    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    query = prepare_query(_panorama(rgb, focal_px=TRUE), scan_map(5), CoarseToFineSettings(), Workers(2))
+    found = focal.Crest(np.array([crest]), np.array([[0.01**-2]]), np.ones((6, 1)))
+    monkeypatch.setattr(focal, "find_crest", lambda *args: found)
+    monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
+    fit = focal.fit_focal(query, scan().from_world(pose))
+    assert fit.conflict == pytest.approx(crest / 0.01 / math.sqrt(2.0), rel=0.02)
+    assert most - 0.15 < fit.change[0] / crest <= most
+    nothing = found._replace(information=np.zeros((1, 1)))
+    monkeypatch.setattr(focal, "find_crest", lambda *args: nothing)
+    open_fit = focal.fit_focal(query, scan().from_world(pose))
+    assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
+
+
+def test_matches_lead_to_a_focal_length_that_is_far_off():
+    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    query = prepare_query(
+        _panorama(rgb, focal_px=0.8 * TRUE), scan_map(5), CoarseToFineSettings(), Workers(2)
+    )
+    found = Selection(score_pose(query, scan().from_world(pose)), ())
+    query, found = focal.follow_matches(query, found)
+    assert query.photo.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
+    assert found.best.pose.distance(scan().from_world(pose)) < 0.15
+    change, information, _ = focal.fit_matches(query, found.best.pose)
+    assert abs(change) < 2.5 / math.sqrt(information)
+    assert focal.follow_matches(query, found) == (query, found)
 
 
 def test_other_poses_with_other_guesses_share_the_probability():
@@ -157,6 +234,35 @@ def test_other_poses_with_other_guesses_share_the_probability():
     assert rival.pose is elsewhere
     assert rival.probability == pytest.approx(0.95 * 0.9 / 1.85)
     assert doubtful.probability_none == pytest.approx(0.05)
+
+
+def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_listed_twice():
+    settings = CoarseToFineSettings()
+    evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
+    ahead, aside = Pose(np.eye(3), np.array([1.0, 0.1, 0.0])), Pose(np.eye(3), np.array([0.0, 1.0, 0.0]))
+    first = replace(
+        Localization("localized", 0.95, 0.05, Pose(np.eye(3), np.zeros(3)), evidence=evidence),
+        alternatives=(Alternative(aside, 0.4, None, 0.02),),
+        focal_length=FocalLength(300.0, 3.0, 300.0, 60.0),
+    )
+    longer = replace(first, confidence=0.9, pose=ahead, focal_length=FocalLength(345.0, 3.0, 345.0, 69.0))
+    assert select_likeliest([first, longer], settings) is first
+    as_long = replace(longer, focal_length=first.focal_length)
+    assert select_likeliest([first, as_long], settings).status == "ambiguous"
+    beside = replace(longer, pose=aside)
+    (rival,) = select_likeliest([first, beside, beside], settings).alternatives
+    assert rival.pose is aside
+    assert rival.probability == pytest.approx(0.95 * 0.9 / 1.85, rel=0.1)
+
+
+def test_the_first_sure_guess_ends_the_search(monkeypatch):
+    statuses = iter(["not_localized", "localized"])
+    monkeypatch.setattr(
+        module, "localize", lambda *args: Localization(next(statuses), pose=Pose(np.eye(3), np.zeros(3)))
+    )
+    panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE, refine_focal=True)
+    module.localize_guessed(scan_map(5), panorama, CoarseToFineSettings(), Workers(1), Stopwatch())
+    assert not list(statuses)
 
 
 def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask():

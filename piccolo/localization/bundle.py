@@ -42,8 +42,8 @@ from .bundle_search import (
     weigh_bundles,
 )
 from .comparison import score_pose
-from .focal_length import FocalFit, calibrate
-from .judge import MOST_CONFLICT, judge, judge_together
+from .focal_length import MOST_CONFLICT, FocalFit, calibrate
+from .judge import judge, judge_together
 from .localize import find_pose
 from .query import Query
 from .selection import Selection

@@ -172,7 +172,7 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     gaussian = member.alone.gaussian
     std_of_fit = member.alone.std_of_fit
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
-        errors = estimate_covariance(query, found.pose, member.fit is None)
+        errors = estimate_covariance(query, found.pose)
         gaussian, std_of_fit = errors or (None, None)
         if gaussian is not None and member.fit is not None:
             gaussian = gaussian.widen(member.fit.pose_covariance)

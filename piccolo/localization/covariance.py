@@ -26,6 +26,7 @@ LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
 LEAST_BLOCKS = 13  # fewer do not tell six dimensions
 MOST_SHARE = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
+UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
@@ -313,9 +314,7 @@ def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
 
-def estimate_covariance(
-    query: Query, pose: Pose, is_calibrated: bool = True, seen_from: Pose | None = None
-) -> Errors | None:
+def estimate_covariance(query: Query, pose: Pose, seen_from: Pose | None = None) -> Errors | None:
     """Estimate the covariance of a pose in the map; None where the points do not fix it.
 
     Photos have the errors of the scan in common, and of a scan without colours all errors: edges lie beside
@@ -335,6 +334,8 @@ def estimate_covariance(
         return None
     turned = pose.R_cam_from_world.T  # R_map_from_cam
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
+    prior = query.photo.given.focal_prior
+    is_calibrated = prior is None or prior.deviation < UNCALIBRATED
     turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.photo.pixel
     own = turn_positions(covariance, turned) + photo_covariance(turn, median_range)
     common = scan_covariance(query.scan_map, median_range)

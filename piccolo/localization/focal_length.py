@@ -23,6 +23,7 @@ from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
+from ..local_features.matching import NO_MATCHES
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
@@ -33,6 +34,7 @@ from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
 from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
 from .selection import Selection
+from .verification import matches_near
 
 FOCALS = "f", "fx", "fy"
 RADIAL = "k1"
@@ -40,10 +42,22 @@ WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted t
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
 NUM_VALUES = 7  # of the parameter in a design of one
 NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
-FIRST_REACH = (0.04, 0.1)  # of a design to either side: at first, least and most
+FIRST_REACH = 0.1  # of a design to either side, at first
+NEXT_REACH = 0.04
 LAST_REACH = 0.02
+NARROWER = 0.4  # times the reach, where a design has a crest
+WIDER = 2.0  # and where it has none
+LIMIT = 0.4  # of the change that is searched
+END_DEVIATION = 0.05  # of a crest that lies there or beyond
+MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
+STEP = 1e-4  # [rad, m] with which that is differentiated
+AGREES = 0.25  # least weight of a match that agrees
+ENOUGH_AGREEING = 12  # fewer tell nothing
+MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
+CLEARLY = 2.5  # deviations by which matches must tell another one
+MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
-MOST_DESIGNS = 6
+MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
 LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
@@ -51,6 +65,7 @@ MOST_SHARE = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
+MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
 EDGE = 5  # [px] within the picture's edge that no point may come near
 NEARBY = Limits(FINE_LOSS, 12, 1e-4)
 CLOSE = Limits(FULL_LOSS, 30, 1e-6)
@@ -112,6 +127,11 @@ class Crest(NamedTuple):
     information: Array  # (p, p) inverse of its covariance; 0 where the profile has no crest
     motion: Array  # (6, p) as of FocalFit
 
+    @property
+    def variance(self) -> float:
+        """Variance of the logarithm of the focal length; infinite where there is no crest."""
+        return float(np.linalg.pinv(self.information)[0, 0]) if self.information.any() else math.inf
+
 
 def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     """Fit the focal length of a photo with a focal_prior whose pose in the map is roughly known.
@@ -128,26 +148,35 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         k1 = names.index(RADIAL)
         expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
     precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
-    reach = min(max(2.5 * prior.deviation, FIRST_REACH[0]), FIRST_REACH[1]) if is_first else LAST_REACH
-    crest = find_crest(query, pose, num, reach)
+    crest = find_crest(query, pose, num, FIRST_REACH if is_first else NEXT_REACH)
     if crest.information.any():
         per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
         covariance = np.linalg.pinv(crest.information)
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
         crest = crest._replace(information=np.linalg.pinv(covariance))
+    change, information, _ = fit_matches(query, pose)
+    of_matches = np.diag([information, 0.0][:num])
+    both = crest.information + of_matches
+    middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
+    crest = crest._replace(change=middle, information=both)
+    conflict = 0.0
+    if crest.information.any():
+        off = abs(crest.change[0] - expected[0])
+        spread = crest.variance + prior.deviation**2
+        conflict = float(off / math.sqrt(spread))
+        excess = max(off**2 - spread, 0.0)  # by which both disagree: the prior is less good than it claims
+        precision[0, 0] = 1.0 / (prior.deviation**2 + excess)
     total = np.linalg.inv(crest.information + precision)
     change = total @ (crest.information @ crest.change + precision @ expected)
-    conflict = 0.0
-    if crest.information[0, 0] > 0.0:
-        spread = np.linalg.pinv(crest.information)[0, 0] + prior.deviation**2
-        conflict = abs(crest.change[0] - expected[0]) / math.sqrt(spread)
     return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
-    """Search the crest of the profile about a pose in ever narrower designs, moved if they miss it.
+    """Search the crest of the profile about a pose in ever narrower designs, moved downhill if they miss it.
 
-    Its information is 0 if no design has a crest: then the picture does not determine the calibration.
+    Of the designs that have a crest, that which tells it best counts. If none has, the picture does not
+    determine the calibration: the information is 0. If the loss still falls at the end of the range, it does
+    contradict what was given, and the crest is the end.
     """
     middle = np.zeros(num)
     found: Crest | None = None
@@ -157,16 +186,29 @@ def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
         crest = fit_crest(changes, losses, ends, pose)
         has_crest = bool(crest.information.any())
         is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
-        if not is_inside and (found is not None or not has_crest):
-            break
-        middle = np.clip(crest.change, middle - reach, middle + reach)
-        pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
+        lowest = changes[int(losses.sum(axis=1).argmin())]
         if is_inside:
-            found = crest
-            if reach <= LAST_REACH:
-                break
-            reach = max(0.5 * reach, LAST_REACH)
+            found = min(crest, found or crest, key=lambda one: one.variance)
+        is_lost = not has_crest and bool(np.all(np.abs(lowest - middle) < 0.99 * reach))
+        if reach <= LAST_REACH if is_inside else found or is_lost:
+            break
+        if abs(lowest[0]) > LIMIT:
+            return crest._replace(change=lowest, information=fit_end(changes, losses))
+        middle = np.clip(crest.change if has_crest else lowest, middle - reach, middle + reach)
+        pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
+        reach = max(NARROWER * reach, LAST_REACH) if is_inside else min(WIDER * reach, FIRST_REACH)
     return found or Crest(np.zeros(num), np.zeros((num, num)), crest.motion)
+
+
+def fit_end(changes: Array, losses: Array) -> Array:
+    """Return the information of the end of a profile: 0 unless most blocks' losses fall to it."""
+    num = changes.shape[1]
+    terms = np.column_stack([np.ones(len(changes)), changes])
+    slopes = np.linalg.lstsq(terms, losses[:, losses.any(axis=0)], rcond=None)[0][1]
+    if len(slopes) < LEAST_BLOCKS:
+        return np.zeros((num, num))
+    is_steep = abs(slopes.mean()) > 2.0 * math.sqrt(INFLATION / len(slopes)) * slopes.std()
+    return np.diag([END_DEVIATION**-2 * is_steep, 0.0][:num])
 
 
 def make_design(num: int, reach: float) -> Array:
@@ -257,19 +299,69 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
-    If the picture says nothing of it in the end, the conflict is that of the last fit in which it did.
+    The last fit in which the picture says something of it counts.
     """
-    conflict = 0.0
-    for k in range(MAX_CALIBRATIONS + 1):
-        fit = fit_focal(query, found.best.pose, is_first=k == 0)
-        conflict = fit.conflict or conflict
-        if fit.is_at_rest or k == MAX_CALIBRATIONS:
+    query, found = follow_matches(query, found)
+    fit = fit_focal(query, found.best.pose)
+    for _ in range(MAX_CALIBRATIONS):
+        if fit.is_at_rest:
             break
-        query = recalibrate(query, fit.change)
-        poses = [fit.move(found.best.pose), *(h.pose for h in found.alternatives)]
-        moved = query.workers.map(partial(score_pose, query), poses, "compare")
-        found = refine_to_the_end(query, moved)
-    return query, found, fit._replace(conflict=conflict)
+        query, found = refine_with(query, found, fit.change, fit.move(found.best.pose))
+        after = fit_focal(query, found.best.pose, is_first=False)
+        fit = after if after.conflict else fit._replace(change=np.zeros_like(fit.change))
+    return query, found, fit
+
+
+def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tuple[Query, Selection]:
+    """Refine the poses with another calibration, of which the best is `best`."""
+    query = recalibrate(query, change)
+    poses = [best, *(h.pose for h in found.alternatives)]
+    moved = query.workers.map(partial(score_pose, query), poses, "compare")
+    return query, refine_to_the_end(query, moved)
+
+
+def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection]:
+    """Begin with the focal length by which most matches agree, if that is clearly another."""
+    change, information, end = fit_matches(query, found.best.pose)
+    if abs(change) * math.sqrt(information) < CLEARLY:
+        return query, found
+    other = refine_with(query, found, np.array([change]), end)
+    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (query, found)
+
+
+def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
+    """Fit focal length and pose to the matches with the scan drawn at a pose, from a wide to a narrow loss.
+
+    Return the change of the focal length's logarithm, its information (0 if few matches agree), and the pose.
+    """
+    matches = matches_near(query, pose) if query.num_parts else NO_MATCHES
+    before = query.photo.given.cameras[0]
+
+    def move(delta: Array) -> Pose:
+        return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:6])
+
+    def find_residuals(delta: Array) -> Array:
+        after = before.with_camera(change_camera(before.camera, delta[6:]))
+        end = move(delta)
+        offsets = rotate_points(matches.points - end.center_world, end.R_cam_from_world)
+        rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
+        return np.asarray(rays - _turn_rays(matches.rays, before, after))
+
+    if len(matches.rays) < ENOUGH_AGREEING:
+        return 0.0, 0.0, pose
+    delta = np.zeros(7)
+    for scale in MATCH_SCALES:
+        steps = [find_residuals(delta + h) - find_residuals(delta - h) for h in STEP * np.eye(7)]
+        J = np.stack(steps, axis=-1) / (2.0 * STEP)
+        residuals = find_residuals(delta)
+        weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure's loss
+        slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
+        inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, J, J) + 1e-6 * np.eye(7))
+        delta -= inverse @ slopes.sum(axis=0)
+        delta[6] = np.clip(delta[6], -1.0, 1.0)  # the focal length stays one
+    variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
+    is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
+    return float(delta[6]), is_known / variance, move(delta)
 
 
 def recalibrate(query: Query, change: Array) -> Query:

@@ -30,7 +30,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .brief import mirror_query
 from .covariance import estimate_covariance
-from .focal_length import FocalFit
+from .focal_length import MOST_CONFLICT, FocalFit, fit_focal
 from .last_descent import settle
 from .prior import contradictions
 from .query import Query
@@ -41,7 +41,6 @@ from .verification import count_agreeing, find_copies
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo; in symmetric scenes it is about 1
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
-MOST_CONFLICT = 4.0  # deviations between the focal length found and that given
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
@@ -72,8 +71,10 @@ def judge(
     standings = credit_copies(assess_poses(query, found.best, reported), is_copy)
     probabilities = posterior(standings, std_of(measured.gaussian), measured.std_of_fit)
     likeliest = int(probabilities[:-1].argmax())
-    if likeliest and is_copy[likeliest] and may_change and fit is None:
-        return judge(query, promote(query, found, reported[likeliest - 1]), None, may_change=False)
+    if likeliest and is_copy[likeliest] and may_change:
+        found = promote(query, found, reported[likeliest - 1])
+        fit = fit and fit_focal(query, found.best.pose, is_first=False)
+        return judge(query, found, fit, may_change=False)
     return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
 
 
@@ -174,7 +175,7 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, make_sampling_loss(query.photo.colors()), pose, descent).pose
     measures: list[Callable[[], Any]] = [
-        partial(estimate_covariance, query, pose, fit is None),  # takes longest
+        partial(estimate_covariance, query, pose),  # takes longest
         lambda: compare_occlusion(points, query.photo.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),
@@ -215,14 +216,17 @@ def promote(query: Query, found: Selection, alternative: Hypothesis) -> Selectio
 def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     """Explain how the focal length makes a pose doubtful, as warnings."""
     focal = fit.focal_length(panorama)
+    assert panorama.focal_prior is not None
+    source = panorama.focal_prior.source
+    if fit.conflict > MOST_CONFLICT:
+        lengths = f"{focal.px:.0f} px, not {focal.given_px:.0f}"
+        return (f"the picture has a focal length of {lengths}: check {source}",)
+    std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
+    if std <= TELLING_STD:
+        return ()
     found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
     given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
-    if fit.conflict > MOST_CONFLICT and abs(focal.px - focal.given_px) < focal.given_std_px:
-        return (f"the picture contradicts the focal length {given} px",)
-    if fit.conflict > MOST_CONFLICT:
-        return (f"{found} contradicts the {given} px",)
-    std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
-    return (f"{found} ({given}): the position is uncertain by {std:.2f} m",) if std > TELLING_STD else ()
+    return (f"{found} ({given}): the position is uncertain by {std:.2f} m",)
 
 
 def collect_evidence(

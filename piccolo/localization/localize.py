@@ -1,5 +1,6 @@
 """The default method, one line a step: localize one panorama in a prepared map."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -7,8 +8,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.localization import Alternative, Localization
-from ..geometry.pose import Array, is_correct
+from ..confidence.confidence import LOCALIZED
+from ..confidence.localization import Alternative, FocalLength, Localization
+from ..geometry.pose import Array, Pose
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -18,18 +20,20 @@ from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate, change_camera
 from .judge import judge, reconsider
-from .last_descent import HOPELESS_SCORE, refine_to_the_end
+from .last_descent import is_faint, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
 from .shape import Aligned, align_level, find_tilts, is_explained, is_tilt_known
+from .verification import NEAR, is_near
 
 GUESSES = (
     0.0,
     -0.15,
     0.15,
 )  # added to the log of the focal length: one comes near enough to any that is 20 % off
+MOST_RANGE = 10.0  # [m] of what a photo shows, so far a pose moves with the logarithm of the focal length
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -38,7 +42,7 @@ class Found(NamedTuple):
 
     query: Query
     selection: Selection
-    fit: FocalFit | None  # of a photo whose focal length is not exact
+    fit: FocalFit | None  # of the photo of one camera, unless the poses are hopeless
 
 
 @one_blas_thread
@@ -121,9 +125,9 @@ def find_once(
 
 
 def finish(query: Query, hypotheses: Sequence[Hypothesis]) -> Found:
-    """Refine the best of several poses to the end, with the focal length if that is not exact."""
+    """Refine the best of several poses to the end, of the photo of one camera with the focal length."""
     found = refine_to_the_end(query, hypotheses)
-    if query.photo.given.focal_prior is None or found.best.score < HOPELESS_SCORE:
+    if query.photo.given.focal_prior is None or is_faint(query, found):
         return Found(query, found, None)
     return Found(*calibrate(query, found))
 
@@ -136,27 +140,37 @@ def has_guessed_focal(panorama: Panorama) -> bool:
 def localize_guessed(
     scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
-    """Localize a photo with several focal lengths around a guess, and return the most confident result."""
+    """Localize a photo with several focal lengths around a guess, until one result is sure."""
     camera = panorama.cameras[0].camera
     width = panorama.rgb.shape[1]
-    taken = [panorama.resample(change_camera(camera, np.array([guess])), width) for guess in GUESSES]
-    return select_likeliest(
-        [localize(scan_map, photo, settings, workers, watch) for photo in taken], settings
-    )
+    found: list[Localization] = []
+    for guess in GUESSES:
+        photo = panorama.resample(change_camera(camera, np.array([guess])), width)
+        found.append(localize(scan_map, photo, settings, workers, watch))
+        if found[-1].status == LOCALIZED:
+            break
+    return select_likeliest(found, settings)
+
+
+def is_same_place(one: Localization, pose: Pose, focal: FocalLength | None) -> bool:
+    """Return True if another pose is that of a result but for what its focal length moves along the view."""
+    if one.pose is None:
+        return False
+    change = math.log(focal.px / one.focal_length.px) if focal and one.focal_length else 0.0
+    offset = pose.center_world - one.pose.center_world
+    ahead = one.pose.R_cam_from_world[0]
+    along = float(offset @ ahead)
+    moved = Pose(pose.R_cam_from_world, pose.center_world - along * ahead)
+    return abs(along) < NEAR + MOST_RANGE * abs(change) and is_near(one.pose, moved)
 
 
 def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettings) -> Localization:
-    """Return the most confident of several results, its confidence reduced by results at other poses."""
-    ranked = sorted(found, key=lambda f: -f.confidence)
-    best = ranked[0]
-    others_found: list[Localization] = []
-    for other in ranked[1:]:
-        if (
-            other.pose
-            and other.evidence
-            and not any(is_correct(f.pose, other.pose) for f in (best, *others_found))
-        ):
-            others_found.append(other)
+    """Return the most confident of several results, its confidence reduced by results at other places."""
+    places: list[Localization] = []
+    for one in sorted(found, key=lambda f: -f.confidence):
+        if not any(one.pose is None or is_same_place(f, one.pose, one.focal_length) for f in places):
+            places.append(one)
+    best, *others_found = places
     total = best.confidence + sum(f.confidence for f in others_found)
     if total <= best.confidence:
         return best
@@ -166,5 +180,6 @@ def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettin
         for f in others_found
         if f.pose and f.evidence
     ]
-    listed = replace(best, alternatives=(*others, *best.alternatives)[:MAX_ALTERNATIVES])
+    of_best = (a for a in best.alternatives if not any(is_near(o.pose, a.pose) for o in others))
+    listed = replace(best, alternatives=(*others, *of_best)[:MAX_ALTERNATIVES])
     return reconsider(listed, fraction, settings.min_confidence)

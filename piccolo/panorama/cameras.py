@@ -31,9 +31,10 @@ HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole set it exa
 AS_SPHERE = "read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole: it has "
 GUESS = "`refine_focal` needs EXIF, `focal_px`, `camera`, or `projection` pinhole and `fov_deg`"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
-# standard deviations of the logarithm of a focal length: a first guess, a number of pixels, a field of view
+# deviations of a focal length's logarithm: of a guess, a number of pixels, a calibration, a field of view
 OF_GUESS = 0.2
 OF_PIXELS = 0.01
+OF_CALIBRATION = 0.003
 OF_FIELD = 0.03
 
 
@@ -41,7 +42,8 @@ class Cameras(NamedTuple):
     """The cameras of a picture."""
 
     mounts: tuple[Mount, ...] = ()  # none if it is a sphere or a part of one
-    deviation: float = 0.0  # standard deviation of the logarithm of the focal length; 0 where it is exact
+    deviation: float = 0.0  # standard deviation of the logarithm of the focal length of one camera
+    source: str = ""  # the option that gives it, or EXIF
     notes: tuple[str, ...] = ()  # what the user should know
 
 
@@ -63,12 +65,12 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
     width, height = picture.size
     if (calibration := find_calibration(options.calibration, path)) is not None:
         mounts = _calibrate(path, picture, calibration)
-        return Cameras(() if _is_sphere(mounts) else mounts)
+        return Cameras() if _is_sphere(mounts) else Cameras(mounts, OF_CALIBRATION, "`camera`")
     if options.focal_px is not None:
-        return Cameras((Mount(pinhole(width, height, options.focal_px)),), OF_PIXELS)
+        return Cameras((Mount(pinhole(width, height, options.focal_px)),), OF_PIXELS, "`focal_px`")
     lens = options.projection
     if lens in ("pinhole", "fisheye") and options.fov_deg is not None:
-        return Cameras((Mount(camera_of_fov(lens, options.fov_deg, width, height)),), OF_FIELD)
+        return Cameras((Mount(camera_of_fov(lens, options.fov_deg, width, height)),), OF_FIELD, "`fov_deg`")
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
     is_photo = lens is None and options.fov_deg is None and not has_gpano
     if not (is_photo or lens == "pinhole"):
@@ -82,7 +84,7 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
     note = (
         f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px from {found.source}"
     )
-    return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, (note + HOW,))
+    return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, "EXIF", (note + HOW,))
 
 
 def _is_sphere(mounts: tuple[Mount, ...]) -> bool:

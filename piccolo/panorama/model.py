@@ -34,6 +34,7 @@ class FocalPrior:
 
     focal: float  # [px] across
     deviation: float  # standard deviation of its logarithm
+    source: str  # the option that gives it, or EXIF
     view: View  # the photo, what is masked in it left out
     is_hidden: NDArray[np.bool_]  # (H, W) of the sphere, masked beside
 
@@ -47,7 +48,7 @@ class Panorama:
     gpano: GPano | None = None  # None for a file without such metadata
     warnings: tuple[str, ...] = ()  # what the user should know of the reading
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one
-    focal_prior: FocalPrior | None = None  # of one camera whose focal length is not exact
+    focal_prior: FocalPrior | None = None  # of the photo of one camera
 
     def resample(self, camera: Camera, width: int) -> "Panorama":
         """Return the panorama, `width` x width / 2, by another calibration of its camera.

@@ -13,7 +13,7 @@ from ..camera.rig import MAX_OFFSET
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..jobs.memory import check_memory
-from .cameras import cameras_of, read_views, rig_cameras
+from .cameras import Cameras, cameras_of, read_views, rig_cameras
 from .cube import cube_of_cells, face_paths, read_cube_folder
 from .gpano import (
     ASPECT_TOLERANCE,
@@ -77,7 +77,8 @@ def make_panorama(path: Path, picture: Picture, options: ReadOptions) -> Panoram
     if cameras.mounts:
         if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
             gpano = GPano(elevation)
-        return _on_sphere(path, [(path, picture, cameras.mounts)], options, gpano, cameras.deviation)
+        picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
+        return _on_sphere(path, [(path, picture, cameras.mounts)], options, gpano, cameras)
     region, more = _region_of(path, picture, fields, options)
     picture = replace(picture, warnings=(*picture.warnings, *more))
     return _embed_and_mask(path, picture, region, options, gpano)
@@ -89,7 +90,7 @@ def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], optio
     picture = Picture(rgb, is_valid)
     cameras = cameras_of(path, picture, options, has_gpano=True)
     if cameras.mounts:
-        return _on_sphere(path, [(path, picture, cameras.mounts)], options, None, cameras.deviation)
+        return _on_sphere(path, [(path, picture, cameras.mounts)], options, None, cameras)
     if rgb.shape[1] != 2 * len(rgb):
         found = f"{rgb.dtype} of shape {rgb.shape}"
         raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
@@ -109,11 +110,11 @@ def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
 
 
 def _on_sphere(
-    path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None, deviation: float = 0.0
+    path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None, of_one: Cameras | None = None
 ) -> Panorama:
     """Project the pictures of one instant, each with its file and cameras, to one sphere, and apply masks.
 
-    `deviation` is that of the one camera's focal length.
+    `of_one` tells how well the focal length of a picture's one camera is known.
     """
     cameras = tuple(mount for *_, mounts in shots for mount in mounts)
     width = sphere_width(cameras)
@@ -133,9 +134,11 @@ def _on_sphere(
     rgb, is_valid = make_sphere(views, width)
     panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
     masked = _mask(path, panorama, counts, options)
-    if deviation == 0.0:
+    if of_one is None or len(cameras) > 1:
         return masked
-    prior = FocalPrior(cameras[0].camera.focal[0], deviation, views[0], is_valid & ~masked.is_valid)
+    is_hidden = is_valid & ~masked.is_valid
+    focal = cameras[0].camera.focal[0]
+    prior = FocalPrior(focal, of_one.deviation, of_one.source, views[0], is_hidden)
     return replace(masked, focal_prior=prior)
 
 
