@@ -190,8 +190,11 @@ def test_a_crest_is_that_of_the_design_that_tells_most(monkeypatch):
     assert crest.information.any()
 
 
-@pytest.mark.parametrize(("crest", "most"), [(0.01, 0.6), (0.03, 0.97), (0.06, 1.0)])
-def test_the_more_picture_and_user_disagree_the_less_the_prior_counts(monkeypatch, crest, most):
+@pytest.mark.parametrize(
+    ("crest", "share", "std"), [(0.01, 0.48, 0.0072), (0.03, 0.48, 0.0096), (0.065, 0.97, 0.0101)]
+)
+def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, crest, share, std):
+    """Beyond four deviations the picture alone says where to look next."""
     rgb, pose = _photo(pinhole(640, 480, TRUE))
     query = prepare_query(_panorama(rgb, focal_px=TRUE), scan_map(5), CoarseToFineSettings(), Workers(2))
     found = focal.Crest(np.array([crest]), np.array([[0.01**-2]]), np.ones((6, 1)))
@@ -199,7 +202,8 @@ def test_the_more_picture_and_user_disagree_the_less_the_prior_counts(monkeypatc
     monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
     fit = focal.fit_focal(query, scan().from_world(pose))
     assert fit.conflict == pytest.approx(crest / 0.01 / math.sqrt(2.0), rel=0.02)
-    assert most - 0.15 < fit.change[0] / crest <= most
+    assert fit.change[0] / crest == pytest.approx(share, abs=0.02)
+    assert fit.deviation == pytest.approx(std, rel=0.03)
     nothing = found._replace(information=np.zeros((1, 1)))
     monkeypatch.setattr(focal, "find_crest", lambda *args: nothing)
     open_fit = focal.fit_focal(query, scan().from_world(pose))

@@ -192,7 +192,7 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
     write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(480, 360, 150.0)),))).encode())
     write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(480, 360, 160.0)),))).encode())
     results = list(scan().localize_many(sorted(photos.iterdir()), camera=cameras, gravity="known"))
-    assert [result.cameras[0].camera.focal[0] for result in results[:2]] == [150.0, 160.0]
+    assert [result.focal_length.given_px for result in results[:2]] == [150.0, 160.0]
     assert results[0].status == "localized"
     assert results[0].settings["panorama"]["calibration"] == str(cameras)
     assert results[2].status == "unreadable"

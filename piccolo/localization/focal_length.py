@@ -160,15 +160,18 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
     crest = crest._replace(change=middle, information=both)
     conflict = 0.0
+    wide = precision.copy()
     if crest.information.any():
         off = abs(crest.change[0] - expected[0])
         spread = crest.variance + prior.deviation**2
         conflict = float(off / math.sqrt(spread))
-        excess = max(off**2 - spread, 0.0)  # by which both disagree: the prior is less good than it claims
-        precision[0, 0] = 1.0 / (prior.deviation**2 + excess)
-    total = np.linalg.inv(crest.information + precision)
-    change = total @ (crest.information @ crest.change + precision @ expected)
-    return FocalFit(change, np.asarray(total), crest.motion, conflict)
+        excess = max(off**2 - spread, 0.0)  # of the prior's variance, as by DerSimonian and Laird (1986)
+        wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
+    if conflict > MOST_CONFLICT:
+        precision = wide  # the picture alone says where to look next
+    goal = crest.information @ crest.change + precision @ expected
+    change = np.linalg.inv(crest.information + precision) @ goal
+    return FocalFit(change, np.linalg.inv(crest.information + wide), crest.motion, conflict)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
