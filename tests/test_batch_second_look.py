@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 
 from piccolo import open_scan, opened_scan
@@ -16,6 +17,7 @@ from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize
+from piccolo.confidence.covariance import describe_errors
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.opened_scan import OpenedScan
@@ -287,9 +289,10 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, ReadOptions(), None)
-    located, confidence, covariance = localizer.locate(opened, text)
+    located, confidence, gaussian = localizer.locate(opened, text)
     assert confidence == json.loads(text)["confidence"]
-    assert covariance.matrix.tolist() == json.loads(text)["covariance"]
+    in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix
+    np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
     assert located.pose.key == opened.from_world(Result.from_json(text).best_pose).key
     assert len(located.ranges) == len(located.keypoints.rays) > 50
     assert (located.ranges > 0.0).all()

@@ -80,9 +80,9 @@ def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
 def test_a_signature_shows_every_option():
     options = inspect.signature(piccolo.open_scan).parameters
     assert {"labels", "ignore_labels", "units", "crs", "settings"} <= options.keys()
-    for method, num_others in ((piccolo.Scan.localize, 2), (piccolo.Scan.localize_many, 3)):
+    for method, num_others, count in ((piccolo.Scan.localize, 2, 20), (piccolo.Scan.localize_many, 3, 21)):
         given = inspect.signature(method).parameters.values()
-        assert [p.kind for p in given][num_others:] == [inspect.Parameter.KEYWORD_ONLY] * 20
+        assert [p.kind for p in given][num_others:] == [inspect.Parameter.KEYWORD_ONLY] * count
     assert not [name for name in dir(piccolo.Scan) if name in ("prepared", "workers", "settings", "walk")]
     assert all(getattr(piccolo, name) is not None for name in piccolo.__all__)
 
