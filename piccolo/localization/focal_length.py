@@ -171,7 +171,8 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         precision = wide  # the picture alone says where to look next
     goal = crest.information @ crest.change + precision @ expected
     change = np.linalg.inv(crest.information + precision) @ goal
-    return FocalFit(change, np.linalg.inv(crest.information + wide), crest.motion, conflict)
+    total = np.linalg.inv(crest.information + wide)
+    return FocalFit(change, np.asarray(total), crest.motion, conflict)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
