@@ -64,6 +64,9 @@ LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
 MOST_SHARE = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
+SLIPS = 0.05  # chosen: of given focal lengths, those that are wrong
+SLIP = 0.1  # chosen: deviation of the logarithm of a wrong one
+MOST_LOG = 50.0  # of odds
 MAX_CALIBRATIONS = 4  # fits of a focal length
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
 EDGE = 5  # [px] within the picture's edge that no point may come near
@@ -78,6 +81,7 @@ class FocalFit(NamedTuple):
     covariance: Array  # (p, p) of these
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
     conflict: float  # deviations between what the picture says and what was given; 0 if it says nothing
+    doubt: float = 0.0  # probability that what was given is wrong by more than its deviation
 
     @property
     def deviation(self) -> float:
@@ -160,11 +164,13 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
     crest = crest._replace(change=middle, information=both)
     conflict = 0.0
+    doubt = SLIPS if prior.deviation <= WIDE else 0.0
     wide = precision.copy()
     if crest.information.any():
         off = abs(crest.change[0] - expected[0])
         spread = crest.variance + prior.deviation**2
         conflict = float(off / math.sqrt(spread))
+        doubt = doubt_given(float(off), float(spread)) if doubt else 0.0
         excess = max(off**2 - spread, 0.0)  # of the prior's variance, as by DerSimonian and Laird (1986)
         wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
     if conflict > MOST_CONFLICT:
@@ -172,7 +178,19 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     goal = crest.information @ crest.change + precision @ expected
     change = np.linalg.inv(crest.information + precision) @ goal
     total = np.linalg.inv(crest.information + wide)
-    return FocalFit(change, np.asarray(total), crest.motion, conflict)
+    return FocalFit(change, np.asarray(total), crest.motion, conflict, doubt)
+
+
+def doubt_given(off: float, spread: float) -> float:
+    """Return the probability that a given focal length is wrong, from how far off the picture says it is.
+
+    Some are: of another picture, a crop, a slip. Then they are off by a tenth; else by no more than the
+    variance `spread` of the difference says. Both are normal distributions of the logarithm.
+    """
+    wide = spread + SLIP**2
+    odds = SLIPS / (1.0 - SLIPS) * math.sqrt(spread / wide)
+    odds *= math.exp(min(0.5 * off**2 * (1.0 / spread - 1.0 / wide), MOST_LOG))
+    return odds / (1.0 + odds)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:

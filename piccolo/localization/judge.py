@@ -105,6 +105,9 @@ def conclude(
     """Return the result for measurements and probabilities, if nothing rules the pose out."""
     scan_map = query.scan_map
     least = query.settings.min_confidence
+    if fit is not None:  # no pose is surer than what it rests on
+        poses = (1.0 - fit.doubt) * probabilities[:-1]
+        probabilities = np.append(poses, 1.0 - poses.sum())
     warnings = contradictions(scan_map, measured.pose, query.settings.prior)
     if classify(probabilities, least) != NOT_LOCALIZED and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
