@@ -51,6 +51,10 @@ class PoseGaussian:
         """Return this with a further error in common (6, 6)."""
         return replace(self, common=self.common + common)
 
+    def blur(self, own: Array) -> "PoseGaussian":
+        """Return this with a further error of its own (6, 6)."""
+        return replace(self, own=self.own + own)
+
     def square_distance(self, other: "PoseGaussian") -> float:
         """Return the squared distance to another estimate of the pose, in deviations: chi square of 6.
 

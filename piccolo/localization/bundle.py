@@ -133,7 +133,10 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
 def agree(
     members: dict[int, Member], bundle: Bundle, supports: dict[int, Support], errors: RelativeErrors
 ) -> Agreed | str:
-    """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed."""
+    """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed.
+
+    What the user says is doubted by the photos' own errors. Then these are larger by those of local optima.
+    """
     own = {
         k: Estimate(support.gaussian, members[k].cam_from_bundle)
         for k, support in supports.items()
@@ -152,15 +155,21 @@ def agree(
     log_scale, std = find_scale(bundle, estimates, errors)
     if abs(log_scale) > MOST_CONFLICT * math.hypot(std, errors.log_scale):
         return f"`relative_poses`: positions are {describe_scale(log_scale)}; each photo is judged by itself"
-    adjusted = adjust(bundle, estimates, errors)
+    excess = max(log_scale**2 - std**2 - errors.log_scale**2, 0.0)
+    blurred = {
+        k: Estimate(estimate.own.blur(supports[k].missed * LOCAL_ERRORS), estimate.cam_from_bundle)
+        for k, estimate in own.items()
+    }
+    errors = errors._replace(log_scale=math.hypot(errors.log_scale, math.sqrt(excess)))
+    adjusted = adjust(bundle, list(blurred.values()), errors)
     warnings = []
-    if abs(adjusted.bundle.log_scale) > TOLD * errors.log_scale:
+    if abs(adjusted.bundle.log_scale) > TOLD * expected.log_scale:
         warnings.append(f"`relative_poses`: positions are {describe_scale(adjusted.bundle.log_scale)}")
     if errors.turn > TOLD * expected.turn or errors.move > TOLD * expected.move:
         text = f"{errors.move:.2f} m and {math.degrees(errors.turn):.1f} deg"
         warnings.append(f"`relative_poses`: they are off by about {text} each")
     apart = (every - frozenset(own)) & frozenset(sure)
-    return Agreed(adjusted, errors, own, apart, tuple(warnings))
+    return Agreed(adjusted, errors, blurred, apart, tuple(warnings))
 
 
 def describe_scale(log_scale: float) -> str:

@@ -75,10 +75,14 @@ class Support(NamedTuple):
         """
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
-        missed = MISSED / (1.0 + self.odds)
-        right = belongs * (1.0 - missed) * here
+        right = belongs * (1.0 - self.missed) * here
         of_others = [CONTRADICTED, CONTRADICTED * self.odds_elsewhere]
-        return np.array([right, belongs * (missed * here + SILENT), *of_others])
+        return np.array([right, belongs * (self.missed * here + SILENT), *of_others])
+
+    @property
+    def missed(self) -> float:
+        """Probability that the own pose is a local optimum near the right one."""
+        return MISSED / (1.0 + self.odds)
 
     @property
     def shares(self) -> Array:
