@@ -160,15 +160,8 @@ def scan_of(
     """Prepare a scan for the method that the settings belong to."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        prior = settings.prior
-        prepared = prepare_map(
-            cloud,
-            workers,
-            cloud_settings.up,
-            watch,
-            prior=prior,
-            has_features=False,
-        )
+        up = cloud_settings.up
+        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior, has_features=False)
     elif not cloud.has_colors:
         raise InputError(f"{cloud.label}: found no colours to be used, wanted some for the preset paper")
     else:
