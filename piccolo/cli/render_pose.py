@@ -250,9 +250,8 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
     start = descent_animation.perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     refined, history = descent_animation.refine_with_history(cloud.points, texels, start, DESCENT)
-    frames = descent_animation.frames_of(
-        cloud.points, panorama, history, descent_animation.FRAME_WIDTH, workers
-    )
+    frame_width = descent_animation.FRAME_WIDTH
+    frames = descent_animation.frames_of(cloud.points, panorama, history, frame_width, workers)
     if suffix_of("--animate", arguments.animate) == ".gif":
         write_atomically(arguments.animate, descent_animation.encode_gif(frames))
     else:

@@ -103,9 +103,8 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     for plan in settings.own_plans:
         if not 1 <= plan.storey <= found:
             raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")
-    return check_scan(
-        [entry.result for entry in entries], scan_map.scan_sha256, "that given", settings.is_forced
-    )
+    results = [entry.result for entry in entries]
+    return check_scan(results, scan_map.scan_sha256, "that given", settings.is_forced)
 
 
 def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:

@@ -205,9 +205,8 @@ def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[
             cloud = scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
             case = f"{kind}, {changed:.0%} changed"
             trials = [_make_trial(world, case, "clean", workers, index) for index in range(4)]
-            another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)._replace(
-                true_pose=None
-            )
+            another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)
+            another = another._replace(true_pose=None)
             hidden = occlude(trials[0].rgb, another.rgb, 0.3, rng)
             trials += [trials[0]._replace(case=f"{case}, hidden 30%", rgb=hidden), another]
             yield cloud, trials

@@ -287,9 +287,8 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
     if options.labels or channel == "shape":
         read = partial(_read_scalar, header, layout, "class")
-        read_chunks = (
-            reader.label_reader(path, read, options.labels) if options.labels else reader.bare_reader(read)
-        )
+        labels = options.labels
+        read_chunks = reader.label_reader(path, read, labels) if labels else reader.bare_reader(read)
         return PointSource(path, read_chunks, header.num_points)
     if channel == "intensity":
         return _gray_source(header, layout)

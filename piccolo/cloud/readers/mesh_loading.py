@@ -111,9 +111,8 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
         raise
     except Exception as error:  # whatever trimesh stumbles over
         if resolver.refusal is None:
-            text = (
-                f"trimesh can't read it ({mesh_files.first_line(error)}); the file may be damaged or cut off"
-            )
+            why = mesh_files.first_line(error)
+            text = f"trimesh can't read it ({why}); the file may be damaged or cut off"
             raise InputError(f"{resolver.path}: {text}") from error
     if resolver.refusal is not None:
         raise resolver.refusal
