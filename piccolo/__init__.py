@@ -14,22 +14,26 @@ __version__ = "0.1.0"  # above the imports: piccolo.result imports it
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-from .errors import InputError
+from .errors import InputError as InputError
 
 if TYPE_CHECKING:
-    from .confidence.covariance import PoseCovariance
-    from .confidence.localization import Alternative, Evidence, FocalLength
-    from .geometry.pose import Pose
-    from .localization.settings import CoarseToFineSettings
-    from .opening import open_scan
-    from .paper.settings import PaperSettings
-    from .report.build import write_report
-    from .result import Result, Source
-    from .scan import Scan
-    from .scan_map.prior import GpsPrior
-    from .scan_walk import Walk
-    from .walk.path import Gap
-    from .walk.results import Alone, WalkFrame
+    from .confidence.covariance import PoseCovariance as PoseCovariance
+    from .confidence.localization import Alternative as Alternative
+    from .confidence.localization import Evidence as Evidence
+    from .confidence.localization import FocalLength as FocalLength
+    from .geometry.pose import Pose as Pose
+    from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
+    from .opening import open_scan as open_scan
+    from .paper.settings import PaperSettings as PaperSettings
+    from .report.build import write_report as write_report
+    from .result import Result as Result
+    from .result import Source as Source
+    from .scan import Scan as Scan
+    from .scan_map.prior import GpsPrior as GpsPrior
+    from .scan_walk import Walk as Walk
+    from .walk.path import Gap as Gap
+    from .walk.results import Alone as Alone
+    from .walk.results import WalkFrame as WalkFrame
 
 MODULES = {
     "Alone": ".walk.results",
@@ -50,27 +54,7 @@ MODULES = {
     "open_scan": ".opening",
     "write_report": ".report.build",
 }
-__all__ = [
-    "Alone",
-    "Alternative",
-    "CoarseToFineSettings",
-    "Evidence",
-    "FocalLength",
-    "Gap",
-    "GpsPrior",
-    "InputError",
-    "PaperSettings",
-    "Pose",
-    "PoseCovariance",
-    "Result",
-    "Scan",
-    "Source",
-    "Walk",
-    "WalkFrame",
-    "__version__",
-    "open_scan",
-    "write_report",
-]
+__all__ = ["InputError", "__version__", *MODULES]  # noqa: PLE0604  names all
 
 
 def __getattr__(name: str) -> object:

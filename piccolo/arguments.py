@@ -24,16 +24,24 @@ NUMBERS = {bool: bool | np.bool_, int: int | np.integer, float: float | int | np
 def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the arguments of a function that are not None, by name.
 
-    `values` are the function's `locals()`. NumPy scalars become Python numbers, and rows of numbers tuples.
-    Raises InputError for an argument that is not of its annotated type.
+    `values` are the function's `locals()`; `**options` are an unpacked TypedDict. NumPy scalars become Python
+    numbers, and rows of numbers tuples. Raises InputError for an argument that is not of its annotated type,
+    and TypeError for an option that the function does not have.
     """
+    kinds = inspect.get_annotations(function)
+    if "options" in kinds:
+        kinds |= get_args(kinds.pop("options"))[0].__annotations__
+    options = values.get("options", {})
+    if unknown := options.keys() - kinds.keys():
+        raise TypeError(f"{function.__qualname__}() got an unexpected keyword argument {min(unknown)!r}")
     given: dict[str, Any] = {}
-    for name, kind in inspect.get_annotations(function).items():
-        if name == "return" or (values[name] is None and is_of_kind(None, kind)):
+    for name, kind in kinds.items():
+        value = options.get(name, values.get(name))
+        if name == "return" or (value is None and is_of_kind(None, kind)):
             continue
-        if not is_of_kind(values[name], kind):
-            raise InputError(f"`{name}`: found {describe_value(values[name])}, wanted {describe(kind)}")
-        given[name] = plain(values[name], kind)
+        if not is_of_kind(value, kind):
+            raise InputError(f"`{name}`: found {describe_value(value)}, wanted {describe(kind)}")
+        given[name] = plain(value, kind)
     return given
 
 

@@ -133,9 +133,8 @@ class OpenedScan:
             photo = read_photo_facts(panorama, read_options.rig)
         if photo.sha256 != result.source.pano_sha256:
             return None
-        found = Localization(
-            confidence=result.confidence, pose=result.best_pose, covariance=result.covariance
-        )
+        pose = result.best_pose
+        found = Localization(confidence=result.confidence, pose=pose, covariance=result.covariance)
         return locate(prepared, picture, found, settings, self.workers)
 
     def localize_again(

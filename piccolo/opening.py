@@ -100,13 +100,8 @@ def open_scan(  # noqa: PLR0913  options by name
     check_arguments(open_scan, locals())
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
-    cloud_settings = CloudSettings(
-        METRES[units],
-        up,
-        WITHOUT_COLORS if ignore_colors else IN_METRES.channels,
-        _make_labels(labels, ignore_labels),
-        crs,
-    )
+    channels = WITHOUT_COLORS if ignore_colors else IN_METRES.channels
+    cloud_settings = CloudSettings(METRES[units], up, channels, _make_labels(labels, ignore_labels), crs)
     if isinstance(source, np.ndarray):
         if units != "m":
             raise InputError(f"`units`: found {units!r} for arrays, wanted points in metres")
@@ -160,15 +155,8 @@ def scan_of(
     """Prepare a scan for the method that the settings belong to."""
     prepared: ScanMap | PaperMap
     if isinstance(settings, CoarseToFineSettings):
-        prior = settings.prior
-        prepared = prepare_map(
-            cloud,
-            workers,
-            cloud_settings.up,
-            watch,
-            prior=prior,
-            has_features=False,
-        )
+        up = cloud_settings.up
+        prepared = prepare_map(cloud, workers, up, watch, prior=settings.prior, has_features=False)
     elif not cloud.has_colors:
         raise InputError(f"{cloud.label}: found no colours to be used, wanted some for the preset paper")
     else:

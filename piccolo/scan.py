@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,34 @@ Mask = NDArray[np.bool_]  # (H, W)
 READ_FIELDS = {f.name for f in fields(ReadOptions)}
 PRIOR_FIELDS = {f.name for f in fields(Prior)}
 SETTINGS_FIELDS = {"gravity", "solver", "min_confidence"}
+
+
+class ReadingOptions(TypedDict, total=False):
+    """Options for reading a photo, which `Scan.localize` explains; None is the default."""
+
+    mask_nadir_deg: float | None
+    fov_deg: float | None
+    projection: Projection | None
+    focal_px: float | None
+    camera: File | None
+    rig: File | None
+    gravity_vector: tuple[float, float, float] | None
+    cube_order: str | None
+
+
+class PhotoOptions(ReadingOptions, total=False):
+    """Options for localizing a photo, which `Scan.localize` explains; None is the default."""
+
+    use_gps: bool | None
+    gravity: Gravity | None
+    solver: Solver | None
+    near_world: tuple[float, float, float | None] | None
+    radius: float | None
+    height: tuple[float, float] | None
+    heading_deg: float | None
+    heading_tolerance_deg: float | None
+    within: Sequence[str] | None
+    min_confidence: float | None
 
 
 class Scan:
@@ -79,30 +107,13 @@ class Scan:
         check_output(Path(path))
         write_map(self._opened.prepared, Path(path), self._opened.workers)
 
-    def localize(  # noqa: PLR0913  options by name
+    def localize(
         self,
         panorama: File | Image,
         *,
         mask: File | Mask | None = None,
-        mask_nadir_deg: float | None = None,
-        fov_deg: float | None = None,
-        projection: Projection | None = None,
-        focal_px: float | None = None,
-        camera: File | None = None,
-        rig: File | None = None,
-        gravity_vector: tuple[float, float, float] | None = None,
         refine_focal: bool | None = None,
-        cube_order: str | None = None,
-        use_gps: bool | None = None,
-        gravity: Gravity | None = None,
-        solver: Solver | None = None,
-        near_world: tuple[float, float, float | None] | None = None,
-        radius: float | None = None,
-        height: tuple[float, float] | None = None,
-        heading_deg: float | None = None,
-        heading_tolerance_deg: float | None = None,
-        within: Sequence[str] | None = None,
-        min_confidence: float | None = None,
+        **options: Unpack[PhotoOptions],
     ) -> Result:
         """Find the position and rotation of the camera that took a photo.
 
@@ -177,32 +188,15 @@ class Scan:
         read_options, settings, is_masked = self._parse(check_arguments(Scan.localize, locals()))
         return self._opened.localize_query(panorama, read_options, settings, is_masked)
 
-    def localize_many(  # noqa: PLR0913  options by name
+    def localize_many(
         self,
         panoramas: Iterable[File | Image],
         relative_poses: Sequence[Pose] | None = None,
         *,
         relative_scale: RelativeScale = "metres",
         mask: File | Mask | None = None,
-        mask_nadir_deg: float | None = None,
-        fov_deg: float | None = None,
-        projection: Projection | None = None,
-        focal_px: float | None = None,
-        camera: File | None = None,
-        rig: File | None = None,
-        gravity_vector: tuple[float, float, float] | None = None,
         refine_focal: bool | None = None,
-        cube_order: str | None = None,
-        use_gps: bool | None = None,
-        gravity: Gravity | None = None,
-        solver: Solver | None = None,
-        near_world: tuple[float, float, float | None] | None = None,
-        radius: float | None = None,
-        height: tuple[float, float] | None = None,
-        heading_deg: float | None = None,
-        heading_tolerance_deg: float | None = None,
-        within: Sequence[str] | None = None,
-        min_confidence: float | None = None,
+        **options: Unpack[PhotoOptions],
     ) -> Iterator[Result]:
         """Return an iterator over the results of photos, in order; each is computed when it is asked for.
 
@@ -230,30 +224,13 @@ class Scan:
 
         return map(localize, panoramas)
 
-    def track(  # noqa: PLR0913  options by name
+    def track(
         self,
         *,
         max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
         mask: File | None = None,
-        mask_nadir_deg: float | None = None,
-        fov_deg: float | None = None,
-        projection: Projection | None = None,
-        focal_px: float | None = None,
-        camera: File | None = None,
-        rig: File | None = None,
-        gravity_vector: tuple[float, float, float] | None = None,
-        cube_order: str | None = None,
-        use_gps: bool | None = None,
-        gravity: Gravity | None = None,
-        solver: Solver | None = None,
-        near_world: tuple[float, float, float | None] | None = None,
-        radius: float | None = None,
-        height: tuple[float, float] | None = None,
-        heading_deg: float | None = None,
-        heading_tolerance_deg: float | None = None,
-        within: Sequence[str] | None = None,
-        min_confidence: float | None = None,
+        **options: Unpack[PhotoOptions],
     ) -> Walk:
         """Track a camera that is carried through the scan, frame by frame.
 
@@ -265,7 +242,7 @@ class Scan:
         max_acceleration
             Standard deviation of the acceleration along each axis [m/s^2]: less smooths the path more.
         mask
-            Path of a mask of all frames, as in `localize`, like all options that follow.
+            Path of a mask of all frames, as in `localize`, like all other options.
 
         Returns
         -------
@@ -276,7 +253,7 @@ class Scan:
         """
         return self._track(check_arguments(Scan.track, locals()))
 
-    def localize_walk(  # noqa: PLR0913  options by name
+    def localize_walk(
         self,
         frames: Iterable[File | Image],
         times: Sequence[float] | NDArray[np.floating[Any]] | None = None,
@@ -285,24 +262,7 @@ class Scan:
         max_speed: float | None = None,
         max_acceleration: float = MAX_ACCELERATION,
         mask: File | None = None,
-        mask_nadir_deg: float | None = None,
-        fov_deg: float | None = None,
-        projection: Projection | None = None,
-        focal_px: float | None = None,
-        camera: File | None = None,
-        rig: File | None = None,
-        gravity_vector: tuple[float, float, float] | None = None,
-        cube_order: str | None = None,
-        use_gps: bool | None = None,
-        gravity: Gravity | None = None,
-        solver: Solver | None = None,
-        near_world: tuple[float, float, float | None] | None = None,
-        radius: float | None = None,
-        height: tuple[float, float] | None = None,
-        heading_deg: float | None = None,
-        heading_tolerance_deg: float | None = None,
-        within: Sequence[str] | None = None,
-        min_confidence: float | None = None,
+        **options: Unpack[PhotoOptions],
     ) -> list[Result]:
         """Localize the frames of a walk together: each frame restricts the poses of the others.
 
@@ -317,7 +277,7 @@ class Scan:
         max_speed, max_acceleration
             As in `track`.
         mask
-            Path of a mask of all frames, as in `localize`, like all options that follow.
+            Path of a mask of all frames, as in `localize`, like all other options.
 
         Returns
         -------
@@ -350,21 +310,14 @@ class Scan:
             walk.add(frame, time, odometry=pose)
         return walk.finish()
 
-    def occlusion_mask(  # noqa: PLR0913  options by name
+    def occlusion_mask(
         self,
         panorama: File | Image,
         pose: Pose,
         *,
         mask: File | Mask | None = None,
-        mask_nadir_deg: float | None = None,
-        fov_deg: float | None = None,
-        projection: Projection | None = None,
-        focal_px: float | None = None,
-        camera: File | None = None,
-        rig: File | None = None,
-        gravity_vector: tuple[float, float, float] | None = None,
         refine_focal: bool | None = None,
-        cube_order: str | None = None,
+        **options: Unpack[ReadingOptions],
     ) -> NDArray[np.uint8]:
         """Return the pixels of a photo that contradict the scan at a pose, such as moved furniture.
 

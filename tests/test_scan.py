@@ -3,6 +3,8 @@
 import dataclasses
 import hashlib
 import inspect
+import re
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from piccolo.files.cache import sha256_of_arrays
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
+from piccolo.scan import PhotoOptions
 from piccolo.scan_map.prior import Prior
 
 
@@ -80,9 +83,13 @@ def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
 def test_a_signature_shows_every_option():
     options = inspect.signature(piccolo.open_scan).parameters
     assert {"labels", "ignore_labels", "units", "crs", "settings"} <= options.keys()
-    for method, num_others, count in ((piccolo.Scan.localize, 2, 20), (piccolo.Scan.localize_many, 3, 21)):
-        given = inspect.signature(method).parameters.values()
-        assert [p.kind for p in given][num_others:] == [inspect.Parameter.KEYWORD_ONLY] * count
+    for method in (piccolo.Scan.localize, piccolo.Scan.localize_many):
+        signature = inspect.signature(method)
+        assert get_args(signature.parameters["options"].annotation) == (PhotoOptions,)
+        own = {p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
+        assert len((own - {"relative_scale"}) | PhotoOptions.__annotations__.keys()) == 20
+    section = piccolo.Scan.localize.__doc__.split("Returns")[0]
+    assert all(re.search(rf"^ {{8}}(\w+, )?{name}\b", section, re.M) for name in PhotoOptions.__annotations__)
     assert not [name for name in dir(piccolo.Scan) if name in ("prepared", "workers", "settings", "walk")]
     assert all(getattr(piccolo, name) is not None for name in piccolo.__all__)
 
@@ -104,6 +111,24 @@ def test_an_option_of_another_type_is_refused(scan, options, text):
         scan.localize("a.jpg", **options)
     with pytest.raises(piccolo.InputError, match=text):
         scan.localize_many([], **options)
+    with pytest.raises(piccolo.InputError, match=text):
+        scan.track(**options)
+
+
+def test_an_option_that_a_method_does_not_have_is_refused(scan):
+    wrong = (
+        (scan.localize, ("a.jpg",), "near"),
+        (scan.localize_many, ([],), "near"),
+        (scan.track, (), "refine_focal"),
+        (scan.localize_walk, ([],), "refine_focal"),
+        (scan.occlusion_mask, ("a.jpg", None), "gravity"),
+    )
+    for method, arguments, name in wrong:
+        text = rf"{method.__qualname__}\(\) got an unexpected keyword argument '{name}'"
+        with pytest.raises(TypeError, match=text):
+            method(*arguments, **{name: True})
+    with pytest.raises(piccolo.InputError, match=r"`mask`: found .*, wanted a path"):
+        scan.track(mask=np.zeros((4, 8), bool))
 
 
 @pytest.mark.parametrize(

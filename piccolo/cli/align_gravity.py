@@ -48,11 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_cloud_options(parser, "coloured scan as for localize.py")
     option(parser, "--out FILE", "write the rotated cloud to this PLY file; - is stdout")
     option(parser, "--queries FILE", "true poses in the scan: rotate them too and write them next to --out")
-    option(
-        parser,
-        "--yaw-walls",
-        "also rotate about z, as little as possible, to align the dominant walls with x and y",
-    )
+    text = "also rotate about z, as little as possible, to align the dominant walls with x and y"
+    option(parser, "--yaw-walls", text)
     option(parser, "--assume-nothing", "the scan may have any orientation: find up from its contents")
     option(parser, "--pano FILE", "localize this upright photo in the scan, and take its up direction")
 

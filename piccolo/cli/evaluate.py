@@ -21,33 +21,15 @@ from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan, settings_json
 from ..result import UNREADABLE, Result, check_scan, describe_failure, read_results
 from ..scan_map.open_map import scan_sha256_of
-from ..scenes.evaluation import tables
+from ..scenes.evaluation import query_result, tables
 from ..scenes.evaluation.plots import errors_figure, figure_png, risk_figure
-from ..scenes.evaluation.query_result import (
-    QueryResult,
-    Thresholds,
-    check_run,
-    check_variants,
-    input_files,
-    is_in_box,
-    make_query_result,
-    match_results,
-    read_run,
-)
+from ..scenes.evaluation.query_result import QueryResult, Thresholds
 from ..scenes.evaluation.walks import alone_table, group_walks, walk_table
 from ..scenes.scene import Query, Scene, find_scenes
+from . import options
 from .command import check_least, command, option
 from .errors import EXIT_BAD_INPUT, Terminated, UsageError, checking_options, print_error, print_note
 from .executing import Interruption, check_execution, connecting, count_jobs, executing, interruptible
-from .options import (
-    CACHE_TEXT,
-    add_cloud_reading_options,
-    add_execution_options,
-    add_method_options,
-    add_panorama_reading_options,
-    cache_from,
-    localizer_from,
-)
 from .outputs import check_distinct, check_outputs, check_suffix, print_report
 from .progress import progress_bar
 
@@ -80,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(kind, "--results JSONL", "evaluate these results of localize.py instead of running it")
     option(kind, "--compare JSONL", "compare two runs", nargs=2)
     option(group, "--force", "also take --results of other clouds than the scene's")
-    option(group, "--cache FOLDER", CACHE_TEXT)
+    option(group, "--cache FOLDER", options.CACHE_TEXT)
     group = parser.add_argument_group("tables and plots")
     option(group, "--max-distance M", "position error below which a pose is correct [m]", default=0.1)
     option(group, "--max-angle DEG", "rotation error below which a pose is correct", default=5.0)
@@ -88,10 +70,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--markdown FILE", "write the tables to this file too")
     option(group, "--errors PNG", "plot: fraction of queries below each error, and recall over thresholds")
     option(group, "--risk PNG", "plot: fraction wrong over fraction accepted, for falling minimum confidence")
-    add_cloud_reading_options(parser.add_argument_group("clouds"))
-    add_panorama_reading_options(parser.add_argument_group("panoramas"))
-    add_method_options(parser)
-    add_execution_options(parser, default_jobs=1)
+    options.add_cloud_reading_options(parser.add_argument_group("clouds"))
+    options.add_panorama_reading_options(parser.add_argument_group("panoramas"))
+    options.add_method_options(parser)
+    options.add_execution_options(parser, default_jobs=1)
 
 
 def check_usage(arguments: argparse.Namespace) -> None:
@@ -138,7 +120,7 @@ def write_report(
 
 def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     """Print two runs side by side."""
-    runs = [read_run(path)[0] for path in arguments.compare]
+    runs = [query_result.read_run(path)[0] for path in arguments.compare]
     if arguments.variants:
         runs = [[row for row in rows if row.variant in arguments.variants] for rows in runs]
     pairs = tables.pair_up(*runs)
@@ -172,7 +154,7 @@ def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments
     for scene in scenes:
         results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
         if results and scene.cloud.is_file():
-            digest = scan_sha256_of([scene.cloud], cache_from(arguments))
+            digest = scan_sha256_of([scene.cloud], options.cache_from(arguments))
             if note := check_scan(results, digest, str(scene.cloud), arguments.force):
                 print_note(arguments, f"warning: {note}")
 
@@ -189,12 +171,12 @@ def run_scenes(
     Returns the run's queries of these scenes and variants, and how many failed. Raises InputError if the file
     can't be written, holds something else, or rows made with other settings.
     """
-    check_variants(scenes, variants)
+    query_result.check_variants(scenes, variants)
     check_output(path)
     settings = settings_json(config.settings, config.cloud_settings, config.read_options)
     with open_locked(path) as file, ExitStack() as stack:
-        rows, size = read_run(path)
-        check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
+        rows, size = query_result.read_run(path)
+        query_result.check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
         pairs = [(scene, query) for scene in scenes for query in scene.queries]
         keys = {(s.name, s.name_of(q)) for s, q in pairs if not variants or q.variant in variants}
         open_keys = keys - {row.key for row in rows}
@@ -233,7 +215,7 @@ class Evaluation:
 
         def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
             scan = localizer.open_scan(Workers(num_threads, show))
-            are_inside.extend(is_in_box(scan, query.pose) for query in queries)
+            are_inside.extend(query_result.is_in_box(scan, query.pose) for query in queries)
             return scan
 
         if cluster:
@@ -268,7 +250,7 @@ class Evaluation:
         if result.error is not None and (result.status != UNREADABLE or query.is_answerable):
             self.report(result.error)
             return
-        row = make_query_result(scene, query, result, None if result.error else is_inside)
+        row = query_result.make_query_result(scene, query, result, None if result.error else is_inside)
         line = row.to_json()
         self.file.append(line)
         self.rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
@@ -285,16 +267,16 @@ def main(arguments: argparse.Namespace) -> int:
     check_usage(arguments)
     with checking_options():
         limit_memory(arguments.max_memory)
-        config = localizer_from(arguments)
+        config = options.localizer_from(arguments)
     thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
     scenes = find_scenes(arguments.scenes or [])
-    check_files(arguments, input_files(scenes))
+    check_files(arguments, query_result.input_files(scenes))
     if arguments.compare:
         return compare(arguments, thresholds)
     if arguments.results:
         results = read_results([arguments.results])
         report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
-        rows = list(match_results(scenes, results, report))
+        rows = list(query_result.match_results(scenes, results, report))
         num_failed = len(results) - len(rows)
         check_clouds(scenes, rows, arguments)
         rows = [row for row in rows if not arguments.variants or row.variant in arguments.variants]

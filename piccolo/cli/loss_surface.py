@@ -53,13 +53,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--truth FILE", "queries.json with the true pose")
     option(parser, "--out PNG", "write the picture here; - is stdout", required=True)
     option(parser, "--step M", "spacing of the grid", default=0.2)
-    option(
-        parser,
-        "--gravity",
-        "known: rotations about z only; unknown: all of SO(3)",
-        choices=["known", "unknown"],
-        default="known",
-    )
+    text = "known: rotations about z only; unknown: all of SO(3)"
+    option(parser, "--gravity", text, choices=["known", "unknown"], default="known")
 
 
 def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:

@@ -70,35 +70,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     text = f"number of points (default {ROOM_POINTS}; in a building {PART_POINTS} per room and corridor part)"
     option(parser, "--points N", text)
     option(parser, "--panoramas N", "number of panoramas of each variant", default=3)
-    option(
-        parser,
-        "--variants",
-        "variants of the panoramas, see below",
-        nargs="+",
-        choices=VARIANTS,
-        default=["clean"],
-    )
+    text = "variants of the panoramas, see below"
+    option(parser, "--variants", text, nargs="+", choices=VARIANTS, default=["clean"])
     option(parser, "--width PX", "width of the panoramas", default=2048)
     text = "take the pictures with this calibrated camera or rig (docs/CAMERAS.md) instead of panoramas"
     option(parser, "--camera FILE", text)
     option(parser, "--size X Y Z", "size of a room [m]", default=[6.0, 5.0, 2.7])
     option(parser, "--rooms N", "number of rooms, at most 256", default=1)
     option(parser, "--labels", "also write semantic labels of points and pixels, for localize.py --labels")
-    option(
-        parser,
-        "--scenes N",
-        "write N scenes, FOLDER/000 and so on, with consecutive seeds from --seed",
-        default=0,
-    )
+    text = "write N scenes, FOLDER/000 and so on, with consecutive seeds from --seed"
+    option(parser, "--scenes N", text, default=0)
     group = parser.add_argument_group("buildings and walks")
     text = "number of storeys of a building, where corridors, halls and stairs join the rooms (1 with --walk)"
     option(group, "--storeys N", text, default=0)
-    option(
-        group,
-        "--twins FRACTION",
-        "fraction of a building's rooms that are exact copies of others",
-        default=0.0,
-    )
+    text = "fraction of a building's rooms that are exact copies of others"
+    option(group, "--twins FRACTION", text, default=0.0)
     text = "make walks of this length [m] through a building instead of single panoramas"
     option(group, "--walk M", text, default=0.0)
     option(group, "--walks N", "number of walks of each variant (clean or photo)", default=1)

@@ -224,13 +224,8 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
         crs = None
     if crs:
         check_crs(crs)
-    return CloudSettings(
-        scale,
-        arguments.up,
-        WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels,
-        _labels_from(arguments),
-        crs,
-    )
+    channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
+    return CloudSettings(scale, arguments.up, channels, _labels_from(arguments), crs)
 
 
 def _labels_from(arguments: argparse.Namespace) -> Labels | None:

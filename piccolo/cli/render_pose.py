@@ -19,14 +19,7 @@ from ..files.json_file import read_text
 from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
 from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
 from ..jobs.threads import Workers, num_cores
-from ..optimize.descent_animation import (
-    FRAME_WIDTH,
-    FRAMES_PER_S,
-    encode_gif,
-    frames_of,
-    perturb_pose,
-    refine_with_history,
-)
+from ..optimize import descent_animation
 from ..optimize.refine import DescentSettings
 from ..optional import import_optional
 from ..panorama import read_panorama
@@ -254,15 +247,16 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
         raise InputError(f"{name}: found the camera model {camera.model}, wanted a sphere for --animate")
     panorama = shrink(read_panorama(find_photo(arguments, name)), DESCENT_WIDTH)
     goal = cloud.from_world(pose)
-    start = perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
+    start = descent_animation.perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
-    refined, history = refine_with_history(cloud.points, texels, start, DESCENT)
-    frames = frames_of(cloud.points, panorama, history, FRAME_WIDTH, workers)
+    refined, history = descent_animation.refine_with_history(cloud.points, texels, start, DESCENT)
+    frame_width = descent_animation.FRAME_WIDTH
+    frames = descent_animation.frames_of(cloud.points, panorama, history, frame_width, workers)
     if suffix_of("--animate", arguments.animate) == ".gif":
-        write_atomically(arguments.animate, encode_gif(frames))
+        write_atomically(arguments.animate, descent_animation.encode_gif(frames))
     else:
         height, width = frames[0].shape[:2]
-        with writing_video(arguments.animate, FRAMES_PER_S, (width, height)) as add:
+        with writing_video(arguments.animate, descent_animation.FRAMES_PER_S, (width, height)) as add:
             for frame in frames:
                 add(frame)
     line: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}

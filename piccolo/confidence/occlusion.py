@@ -235,6 +235,5 @@ def measure_agreement(points: PackedPoints, panorama: Panorama, pose: Pose) -> A
         return float((weights[..., None] * values).sum(dtype=np.float64))
 
     energy = math.sqrt(total(of_view**2) * total(of_panorama**2))
-    return Agreement(
-        correlation=total(of_view * of_panorama) / max(energy, 1e-9), seen_fraction=float(weights.sum())
-    )
+    correlation = total(of_view * of_panorama) / max(energy, 1e-9)
+    return Agreement(correlation=correlation, seen_fraction=float(weights.sum()))

@@ -96,9 +96,8 @@ class Processes:
                 continue
             self._own.worker = pool, child
             return pool, child
-        raise InputError(
-            f"`jobs`: a process {end} while it opened the scan; use fewer processes or more memory"
-        )
+        advice = "use fewer processes or more memory"
+        raise InputError(f"`jobs`: a process {end} while it opened the scan; {advice}")
 
     def _end_of(self, child: BaseProcess) -> str:
         """Return how a process ended; raises CancelledError if that was by `close`."""

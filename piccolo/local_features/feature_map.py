@@ -94,9 +94,7 @@ def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> Fe
     )
 
 
-def principal_components(
-    descriptors: NDArray[np.uint8],
-) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
+def principal_components(descriptors: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
     """Return mean (128,) and first components (128, NUM_COMPONENTS), times 127, of descriptors (N, 128)."""
     values = descriptors.astype(np.float64)
     mean = np.rint(values.sum(axis=0) / max(len(values), 1))

@@ -104,10 +104,9 @@ def make_view(
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
     columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
     is_nearest = np.argmax(rays @ middles.T, axis=-1) == place
-    own = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
-    return PerspectiveView(
-        R_sphere_from_view, pixel, columns, rows, np.asarray(own, np.uint8), middles, place
-    )
+    grown = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
+    own = np.asarray(grown, np.uint8)
+    return PerspectiveView(R_sphere_from_view, pixel, columns, rows, own, middles, place)
 
 
 def centers_of_pixels(count: int, pixel: float) -> Array:

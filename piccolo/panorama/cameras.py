@@ -81,9 +81,8 @@ def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: b
     if found is None or (is_two_to_one and lens is None):
         return Cameras(notes=(f"{AS_SPHERE}{found.source}",) if found else ())
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
-    note = (
-        f"read as a pinhole photo {fov:.1f} deg wide, focal length {found.focal:.0f} px from {found.source}"
-    )
+    focal = f"focal length {found.focal:.0f} px from {found.source}"
+    note = f"read as a pinhole photo {fov:.1f} deg wide, {focal}"
     return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, "EXIF", (note + HOW,))
 
 

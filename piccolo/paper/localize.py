@@ -73,9 +73,8 @@ def localize(
     otherwise = AMBIGUOUS if others and alone >= settings.min_confidence else NOT_LOCALIZED
     status = LOCALIZED if confidence >= settings.min_confidence else otherwise
     in_world = tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others)
-    return Localization(
-        status, confidence, None, paper_map.to_world(best.pose), best.loss, evidence, in_world
-    )
+    pose = paper_map.to_world(best.pose)
+    return Localization(status, confidence, None, pose, best.loss, evidence, in_world)
 
 
 def evaluate(

@@ -12,20 +12,18 @@ import numpy as np
 
 from .. import __version__
 from ..arguments import check_arguments
-from ..cloud.settings import METRES, CloudSettings, UpAxis
+from ..cloud.settings import UpAxis
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.cache import digest_of_sources
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
-from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
 from ..opened_scan import File, read_options_of
-from ..opening import Units
+from ..opening import Units, open_scan
 from ..panorama.photo import read_photo_facts
 from ..result import FAILED, UNREADABLE, Result, check_scan
 from ..scan import Scan
-from ..scan_map.open_map import CachePolicy, open_map
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
@@ -105,9 +103,8 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     for plan in settings.own_plans:
         if not 1 <= plan.storey <= found:
             raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")
-    return check_scan(
-        [entry.result for entry in entries], scan_map.scan_sha256, "that given", settings.is_forced
-    )
+    results = [entry.result for entry in entries]
+    return check_scan(results, scan_map.scan_sha256, "that given", settings.is_forced)
 
 
 def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
@@ -290,6 +287,8 @@ def write_report(  # noqa: PLR0913  options by name
     check_arguments(write_report, locals())
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
+    if not isinstance(scan, Scan):
+        scan = open_scan(scan, units=units, up=up, cache=cache, num_threads=num_threads, progress=progress)
     settings = ReportSettings(
         title=title,
         storey_names=tuple(storeys),
@@ -300,11 +299,7 @@ def write_report(  # noqa: PLR0913  options by name
         crs=crs,
         is_forced=force,
     )
-    if isinstance(scan, Scan):
-        scan_map = scan._opened.prepared
-    else:
-        policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-        scan_map = open_map(_paths(scan), CloudSettings(METRES[units], up), policy, workers, Stopwatch())
+    scan_map = scan._opened.prepared
     if not isinstance(scan_map, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
     return build_report(collect_entries(_items(results)), scan_map, Path(out), settings, workers).page
@@ -313,7 +308,3 @@ def write_report(  # noqa: PLR0913  options by name
 def _items(results: File | Iterable[File | Result]) -> list[Path | Result]:
     several = [results] if isinstance(results, str | PathLike) else results
     return [item if isinstance(item, Result) else Path(item) for item in several]
-
-
-def _paths(files: File | Sequence[File]) -> list[Path]:
-    return [Path(files)] if isinstance(files, str | PathLike) else [Path(file) for file in files]

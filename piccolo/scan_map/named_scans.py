@@ -46,9 +46,8 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
     """Refuse names that are not names of the map's scans."""
     names = scan_map.scan_names
     if within and not names:
-        raise InputError(
-            "`within`: found a scan without names, wanted a map of tools/prepare_map.py with `name`"
-        )
+        wanted = "wanted a map of tools/prepare_map.py with `name`"
+        raise InputError(f"`within`: found a scan without names, {wanted}")
     for name in within:
         if name not in names:
             raise InputError(f"`within`: found {name!r}, wanted of {_list_names(names)}")

@@ -68,14 +68,8 @@ def open_map(
     def build() -> ScanMap:
         with watch.stage("read"):
             cloud = open_cloud(paths, cloud_settings, workers.show)
-        scan_map = prepare_map(
-            cloud,
-            workers,
-            cloud_settings.up,
-            watch,
-            prior=prior,
-            has_features=has_features,
-        )
+        up = cloud_settings.up
+        scan_map = prepare_map(cloud, workers, up, watch, prior=prior, has_features=has_features)
         has_labels = cloud_settings.labels is not None
         return replace(scan_map, has_labels=has_labels, scan_sha256=digest, crs=read_crs(paths))
 

@@ -234,9 +234,8 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
 
     def run(first: int) -> None:
         part = slice(first, first + num_rows)
-        inside = np.flatnonzero(
-            (extents[:, 1] + reach >= first) & (extents[:, 1] - reach <= first + num_rows)
-        )
+        middles = extents[:, 1]
+        inside = np.flatnonzero((middles + reach >= first) & (middles - reach <= first + num_rows))
         some, colors, where = packed[inside], surfels.points.rgbx[inside], extents[inside]
         sums = np.zeros((*depth[part].shape, 5), np.float32)
         for drawn in (sums[:0], sums):

@@ -160,11 +160,8 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
         return
     errors, matrices = (np.array(values) for values in zip(*known, strict=True))
     rows = []
-    for part, own in {
-        "rotation and position": slice(6),
-        "rotation": slice(3),
-        "position": slice(3, 6),
-    }.items():
+    parts = {"rotation and position": slice(6), "rotation": slice(3), "position": slice(3, 6)}
+    for part, own in parts.items():
         e = errors[:, own, None]
         squares = np.sum(e * np.linalg.solve(matrices[:, own, own], e), axis=(1, 2))
         fractions = [f"{np.mean(squares < chi2.ppf(p, e.shape[1])):.3f}" for p in (0.95, 0.5)]

@@ -205,9 +205,8 @@ def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[
             cloud = scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
             case = f"{kind}, {changed:.0%} changed"
             trials = [_make_trial(world, case, "clean", workers, index) for index in range(4)]
-            another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)._replace(
-                true_pose=None
-            )
+            another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)
+            another = another._replace(true_pose=None)
             hidden = occlude(trials[0].rgb, another.rgb, 0.3, rng)
             trials += [trials[0]._replace(case=f"{case}, hidden 30%", rgb=hidden), another]
             yield cloud, trials
@@ -266,16 +265,14 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
 def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
     """Return what tools/benchmark.py calibration reads of a trial."""
     poses = [found.pose, *(a.pose for a in found.alternatives)] if found.pose else []
+    others = (alternative.probability for alternative in found.alternatives)
+    probabilities = [found.confidence, *others, found.probability_none]
     return {
         "case": trial.case,
         "scene": scene,
         "truth": trial.true_pose and pose_json(trial.true_pose),
         "status": found.status,
-        "probabilities": [
-            found.confidence,
-            *(a.probability for a in found.alternatives),
-            found.probability_none,
-        ],
+        "probabilities": probabilities,
         "poses": [pose_json(pose) for pose in poses],
         "standings": [list(standing) for standing in found.standings],
         "covariance": found.covariance and found.covariance.matrix.tolist(),
@@ -291,13 +288,8 @@ def pose_json(pose: Pose) -> dict[str, object]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", required=True)
-    option(
-        parser,
-        "--kinds KIND ...",
-        "kinds of places that look alike",
-        choices=ALIKE_KINDS,
-        default=list(ALIKE_KINDS),
-    )
+    text = "kinds of places that look alike"
+    option(parser, "--kinds KIND ...", text, choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
     option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
     option(parser, "--photos N", "cut so many photos out of each panorama of the scenes", default=0)
     option(parser, "--ignore-colors", "localize by the shape of the scans alone")

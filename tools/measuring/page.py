@@ -362,14 +362,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
     option(parser, "--only PART ...", "measure only these parts", choices=PARTS, default=list(PARTS))
     option(parser, "--damaged N", "number of panoramas of each scene to damage", default=4)
-    option(
-        parser, "--photos N", "number of phone photos to cut out of the panoramas of each scene", default=12
-    )
+    text = "number of phone photos to cut out of the panoramas of each scene"
+    option(parser, "--photos N", text, default=12)
     sizes = [10_000, 100_000, 1_000_000]
     option(parser, "--points N ...", "sizes to which the first scene is resampled", nargs="*", default=sizes)
-    option(
-        parser, "--rooms N ...", "sizes of synthetic scenes, 1 to 256 rooms", nargs="*", default=[1, 16, 64]
-    )
+    text = "sizes of synthetic scenes, 1 to 256 rooms"
+    option(parser, "--rooms N ...", text, nargs="*", default=[1, 16, 64])
     option(parser, "--out FILE", "write the page here (default: print it)")
 
 

@@ -65,7 +65,6 @@ def change_sensor(rgb: Image, rng: np.random.Generator) -> Image:
     sharpened = toned + rng.uniform(0.0, 1.0) * (toned - smooth)
     noisy = 255.0 * sharpened + rng.normal(0.0, rng.uniform(0.0, 6.0), rgb.shape)
     quality = int(rng.integers(50, 95))
-    _, content = cv2.imencode(
-        ".jpg", noisy.clip(0.0, 255.0).astype(np.uint8), [cv2.IMWRITE_JPEG_QUALITY, quality]
-    )
+    levels = noisy.clip(0.0, 255.0).astype(np.uint8)
+    _, content = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, quality])
     return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), np.uint8)

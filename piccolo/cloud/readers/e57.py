@@ -15,20 +15,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
-from .e57_file import (
-    MAGIC,
-    NAMESPACE,
-    E57File,
-    child,
-    children,
-    open_file,
-    parse_integer,
-    pose_of,
-    read_number,
-    read_scaled,
-    refusing,
-    text_of,
-)
+from . import e57_file
+from .e57_file import E57File, child, children, open_file, parse_integer, read_number, refusing, text_of
 from .reader import (
     CHUNK,
     ChunkReader,
@@ -135,7 +123,7 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
     num_points = parse_integer(file.path, points.get("recordCount", "0"))
     if num_points <= 0:
         raise _UnusableError(f"has {num_points} points")
-    fields = {field.tag.removeprefix(NAMESPACE): field for field in prototype}
+    fields = {field.tag.removeprefix(e57_file.NAMESPACE): field for field in prototype}
     coordinates = next((names for names in (CARTESIAN, SPHERICAL) if fields.keys() >= set(names)), None)
     if coordinates is None:
         raise _UnusableError("has neither cartesian nor spherical coordinates")
@@ -149,7 +137,7 @@ def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int
         raise InputError(f"{file.path}: {label} {found}; it is broken")
     names = tuple(name for name in invalid if name in fields)
     ranges = (_color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY)
-    pose = pose_of(file.path, element)
+    pose = e57_file.pose_of(file.path, element)
     return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), pose)
 
 
@@ -167,7 +155,7 @@ def _num_bits(path: Path, field: Element) -> int:
 
 def _color_range(path: Path, element: Element, field: Element) -> tuple[float, float]:
     """Return the values of black and of full brightness of a channel."""
-    name = field.tag.removeprefix(NAMESPACE)
+    name = field.tag.removeprefix(e57_file.NAMESPACE)
     limits = child(element, "colorLimits")
     low, high = (read_number(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
     if low is not None and high is not None and low < high:
@@ -175,7 +163,7 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     declared = [field.get(end) for end in ("minimum", "maximum")]
     if None in declared:
         raise _UnusableError(f"has colours without a range: neither colorLimits nor a declared {name}")
-    first, last = (read_scaled(path, field, text or "") for text in declared)
+    first, last = (e57_file.read_scaled(path, field, text or "") for text in declared)
     if not first < last:
         raise _UnusableError(f"has colours without a range: {name} is declared {first:g} to {last:g}")
     return first, last
@@ -237,7 +225,7 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
         raise InputError(f"{file.path}: {scan.label} {counts}; the file is broken")
 
 
-E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(MAGIC), open_e57)
+E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(e57_file.MAGIC), open_e57)
 
 
 class E57Image(NamedTuple):
@@ -294,7 +282,7 @@ def _images(file: E57File) -> Iterator[E57Image]:
                 width=_side(file.path, representation, "imageWidth"),
                 height=_side(file.path, representation, "imageHeight"),
                 fov_deg=_fov_deg(file.path, representation) if kind == "spherical" else None,
-                pose=pose_of(file.path, element),
+                pose=e57_file.pose_of(file.path, element),
                 scan_guid=text_of(element, "associatedData3DGuid"),
                 node=(number, representation_name, f"{encoding}Image"),
             )

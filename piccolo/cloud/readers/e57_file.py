@@ -175,9 +175,8 @@ def parse_number(path: Path, text: str) -> float:
     except ValueError:
         value = math.nan
     if not math.isfinite(value):
-        raise InputError(
-            f"{path}: found {quote_line(text.encode())} in the XML section, wanted a finite number"
-        )
+        found = quote_line(text.encode())
+        raise InputError(f"{path}: found {found} in the XML section, wanted a finite number")
     return value
 
 

@@ -19,19 +19,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...optional import import_optional
 from ..settings import IN_METRES, Channel, CloudSettings
-from .reader import (
-    CHUNK,
-    CUT,
-    CloudFormat,
-    MissingChannelError,
-    PointSource,
-    PointsWithScalar,
-    RawCloud,
-    bare_reader,
-    intensity_reader,
-    label_reader,
-    quote_line,
-)
+from . import reader
+from .reader import CHUNK, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
 
 MAGIC = b"LASF"
 MIN_HEADER_SIZE = 227  # [byte]
@@ -298,7 +287,8 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
     if options.labels or channel == "shape":
         read = partial(_read_scalar, header, layout, "class")
-        read_chunks = label_reader(path, read, options.labels) if options.labels else bare_reader(read)
+        labels = options.labels
+        read_chunks = reader.label_reader(path, read, labels) if labels else reader.bare_reader(read)
         return PointSource(path, read_chunks, header.num_points)
     if channel == "intensity":
         return _gray_source(header, layout)
@@ -323,7 +313,7 @@ def _gray_source(header: LasHeader, layout: LasLayout) -> PointSource:
     largest, num_samples = _largest(header, layout, "intensity")
     if largest == 0:
         raise MissingChannelError(f"{header.path}: the intensity is 0 in all {num_samples} points checked")
-    read_chunks = intensity_reader(partial(_read_scalar, header, layout, "intensity"))
+    read_chunks = reader.intensity_reader(partial(_read_scalar, header, layout, "intensity"))
     return PointSource(header.path, read_chunks, header.num_points)
 
 
@@ -353,7 +343,7 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
             size = int(sizes[first:end].sum())
             data = file.read(size)
             if len(data) < size:
-                raise InputError(f"{header.path}: {CUT}")
+                raise InputError(f"{header.path}: {reader.CUT}")
             content: bytes | NDArray[np.uint8] = data
             if layout.laszip:
                 content = decompress(header, layout, data, layout.chunks[first:end])
@@ -368,7 +358,7 @@ def _largest(header: LasHeader, layout: LasLayout, name: str) -> tuple[int, int]
     return max(largest for largest, _ in found), sum(count for _, count in found)
 
 
-def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[PointsWithScalar]:
+def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[reader.PointsWithScalar]:
     bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
     for records in _chunks(header, layout):
         points_world, kept = _points(header, records)

@@ -11,17 +11,8 @@ from typing import Any
 
 from ...errors import InputError
 from ...optional import import_optional
-from .mesh_files import (
-    GLB_MAGIC,
-    FolderResolver,
-    Material,
-    Texture,
-    check_image,
-    first_line,
-    own_limit,
-    read_texture,
-    sanitize_gltf,
-)
+from . import mesh_files
+from .mesh_files import GLB_MAGIC, FolderResolver, Material, Texture
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
 # faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
@@ -56,14 +47,14 @@ class Loaded:
     def texture(self, image: Any) -> Texture | None:
         """Return the texture in an image, one object for all surfaces that share it."""
         if id(image) not in self.textures:
-            self.textures[id(image)] = read_texture(self.path, image)
+            self.textures[id(image)] = mesh_files.read_texture(self.path, image)
         return self.textures[id(image)]
 
 
 def load_gltf(path: Path, content: bytes) -> Loaded:
     """Load a glTF or GLB file."""
     resolver = FolderResolver(path)
-    sanitized, materials = sanitize_gltf(content, resolver)
+    sanitized, materials = mesh_files.sanitize_gltf(content, resolver)
     kind = "glb" if content.startswith(GLB_MAGIC) else "gltf"
     return Loaded(path, _scene(resolver, sanitized, kind), materials)
 
@@ -92,7 +83,7 @@ def load_obj(path: Path, content: bytes) -> Loaded:
 
 def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
     for name in sorted(set(names)):
-        check_image(resolver.path, ascii(name[:100]), resolver.get(name))
+        mesh_files.check_image(resolver.path, ascii(name[:100]), resolver.get(name))
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
@@ -110,7 +101,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
 def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: bool = True) -> Any:
     trimesh = import_optional(resolver.path, "trimesh")
     try:
-        with own_limit():
+        with mesh_files.own_limit():
             # vertices are split by texture coordinates only if there is a texture: colours go by vertices
             options = {"fix_texture": has_texture} if kind == "ply" else {}
             load = trimesh.exchange.load.mesh_loaders[kind]
@@ -120,7 +111,8 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
         raise
     except Exception as error:  # whatever trimesh stumbles over
         if resolver.refusal is None:
-            text = f"trimesh can't read it ({first_line(error)}); the file may be damaged or cut off"
+            why = mesh_files.first_line(error)
+            text = f"trimesh can't read it ({why}); the file may be damaged or cut off"
             raise InputError(f"{resolver.path}: {text}") from error
     if resolver.refusal is not None:
         raise resolver.refusal

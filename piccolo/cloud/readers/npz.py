@@ -19,20 +19,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import IN_METRES, Channel, CloudSettings
-from .reader import (
-    BRIGHTEST,
-    CloudFormat,
-    MissingChannelError,
-    PointSource,
-    bare_points,
-    color_chunks,
-    find_full_brightness,
-    in_chunks,
-    point_label,
-    points_of,
-    quote_line,
-    read_records,
-)
+from . import reader
+from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -62,14 +50,14 @@ class ArrayInFile(NamedTuple):
         """Yield the rows (N, C) in chunks."""
         if self.member is None and not self.is_fortran:
             row = np.dtype((self.dtype, self.shape[1:]))
-            yield from read_records(self.path, self.offset, self.shape[0], row)
+            yield from reader.read_records(self.path, self.offset, self.shape[0], row)
             return
         with naming_damage(self.path), _open(self.path, self.member) as file:
             file.read(self.offset)  # not seek, so that the checksum covers all
             content = file.read(math.prod(self.shape) * self.dtype.itemsize)
             order: Literal["F", "C"] = "F" if self.is_fortran else "C"
             array = np.frombuffer(content, self.dtype).reshape(self.shape, order=order)
-        for (rows,) in in_chunks([array]):
+        for (rows,) in reader.in_chunks([array]):
             yield rows
 
 
@@ -82,7 +70,7 @@ def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         return _bare_source(path, array)
     if channel == "intensity" or array.shape[1] == 3:
         raise MissingChannelError(f"{path}: {array}, {WANTED}")
-    brightest = BRIGHTEST["u1"]
+    brightest = reader.BRIGHTEST["u1"]
     return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
 
 
@@ -102,21 +90,21 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     colors = arrays[-1]
     if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {points} and {colors}, {WANTED}")
-    brightest = find_full_brightness(path, [colors.dtype.str[1:]])
+    brightest = reader.find_full_brightness(path, [colors.dtype.str[1:]])
     return _source(path, lambda: zip(points.read_rows(), colors.read_rows(), strict=True), brightest, points)
 
 
 def _bare_source(path: Path, rows: ArrayInFile) -> PointSource:
     """Return the source of points alone, in the first three columns."""
     return PointSource(
-        path, lambda: bare_points(points_of(list(r.T)) for r in rows.read_rows()), rows.shape[0]
+        path, lambda: reader.bare_points(reader.points_of(list(r.T)) for r in rows.read_rows()), rows.shape[0]
     )
 
 
 def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
     """Return the source of the points in chunks of positions and colours; their number is that of `rows`."""
-    locate = partial(point_label, path)
-    return PointSource(path, lambda: color_chunks(read_parts(), brightest, locate), rows.shape[0])
+    locate = partial(reader.point_label, path)
+    return PointSource(path, lambda: reader.color_chunks(read_parts(), brightest, locate), rows.shape[0])
 
 
 def has_npz_magic(head: bytes) -> bool:

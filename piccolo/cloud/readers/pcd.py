@@ -16,22 +16,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
-from .reader import (
-    CloudFormat,
-    ColumnReader,
-    Columns,
-    MissingChannelError,
-    PointSource,
-    RawCloud,
-    color_names,
-    column_source,
-    in_chunks,
-    point_label,
-    points_of,
-    quote_line,
-    read_records,
-    take_records,
-)
+from . import reader
+from .reader import CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
 from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
@@ -201,7 +187,7 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         read_chunks = partial(_read_packed, header, fields[3].type, read_columns)
         return PointSource(path, read_chunks, header.num_points)
     types = [field.type for field in fields[3:]]
-    return column_source(path, read_columns, types, header.num_points, options.labels)
+    return reader.column_source(path, read_columns, types, header.num_points, options.labels)
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:
@@ -216,7 +202,7 @@ def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) 
     elif channel == "intensity":
         more = (INTENSITY,) * (INTENSITY in found)
     elif channel == "colors":
-        more = next(((name,) for name in PACKED_NAMES if name in found), color_names(found))
+        more = next(((name,) for name in PACKED_NAMES if name in found), reader.color_names(found))
     has_points = all(names.count(axis) == 1 and axis in found for axis in "xyz")
     if not has_points or not (more or channel == "shape"):
         listed = " ".join(names[:12]) or "none"
@@ -230,51 +216,51 @@ def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) 
     return fields
 
 
-def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
+def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[reader.Columns]:
     layout = LineLayout(tuple(field.column for field in fields), header.num_columns, header.size)
     rows = NumberLines(header.path, layout, WANTED).read_rows(header.num_points)
     return (list(some.T) for some in rows)
 
 
-def _read_binary(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
+def _read_binary(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[reader.Columns]:
     places = [("<" + field.type, field.offset) for field in fields]
     row = np.dtype((np.void, header.row_size))
-    for records in read_records(header.path, header.size, header.num_points, row):
+    for records in reader.read_records(header.path, header.size, header.num_points, row):
         yield [records.getfield(*place) for place in places]
 
 
-def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[Columns]:
+def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[reader.Columns]:
     kept = [field for field in header.fields if field.name != PADDING]  # PCL leaves padding out
     promised = header.num_points * sum(field.size for field in kept)
     found = header.path.stat().st_size - header.size - 8
     with header.path.open("rb") as file:
         file.seek(header.size)
-        packed_size, size = take_records(file, header.path, 2, np.dtype("<u4")).tolist()
+        packed_size, size = reader.take_records(file, header.path, 2, np.dtype("<u4")).tolist()
         if packed_size > found or size > MAX_RATIO * packed_size or size != promised:
             counts = f"found {found}, wanted {promised} for {header.num_points} points"
             raise InputError(f"{header.path}: {size} bytes packed into {packed_size}, {counts}; {BROKEN}")
-        packed = take_records(file, header.path, packed_size, np.dtype(np.uint8))
+        packed = reader.take_records(file, header.path, packed_size, np.dtype(np.uint8))
     table = decompress_lzf(packed.tobytes(), size)
     if table is None:
         raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
     # all points' values of a field, then those of the next
     ends = np.cumsum([field.size * header.num_points for field in kept])
     parts = dict(zip(kept, np.split(np.frombuffer(table, np.uint8), ends[:-1]), strict=True))
-    yield from in_chunks([parts[field].view("<" + field.type) for field in fields])
+    yield from reader.in_chunks([parts[field].view("<" + field.type) for field in fields])
 
 
-def _read_packed(header: PcdHeader, type_: str, read_columns: ColumnReader) -> Iterator[RawCloud]:
+def _read_packed(header: PcdHeader, type_: str, read_columns: reader.ColumnReader) -> Iterator[RawCloud]:
     """Yield the points with colours 0xAARRGGBB, in numbers of a declared type, which ASCII has as text."""
     num_before = 0
     for columns in read_columns():
-        points_world = points_of(columns)
+        points_world = reader.points_of(columns)
         values = columns[3]
         if header.encoding == "ascii":
             has_position = np.isfinite(points_world).all(axis=1)
             bits, is_right = _bits_of_text(np.where(has_position, values, 0.0), type_)
             if not is_right.all():
                 wrong = int(np.argmin(is_right))
-                place = point_label(header.path, num_before + wrong)
+                place = reader.point_label(header.path, num_before + wrong)
                 raise InputError(f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {type_}")
         else:
             bits = np.ascontiguousarray(values).view(np.uint32)

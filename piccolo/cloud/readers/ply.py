@@ -16,20 +16,9 @@ from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
+from . import reader
 from .mesh import open_ply_mesh
-from .reader import (
-    COLOR_NAMES,
-    INTENSITY_NAMES,
-    LABEL_NAMES,
-    CloudFormat,
-    Columns,
-    MissingChannelError,
-    PointSource,
-    color_names,
-    column_source,
-    quote_line,
-    read_records,
-)
+from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
@@ -75,7 +64,7 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         place_of_vertices(header)
     types = [header.vertices.ply_property(name).val_dtype for name in names[3:]]
     num_points = header.counts[header.index]
-    return column_source(path, partial(read_columns, header, names), types, num_points, options.labels)
+    return reader.column_source(path, partial(read_columns, header, names), types, num_points, options.labels)
 
 
 def _has_faces(header: PlyHeader) -> bool:
@@ -85,16 +74,16 @@ def _has_faces(header: PlyHeader) -> bool:
         return False
     for element in header.elements:
         for prop in element.properties:
-            if prop.name in COLOR_NAMES[0] and prop.val_dtype not in ("u1", "f4", "f8"):
+            if prop.name in reader.COLOR_NAMES[0] and prop.val_dtype not in ("u1", "f4", "f8"):
                 wrong = f"'{prop.name}' is of type {prop.val_dtype}"
                 raise InputError(f"{header.path}: {wrong}, wanted uchar 0-255 or float 0-1 in a mesh")
     return True
 
 
-def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[Columns]:
+def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
     """Yield the named columns of up to raw.CHUNK vertices; those of an ASCII file are float64."""
     if not header.is_ascii:
-        for rows in read_records(header.path, *place_of_vertices(header)):
+        for rows in reader.read_records(header.path, *place_of_vertices(header)):
             yield [rows[name] for name in names]
         return
     properties = [prop.name for prop in header.vertices.properties]
@@ -150,11 +139,11 @@ def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel)
     by_lower = {name.lower(): name for name in found}
     more: tuple[str, ...] = ()
     if options.labels:
-        more = tuple(by_lower[name] for name in LABEL_NAMES if name in by_lower)[:1]
+        more = tuple(by_lower[name] for name in reader.LABEL_NAMES if name in by_lower)[:1]
     elif channel == "intensity":
-        more = tuple(name for name in found if name.lower() in INTENSITY_NAMES)[:1]
+        more = tuple(name for name in found if name.lower() in reader.INTENSITY_NAMES)[:1]
     elif channel == "colors":
-        more = color_names(found)
+        more = reader.color_names(found)
     if not {*"xyz"} <= {*found} or not (more or channel == "shape"):
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
         listed = " ".join(found[:9]) or "no properties"

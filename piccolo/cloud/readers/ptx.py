@@ -18,16 +18,8 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
-from .reader import (
-    ChunkReader,
-    CloudFormat,
-    MissingChannelError,
-    PointSource,
-    RawCloud,
-    bare_reader,
-    intensity_reader,
-    quote_line,
-)
+from . import reader
+from .reader import ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
@@ -70,8 +62,8 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     read = partial(_read, path, COLORED if channel == "colors" else IN_GRAY, scans)
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: starmap(RawCloud, read()),
-        "intensity": intensity_reader(read),
-        "shape": bare_reader(read),
+        "intensity": reader.intensity_reader(read),
+        "shape": reader.bare_reader(read),
     }
     num_points = sum(scan.num_points for scan in scans)
     return PointSource(path, readers[channel], num_points, tuple(warnings), tuple(_station_axes(scans)))

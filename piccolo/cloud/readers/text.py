@@ -15,22 +15,8 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
-from . import reader as raw
-from .reader import (
-    BRIGHTEST,
-    CUT,
-    INTENSITY_NAMES,
-    ChunkReader,
-    CloudFormat,
-    MissingChannelError,
-    PointSource,
-    RawCloud,
-    bare_points,
-    color_chunks,
-    color_names,
-    intensity_reader,
-    quote_line,
-)
+from . import reader
+from .reader import ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
@@ -75,7 +61,7 @@ def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
                 raise InputError(f"{path}: a line of more than {BLOCK} bytes, wanted lines of a few numbers")
             yield data[:end].splitlines()
         if file.tell() < size:
-            raise InputError(f"{path}: {CUT}")
+            raise InputError(f"{path}: {reader.CUT}")
     if rest:
         yield rest.splitlines()
 
@@ -114,10 +100,10 @@ class NumberLines:
         """Return the wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
         columns = list(self.layout.columns)
         num_columns = self.layout.num_columns
-        most = max(1, raw.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
+        most = max(1, reader.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
         if self.peek() is None:
             return np.empty((0, len(columns)))
-        lines = islice(self._lines, min(count, raw.CHUNK, most))
+        lines = islice(self._lines, min(count, reader.CHUNK, most))
         usecols = columns if num_columns is None else None
         try:
             rows = np.loadtxt(lines, comments=None, delimiter=self.layout.delimiter, usecols=usecols, ndmin=2)
@@ -136,7 +122,7 @@ class NumberLines:
         """Yield the wanted columns of `count` lines, or of all that are left, CHUNK or fewer at once."""
         num_rows = 0
         while num_rows != count:
-            rows = self._take_rows(raw.CHUNK if count is None else count - num_rows)
+            rows = self._take_rows(reader.CHUNK if count is None else count - num_rows)
             num_rows += len(rows)
             if len(rows):
                 yield rows
@@ -155,14 +141,14 @@ class NumberLines:
         if len(self.layout.columns) == NUM_WITH_INTENSITY:
             return ((some[:, :3], some[:, 3]) for some in rows)
         parts = ((some[:, :3], some[:, 3:]) for some in rows)
-        chunks = color_chunks(parts, BRIGHTEST["u1"], lambda index: self.locate(first + index))
+        chunks = reader.color_chunks(parts, reader.BRIGHTEST["u1"], lambda index: self.locate(first + index))
         return ((chunk.points_world, chunk.colors) for chunk in chunks)
 
     def locate(self, index: int) -> str:
         """Return the file, and the number in it of the line that follows `index` lines of numbers."""
         for number, _ in islice(self._number_lines(), index, None):
             return f"{self.path}: line {number}"
-        raise InputError(f"{self.path}: {CUT}")
+        raise InputError(f"{self.path}: {reader.CUT}")
 
     def _number_lines(self) -> Iterator[tuple[int, bytes]]:
         """Read the file again: yield the number in the file and the text of each line of numbers."""
@@ -220,8 +206,8 @@ def line_source(path: Path, layout: LineLayout, channel: Channel, wanted: str) -
 
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: starmap(RawCloud, read()),
-        "intensity": intensity_reader(read),
-        "shape": lambda: bare_points(NumberLines(path, layout, wanted).read_rows()),
+        "intensity": reader.intensity_reader(read),
+        "shape": lambda: reader.bare_points(NumberLines(path, layout, wanted).read_rows()),
     }
     return PointSource(path, readers[channel])
 
@@ -292,8 +278,8 @@ def _find_columns(header: str, channel: Channel) -> tuple[int, ...]:
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
     more: dict[Channel, tuple[str, ...]] = {
-        "colors": color_names(once),
-        "intensity": tuple(name for name in once if name in INTENSITY_NAMES)[:1],
+        "colors": reader.color_names(once),
+        "intensity": tuple(name for name in once if name in reader.INTENSITY_NAMES)[:1],
         "shape": (),
     }
     wanted = (*"xyz", *more[channel])

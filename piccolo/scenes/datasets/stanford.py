@@ -157,9 +157,8 @@ def _read_table(options: ConvertOptions) -> NDArray[np.uint16]:
     """Return the class of each index in the semantic pictures."""
     found = _glob(options.folder, LABEL_FILES)
     if not found:
-        raise InputError(
-            f"{options.folder}: found no {LABEL_FILES[1]}, wanted the names of the semantic indices"
-        )
+        wanted = "wanted the names of the semantic indices"
+        raise InputError(f"{options.folder}: found no {LABEL_FILES[1]}, {wanted}")
     names = read_json(options.inside(found[0]), "wanted a list of names")
     if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
         raise InputError(f"{found[0]}: found {json.dumps(names)[:60]}, wanted a list of names")

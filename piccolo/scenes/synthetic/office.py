@@ -147,9 +147,8 @@ def plan_building(size: Array, num_rooms: int, num_storeys: int) -> Plan:
     num_corridors = -(-per_storey // (2 * COLUMNS))
     plan = Plan(size, num_rooms, num_storeys, num_corridors, -(-per_storey // (2 * num_corridors)))
     if num_storeys > 1 and 2.0 * FLIGHT_BEGIN + plan.flight(0).run > plan.num_corridors * plan.depth:
-        raise InputError(
-            f"`size`: rooms of {size.tolist()} m are too high for stairs in the halls between them"
-        )
+        why = "are too high for stairs in the halls between them"
+        raise InputError(f"`size`: rooms of {size.tolist()} m {why}")
     return plan
 
 

@@ -41,9 +41,8 @@ class WalkOptions:
     def __post_init__(self) -> None:
         """Refuse what means nothing."""
         if self.variant not in WALK_VARIANTS:
-            raise InputError(
-                f"`variants`: found {self.variant}, wanted {' or '.join(WALK_VARIANTS)} in a walk"
-            )
+            wanted = " or ".join(WALK_VARIANTS)
+            raise InputError(f"`variants`: found {self.variant}, wanted {wanted} in a walk")
         if not 0.1 <= self.rate <= 120.0:
             raise InputError(f"`frame_rate`: found {self.rate}, wanted 0.1 to 120 per second")
         if not 0.0 <= self.bad_fraction <= 1.0:

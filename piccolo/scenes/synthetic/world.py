@@ -119,9 +119,8 @@ def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Wor
     for mount in mounts:
         left, top = mount.offset
         camera = mount.camera
-        rgb[top : top + camera.height, left : left + camera.width] = render_picture(
-            mount, room, pose, workers
-        )
+        picture = render_picture(mount, room, pose, workers)
+        rgb[top : top + camera.height, left : left + camera.width] = picture
     return rgb
 
 
@@ -162,9 +161,8 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     """`num_rooms` rooms of `size` (3,) [m], all different."""
     size = np.asarray(size, dtype=float)
     if not ((size >= MIN_SIZE) & (size <= MAX_SIZE)).all():  # so that NaN is refused too
-        raise InputError(
-            f"`size`: found {size.tolist()}, wanted {MIN_SIZE} to {MAX_SIZE} m in each direction"
-        )
+        wanted = f"wanted {MIN_SIZE} to {MAX_SIZE} m in each direction"
+        raise InputError(f"`size`: found {size.tolist()}, {wanted}")
     if not 1 <= num_rooms <= MAX_ROOMS:
         raise InputError(f"`rooms`: found {num_rooms}, wanted 1 to {MAX_ROOMS}")
     columns = int(np.ceil(np.sqrt(num_rooms)))
