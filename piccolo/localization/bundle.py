@@ -157,7 +157,7 @@ def agree(
         return f"`relative_poses`: positions are {describe_scale(log_scale)}; each photo is judged by itself"
     excess = max(log_scale**2 - std**2 - errors.log_scale**2, 0.0)
     blurred = {
-        k: Estimate(estimate.own.blur(supports[k].missed * LOCAL_ERRORS), estimate.cam_from_bundle)
+        k: Estimate(estimate.own.blur(supports[k].local_share * LOCAL_ERRORS), estimate.cam_from_bundle)
         for k, estimate in own.items()
     }
     errors = errors._replace(log_scale=math.hypot(errors.log_scale, math.sqrt(excess)))

@@ -75,12 +75,12 @@ class Support(NamedTuple):
         """
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
-        right = belongs * (1.0 - self.missed) * here
+        right = belongs * (1.0 - self.local_share) * here
         of_others = [CONTRADICTED, CONTRADICTED * self.odds_elsewhere]
-        return np.array([right, belongs * (self.missed * here + SILENT), *of_others])
+        return np.array([right, belongs * (self.local_share * here + SILENT), *of_others])
 
     @property
-    def missed(self) -> float:
+    def local_share(self) -> float:
         """Probability that the own pose is a local optimum near the right one."""
         return MISSED / (1.0 + self.odds)
 
