@@ -17,19 +17,11 @@ from ..optional import import_optional
 from ..scenes import scene as scenes
 from ..scenes.export.formats import tum_lines, write_lines
 from ..scenes.export.video import writing_video
+from ..scenes.synthetic import world as worlds
 from ..scenes.synthetic.office import Office, make_office
 from ..scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from ..scenes.synthetic.walking import Walker
-from ..scenes.synthetic.world import (
-    VARIANTS,
-    World,
-    check_cameras,
-    make_labels,
-    make_photos,
-    make_query,
-    make_world,
-    scan_world,
-)
+from ..scenes.synthetic.world import World
 from ..views.pictures import encode_image
 from .command import check_least, check_only_with, command, option
 from .errors import UsageError, checking_options
@@ -71,7 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--points N", text)
     option(parser, "--panoramas N", "number of panoramas of each variant", default=3)
     text = "variants of the panoramas, see below"
-    option(parser, "--variants", text, nargs="+", choices=VARIANTS, default=["clean"])
+    option(parser, "--variants", text, nargs="+", choices=worlds.VARIANTS, default=["clean"])
     option(parser, "--width PX", "width of the panoramas", default=2048)
     text = "take the pictures with this calibrated camera or rig (docs/CAMERAS.md) instead of panoramas"
     option(parser, "--camera FILE", text)
@@ -134,15 +126,15 @@ def write_photos(
         image = folder / "images" / (f"{v}_{k}" if cameras and cameras.is_rig else f"{v}_{k}.jpg")
         labels = None
         if cameras is not None:
-            pictures, pose = make_photos(world, k, v, cameras, workers)
+            pictures, pose = worlds.make_photos(world, k, v, cameras, workers)
         else:
-            query = make_query(world, k, v, arguments.width, workers)
+            query = worlds.make_query(world, k, v, arguments.width, workers)
             pictures = [("", query.rgb)]
             pose = query.pose
             if arguments.labels:
                 labels = folder / "labels" / f"{v}_{k}.png"
                 labels.parent.mkdir(exist_ok=True)
-                write_atomically(labels, encode_image(make_labels(world, k, query, workers), ".png"))
+                write_atomically(labels, encode_image(worlds.make_labels(world, k, query, workers), ".png"))
         for name, rgb in pictures:
             path = image / name
             path.parent.mkdir(exist_ok=True)
@@ -190,13 +182,13 @@ def write_scene(
             raise UsageError(f"--width: found {arguments.width}, wanted an even number of at least 128")
         if is_building(arguments):
             office = make_office(seed, size, arguments.rooms, max(1, arguments.storeys), arguments.twins)
-        world = office.world if office else make_world(seed, size, arguments.rooms)
+        world = office.world if office else worlds.make_world(seed, size, arguments.rooms)
         usual = PART_POINTS * len(world.rooms) if office else ROOM_POINTS
         num_points = usual if arguments.points is None else arguments.points
         if num_points < MIN_POINTS * len(world.rooms):
             raise UsageError(f"--points: found {num_points}, wanted at least {MIN_POINTS} per room")
     (folder / "images").mkdir(parents=True, exist_ok=True)
-    points, colors, labels = scan_world(world, num_points, workers)
+    points, colors, labels = worlds.scan_world(world, num_points, workers)
     rows = vertex_rows(points, colors, label=labels.astype(np.int32) if arguments.labels else None)
     write_ply(folder / scenes.CLOUD_NAME, rows)
     if office is not None and arguments.walk:
@@ -219,7 +211,7 @@ def main(arguments: argparse.Namespace) -> int:
     with checking_options():
         check_usage(arguments)
         if cameras is not None:
-            check_cameras(cameras)
+            worlds.check_cameras(cameras)
     if arguments.video:
         import_optional("--video", "av", "video")
     workers = Workers(num_cores(), progress_bar(arguments.quiet))

@@ -17,14 +17,8 @@ from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import solid_angles
 from ..kernels.jit import F0, F1, kernel
-from ..panorama import Panorama
-from ..panorama.local_normalization import (
-    block_moments,
-    blur_sphere,
-    finish_statistics,
-    normalize_locally,
-    opponent_channels,
-)
+from ..panorama import Panorama, local_normalization
+from ..panorama.local_normalization import normalize_locally, opponent_channels
 from ..panorama.model import resize, shrink
 from ..views.zbuffer import View, render_view
 
@@ -164,13 +158,13 @@ def _statistics(
 ) -> NDArray[np.float32]:
     """Return local means and 1 / deviations (H, W, 6) of channels (H, W, 3), mixed with the global ones."""
     moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
-    block_moments(channels, weight, moments)
+    local_normalization.block_moments(channels, weight, moments)
     total = (moments * solid_angles(STATS_WIDTH)[:, None, None]).sum(axis=(0, 1))
     # what blur_sphere makes of full blocks: the integral of exp((cosine - 1) / sigma^2)
     full = global_weight * math.tau * math.radians(SIGMA_DEG) ** 2 * weight.size / moments[..., 0].size
-    sums = blur_sphere(moments, SIGMA_DEG)
+    sums = local_normalization.blur_sphere(moments, SIGMA_DEG)
     sums += (full * total / max(total[0], 1e-9)).astype(np.float32)
-    finish_statistics(sums)
+    local_normalization.finish_statistics(sums)
     return _enlarge(sums[..., 1:], weight.shape)
 
 

@@ -169,12 +169,8 @@ def make_grid(num_rings: int) -> SphereGrid:
         s = np.sin(middle[ring])
         directions.append(np.stack([c * np.cos(azimuth), c * np.sin(azimuth), np.full(n, s)], axis=1))
         solid_angle.append(np.full(n, 0.5 * (np.sin(edges[ring]) - np.sin(edges[ring + 1])) / n))
-    return SphereGrid(
-        num_columns,
-        first,
-        np.concatenate(directions).astype(np.float32),
-        np.concatenate(solid_angle).astype(np.float32),
-    )
+    all_directions = np.concatenate(directions).astype(np.float32)
+    return SphereGrid(num_columns, first, all_directions, np.concatenate(solid_angle).astype(np.float32))
 
 
 @lru_cache(maxsize=8)

@@ -32,12 +32,8 @@ class Keypoints(NamedTuple):
         """Return the keypoints of the picture mirrored left for right: rays, tangents and descriptors."""
         left_for_right = np.array([1.0, -1.0, 1.0], np.float32)
         histograms = self.descriptors.reshape(-1, 4, 4, 8)[:, ::-1, :, -np.arange(8) % 8]
-        return Keypoints(
-            self.rays * left_for_right,
-            self.tangents * left_for_right,
-            self.sizes,
-            histograms.reshape(-1, DESCRIPTOR_SIZE),
-        )
+        descriptors = histograms.reshape(-1, DESCRIPTOR_SIZE)
+        return Keypoints(self.rays * left_for_right, self.tangents * left_for_right, self.sizes, descriptors)
 
 
 def find_keypoints(

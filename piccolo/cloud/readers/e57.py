@@ -15,18 +15,9 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ...geometry.pose import Array, Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
-from . import e57_file
+from . import e57_file, reader
 from .e57_file import E57File, child, children, open_file, parse_integer, read_number, refusing, text_of
-from .reader import (
-    CHUNK,
-    ChunkReader,
-    CloudFormat,
-    MissingChannelError,
-    PointSource,
-    RawCloud,
-    bare_points,
-    intensity_reader,
-)
+from .reader import CHUNK, ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -84,9 +75,11 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
     read_chunks: ChunkReader = partial(_read_colored, path, scans)
     if channel == "shape":
-        read_chunks = lambda: bare_points(points for _, points, _ in _read(path, scans))  # noqa: E731
+        read_chunks = lambda: reader.bare_points(points for _, points, _ in _read(path, scans))  # noqa: E731
     elif channel == "intensity":
-        read_chunks = intensity_reader(lambda: ((p, values[:, 0]) for _, p, values in _read(path, scans)))
+        read_chunks = reader.intensity_reader(
+            lambda: ((p, values[:, 0]) for _, p, values in _read(path, scans))
+        )
     warnings = tuple(f"{path}: {what}; left out" for what in left_out)
     num_points = sum(scan.num_points for scan in scans)
     return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans))
@@ -214,12 +207,12 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     with refusing(file.path, file.libe57):
         for name, room in columns.items():
             buffers.append(file.libe57.SourceDestBuffer(file.image_file, name, room, len(room), True, True))
-        reader = file.image_file.root()["data3D"][scan.index]["points"].reader(buffers)
+        compressed = file.image_file.root()["data3D"][scan.index]["points"].reader(buffers)
         while num_read < scan.num_points and count > 0:
-            count = reader.read()
+            count = compressed.read()
             num_read += count
             yield {name: column[:count] for name, column in columns.items()}
-    reader.close()
+    compressed.close()
     if num_read != scan.num_points:
         counts = f"promises {scan.num_points} points, found {num_read}"
         raise InputError(f"{file.path}: {scan.label} {counts}; the file is broken")

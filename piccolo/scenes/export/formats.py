@@ -28,8 +28,6 @@ COLUMNS = (
     *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
     *("heading_deg", "pitch_deg", "roll_deg"),
 )
-
-
 STEP = 10.0  # [m] ahead, to find true north
 MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
 LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
