@@ -94,7 +94,7 @@ def test_localize_overlay_export_and_render_show_the_photo_s_own_field(photos, t
     model = tmp_path / "model"
     assert export_poses.main(["--results", str(out), "--format", "colmap", "--out", str(model), "--all"]) == 0
     (theirs,) = pycolmap.Reconstruction(str(model)).images.values()
-    rays, _ = WIDE.rays(np.array([[100.0, 300.0]]))
+    rays, _ = found.camera.rays(np.array([[100.0, 300.0]]))
     point = result.best_pose.center_world + 3.0 * rays[0] @ result.best_pose.R_cam_from_world
     np.testing.assert_allclose(theirs.project_point(point), [100.0, 300.0], atol=1e-6)
 
