@@ -40,7 +40,7 @@ from .scan_map.scan_map import ScanMap
 
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
-MEMORY_OF_PHOTO = 3e7  # [byte] that a photo keeps while others of its bundle are localized
+MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
 File = str | PathLike[str]
 Settings = CoarseToFineSettings | PaperSettings
 
