@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 
-from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.pose_gaussian import (
     LIKELY,
     PoseGaussian,
@@ -62,18 +61,6 @@ def test_a_pose_on_a_rig_has_the_errors_of_both():
         camera = add(pose, roots[0] @ rng.normal(size=6))
         drawn.append(subtract(add(other_from_cam @ camera, roots[1] @ rng.normal(size=6)), attached.pose))
     np.testing.assert_allclose(np.cov(np.array(drawn).T), attached.covariance, atol=2e-6)
-
-
-def test_another_frame_turns_position_and_covariance():
-    rng = np.random.default_rng(2)
-    pose, *_ = tilted_poses(1, NEAR)
-    R = exp_so3(np.array([0.3, -0.5, 1.0]))
-    moved = Pose(pose.R_cam_from_world @ R.T, R @ pose.center_world)
-    found = PoseGaussian(pose, covariance(rng), covariance(rng))
-    turned = found.to_frame(moved, R)
-    np.testing.assert_allclose(turned.own[:3, :3], found.own[:3, :3])
-    np.testing.assert_allclose(turned.common[3:, 3:], R @ found.common[3:, 3:] @ R.T)
-    assert turned.largest_std == pytest.approx(found.largest_std)
 
 
 def test_the_mean_is_that_of_least_squares():

@@ -37,11 +37,6 @@ class PoseGaussian:
         """Standard deviation of the position in its least constrained direction [m]."""
         return largest_std(self.covariance)
 
-    def to_frame(self, pose: Pose, R_target_from_source: Array) -> "PoseGaussian":
-        """Return this as `pose` of another frame, whose axes are turned by a rotation (3, 3)."""
-        own, common = (turn_positions(part, R_target_from_source) for part in (self.own, self.common))
-        return PoseGaussian(pose, own, common)
-
     def attach(self, other_from_cam: Pose, relative: Array) -> "PoseGaussian":
         """Return the pose of another camera on the same rig, whose place there has a covariance (6, 6)."""
         J = differentiate(self.pose, other_from_cam)
