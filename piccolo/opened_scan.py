@@ -13,7 +13,7 @@ from .camera import Calibration
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
 from .confidence.confidence import LOCALIZED, NOT_LOCALIZED
-from .confidence.localization import Localization
+from .confidence.localization import FocalLength, Localization
 from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
@@ -88,11 +88,13 @@ class OpenedScan:
         settings: Settings,
         is_masked: NDArray[np.bool_] | None = None,
         calibration: Calibration | None = None,
+        focal: FocalLength | None = None,
     ) -> Result:
         """Localize a photo.
 
         `is_masked` (H, W) is the mask of a photo that is an array, True where it is ignored. `calibration` is
-        the photo's camera, if `read_options` give none.
+        the photo's camera, if `read_options` give none. `focal` is its focal length as found before, with
+        that of other photos, which counts then.
         """
         watch = Stopwatch()
         self.check_options(read_options, settings)
@@ -100,7 +102,7 @@ class OpenedScan:
         if calibration is not None and read_options.calibration is None:
             read_options = replace(read_options, calibration=calibration)
         with watch.stage("read"), reading_once():
-            picture = read_photo(panorama, read_options, is_masked)
+            picture = expect_focal(read_photo(panorama, read_options, is_masked), focal)
             photo = read_photo_facts(panorama, read_options.rig)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
@@ -117,6 +119,8 @@ class OpenedScan:
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
             raise InputError(OTHER_METHOD)
+        if focal is not None:
+            found = replace(found, focal_length=focal.after(found.focal_length))
         about = settings_json(settings, self.cloud_settings, asked)
         return replace(self.make_result(panorama, picture, photo, found, about, watch.seconds), gps_prior=gps)
 
@@ -152,8 +156,9 @@ class OpenedScan:
         """
         watch = Stopwatch(dict(first.seconds))
         prepared, settings = self.require_default_method("photos beside others", settings)
+        focal = first.focal_length
         with watch.stage("read"), reading_once():
-            picture = read_photo(panorama, read_options)
+            picture = expect_focal(read_photo(panorama, read_options), focal)
             photo = read_photo_facts(panorama, read_options.rig)
         if has_guessed_focal(picture) or prepared.has_shape or photo.sha256 != first.source.pano_sha256:
             return first, ()
@@ -166,6 +171,11 @@ class OpenedScan:
         is_other = first.best_pose and found.pose and not is_near(found.pose, first.best_pose)
         if not names or not (is_surer or is_other):
             return first, ()
+        if focal is not None:
+            found = replace(found, focal_length=focal.after(found.focal_length))
+        elif found.focal_length is not None:  # only what a photo says alone counts for others
+            alone = replace(found.focal_length, picture_px=None, picture_std_px=None)
+            found = replace(found, focal_length=alone)
         about = settings_json(settings, self.cloud_settings, read_options)
         result = self.make_result(panorama, picture, photo, found, about, watch.seconds)
         return replace(result, gps_prior=first.gps_prior), names
@@ -255,6 +265,13 @@ class OpenedScan:
         if photo.gps is None or not crs or settings.prior.near_world is not None:
             return None
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
+
+
+def expect_focal(picture: Panorama, focal: FocalLength | None) -> Panorama:
+    """Return a photo with the focal length that other photos of its camera have, if that is known."""
+    if focal is None or focal.others_px is None or focal.others_std_px is None:
+        return picture
+    return picture.expect_focal(focal.others_px, focal.others_std_px / focal.others_px)
 
 
 def settings_json(

@@ -13,7 +13,7 @@ import pytest
 from piccolo import open_scan, opened_scan
 from piccolo.batch.localizer import Localizer
 from piccolo.batch.outputs import StreamOutput
-from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks
+from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks_beside
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize
@@ -31,7 +31,8 @@ NONE_ASKED = {"photos": [], "asked_sha256": "0"}
 
 def _text(pano, status="localized", beside=None, camera=CAMERA, confidence=0.95):
     fields = {"pano": pano, "pano_sha256": "1", "status": status, "confidence": confidence}
-    return json.dumps({**fields, "beside": beside, "camera": camera})
+    size = {"image_size": [1024, 512], "focal_length": None}
+    return json.dumps({**fields, **size, "beside": beside, "camera": camera})
 
 
 def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
@@ -41,7 +42,7 @@ def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
     texts += [_text("5", beside={"photos": ["0"], "asked_sha256": "0"}), _text("6", camera=None)]
     texts += [_text("7", "ambiguous", camera=None), _text("8", "not_localized", NONE_ASKED)]
     texts += [_text("9", confidence=0.94)]
-    looks = list_looks(texts)
+    looks = list_looks_beside(texts)
     assert [(look.number, look.status, look.pano, look.first) for look in looks] == [
         (1, "ambiguous", "1", texts[1]),
         (2, "not_localized", "2", texts[2]),
@@ -51,15 +52,15 @@ def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
     assert all(look.beside == (texts[0], texts[6]) for look in looks)
     asked = {"photos": [], "asked_sha256": looks[0].asked_sha256}
     texts[1] = _text("1", "ambiguous", asked)
-    assert [look.number for look in list_looks(texts)] == [2, 5, 8]
+    assert [look.number for look in list_looks_beside(texts)] == [2, 5, 8]
     texts[6] = _text("6", "ambiguous")
-    assert [look.number for look in list_looks(texts)] == [1, 2, 5, 6, 8]
-    assert [(look.number, look.beside) for look in list_looks(texts[1:6])] == [(0, ()), (4, ())]
+    assert [look.number for look in list_looks_beside(texts)] == [1, 2, 5, 6, 8]
+    assert [(look.number, look.beside) for look in list_looks_beside(texts[1:6])] == [(0, ()), (4, ())]
 
 
 def test_a_photo_is_looked_at_beside_the_nearest_in_order():
     texts = [_text(f"{k}", "ambiguous" if k == 40 else "localized") for k in range(MOST_PICTURES + 30)]
-    (look,) = list_looks(texts)
+    (look,) = list_looks_beside(texts)
     assert look.beside == tuple(text for k, text in enumerate(texts) if k != 40 and k <= MOST_PICTURES)
 
 

@@ -113,7 +113,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert _fused(judged, _at(true, 0.01), away) is None
     motion = np.zeros((6, 1))
     motion[3] = 1.0
-    fit = FocalFit(np.zeros(1), np.array([[0.03**2]]), motion, 0.0)
+    fit = FocalFit(np.zeros(1), np.array([[0.03**2]]), motion, None, 0.0)
     of_camera = fit.pose_covariance
     widened = _fused(replace(judged, gaussian=_at(off, 0.05).widen(of_camera)), _at(true, 0.01), fit=fit)
     assert 0.03 < widened.largest_std < 0.033, "the focal length's error is common"

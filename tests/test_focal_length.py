@@ -21,6 +21,7 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization import localize as module
 from piccolo.localization.comparison import score_pose
+from piccolo.localization.focal_consensus import SLIPS, Opinion, combine
 from piccolo.localization.localize import localize, select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.selection import Selection
@@ -102,7 +103,7 @@ def test_k1_is_fitted_with_the_focal_length_of_a_guess():
     rgb, pose = _photo(Camera("SIMPLE_RADIAL", 640, 480, (TRUE, 320.0, 240.0, -0.04)))
     mount = Mount(Camera("SIMPLE_RADIAL", 640, 480, (1.03 * TRUE, 320.0, 240.0, 0.0)))
     _, fit = _fit(rgb, pose, calibration=Calibration("guess", (mount,)), refine_focal=True)
-    f, k1 = focal.change_camera(mount.camera, fit.change).params[::3]
+    f, k1 = mount.camera.change(*fit.change).params[::3]
     assert f == pytest.approx(TRUE, rel=0.02)
     assert k1 == pytest.approx(-0.04, abs=0.015)
 
@@ -301,10 +302,24 @@ def test_pictures_of_a_result_are_made_with_the_camera_found():
 
 def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
     """One in fifty is wrong; a sharp picture confirms or contradicts it, a blurred one says little."""
-    assert focal.doubt_given(0.0, 0.005**2) < 0.005
-    assert focal.doubt_given(0.0, 0.05**2) == pytest.approx(focal.SLIPS, abs=0.015)
-    assert focal.doubt_given(0.05, 0.02**2) > 0.05
-    assert focal.doubt_given(0.05, 0.01**2) > 0.99
-    rising = [focal.doubt_given(off, 0.02**2) for off in (0.0, 0.02, 0.04, 0.06, 1.0)]
+    assert Opinion(0.0, 0.004**2).doubt(0.003) < 0.005
+    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(SLIPS, abs=0.015)
+    assert Opinion(0.05, 0.02**2).doubt(0.003) > 0.05
+    assert Opinion(-0.05, 0.009**2).doubt(0.003) > 0.99
+    rising = [Opinion(off, 0.02**2).doubt(0.003) for off in (0.0, 0.02, 0.04, 0.06, 1.0)]
     assert rising == sorted(rising)
-    assert focal.doubt_given(9.0, 0.01**2) <= 1.0
+    assert Opinion(9.0, 0.01**2).doubt(0.003) <= 1.0
+
+
+def test_photos_of_one_camera_agree_on_its_focal_length_whatever_some_say():
+    """Each is right to its deviation, but for those at a wrong place; the mean has the deviation it says."""
+    rng = np.random.default_rng(5)
+    misses = []
+    for _ in range(200):
+        stds = rng.uniform(0.005, 0.03, 12)
+        offs = rng.normal(0.05, stds)
+        offs[:3] = rng.uniform(-0.3, 0.3, 3)
+        consensus = combine([Opinion(off, std**2) for off, std in zip(offs, stds, strict=True)])
+        misses.append((consensus.off - 0.05) / math.sqrt(consensus.variance))
+    assert 0.5 < np.std(misses) < 1.4
+    assert combine([Opinion(0.0, 1e-4)] * 2) is None

@@ -163,7 +163,7 @@ class Localizer:
             if look.first:
                 first = Result.from_json(look.first)
             else:
-                first = scan.localize_query(path, read, task.settings, None, task.calibration)
+                first = scan.localize_query(path, read, task.settings, None, task.calibration, look.focal)
             if not look.beside:
                 return replace(first, beside=None)
             found, names = scan.localize_again(path, first, list_pictures, read, task.settings)

@@ -24,7 +24,7 @@ class StreamOutput:
             self._write(text)
             return
         self._texts.append(text)
-        self._is_waiting = self._is_waiting or parse_line(text).is_doubtful
+        self._is_waiting = self._is_waiting or parse_line(text).may_change
         if not self._is_waiting:
             self.close()
 

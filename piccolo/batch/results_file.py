@@ -138,7 +138,8 @@ class Records:
             if named is None or pano in named:
                 check_as_expected(fields, expected(Path(pano)))
             span = (self.size, self.size + len(content))
-            is_second = fields.get("beside") is not None
+            focal = fields.get("focal_length") or {}
+            is_second = fields.get("beside") is not None or focal.get("others_px") is not None
             line = Finished(span, fields.get("pano_sha256"), str(fields.get("status")), is_second)
             self._others.setdefault(pano, []).append(line)
             self.size = span[1]

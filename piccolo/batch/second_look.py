@@ -1,15 +1,25 @@
-"""A second look at the photos of a batch that are not sure, beside others that are."""
+"""A second look at the photos of a batch, with what the others say of their camera, or beside sure ones."""
 
 import json
+import math
 from bisect import bisect
 from collections.abc import Sequence
+from dataclasses import replace
 from hashlib import sha256
 from typing import Any, NamedTuple
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..confidence.localization import FocalLength, Localization
+from ..localization.focal_consensus import Opinion, combine
+from ..localization.focal_length import WIDE
+from ..localization.judge import follow_consensus
+from ..result import Result
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
 LEAST_CONFIDENCE = 0.95  # of these: about the log odds of 3 that frames of walks need
+BETTER = 0.5  # of the deviation of a focal length that others must leave
+ONE_CAMERA = 1.02  # most between focal lengths given of one camera, as focusing changes them
+TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
 
 
 class Line(NamedTuple):
@@ -22,6 +32,13 @@ class Line(NamedTuple):
     is_sure: bool  # others may be localized beside it
     has_camera: bool  # it is no sphere
     beside: dict[str, Any] | None  # of `Beside`
+    focal: FocalLength | None = None
+    image_size: tuple[int, int] = (0, 0)  # [px]
+
+    @property
+    def may_change(self) -> bool:
+        """True if other photos may change the result."""
+        return self.is_doubtful or self.focal is not None
 
     @property
     def is_doubtful(self) -> bool:
@@ -39,6 +56,7 @@ class Look(NamedTuple):
     first: str  # JSON of its result without the others; empty if that is to be computed again
     beside: tuple[str, ...]  # JSON of the results of photos that are sure
     asked_sha256: str  # digest of these
+    focal: FocalLength | None = None  # as found so far, with what other photos of the camera say
 
 
 def parse_line(text: str) -> Line:
@@ -48,11 +66,104 @@ def parse_line(text: str) -> Line:
     is_sure = fields["status"] == LOCALIZED and fields["confidence"] >= LEAST_CONFIDENCE and beside is None
     has_camera = bool(fields["camera"])
     digest = fields["pano_sha256"]
-    return Line(text, fields["pano"], digest, fields["status"], is_sure, has_camera, beside)
+    focal = fields["focal_length"] and FocalLength(**fields["focal_length"])
+    size = tuple(fields["image_size"] or (0, 0))
+    return Line(text, fields["pano"], digest, fields["status"], is_sure, has_camera, beside, focal, size)
 
 
-def list_looks(texts: Sequence[str]) -> list[Look]:
-    """List the photos to look at again among results in order, each with others that are sure.
+def list_looks_by_focal(texts: Sequence[str]) -> list[Look]:
+    """List the photos that are not sure, or another focal length fits, and that others tell it better."""
+    lines = [parse_line(text) for text in texts]
+    looks = []
+    for camera in group_by_camera(lines):
+        for k in camera:
+            line = lines[k]
+            focal = line.focal
+            others = combine([o for n in camera if n != k and (o := opinion_of(lines[n].focal))])
+            if others is None or focal is None or focal.others_px is not None:
+                continue
+            px = focal.given_px * math.exp(others.off)
+            std_px = math.sqrt(others.variance) * px
+            told = replace(focal, others_px=px, others_std_px=std_px)
+            is_off = abs(px - focal.px) > focal.std_px
+            if std_px < BETTER * focal.std_px and (is_off or line.status != LOCALIZED):
+                looks.append(Look(k, line.status, line.pano, "", (), digest_of([]), told))
+    return looks
+
+
+def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> list[tuple[int, str, Result]]:
+    """List the results that all photos of a camera change, by number, each with its status before.
+
+    Together they may confirm the focal length given, doubt it, or contradict it.
+    """
+    lines = [parse_line(text) for text in texts]
+    changed = []
+    for camera in group_by_camera(lines):
+        consensus = combine([o for n in camera if (o := opinion_of(lines[n].focal))])
+        for k in camera:
+            if consensus is None:
+                break
+            before = Result.from_json(texts[k])
+            after = take_consensus(before, consensus, min_confidence)
+            is_other = after.status != before.status or after.warnings != before.warnings
+            if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:
+                changed.append((k, before.status, after))
+    return changed
+
+
+def take_consensus(result: Result, consensus: Opinion, min_confidence: float) -> Result:
+    """Return a result as all photos of its camera together leave it."""
+    found = Localization(
+        result.status,
+        result.confidence,
+        result.probability_none,
+        alternatives=result.alternatives,
+        focal_length=result.focal_length,
+    )
+    told = follow_consensus(found, consensus, min_confidence)
+    return replace(
+        result,
+        status=told.status,
+        confidence=told.confidence,
+        probability_none=told.probability_none,
+        alternatives=told.alternatives,
+        focal_length=told.focal_length,
+        warnings=tuple(dict.fromkeys(result.warnings + told.warnings)),
+    )
+
+
+def opinion_of(focal: FocalLength | None) -> Opinion | None:
+    """Return what a photo alone says of its focal length, if anything."""
+    if focal is None or focal.picture_px is None or focal.picture_std_px is None:
+        return None
+    off = math.log(focal.picture_px / focal.given_px)
+    return Opinion(off, (focal.picture_std_px / focal.picture_px) ** 2)
+
+
+def group_by_camera(lines: Sequence[Line]) -> list[list[int]]:
+    """Return the numbers of photos by camera: of one size, source and about the focal length given.
+
+    Those whose focal length was a mere guess are left out.
+    """
+    known = [
+        (line.image_size, line.focal.source, line.focal.given_px, k)
+        for k, line in enumerate(lines)
+        if line.focal is not None and line.focal.given_deviation <= WIDE
+    ]
+    groups: list[list[int]] = []
+    camera: tuple[object, ...] = ()
+    largest = 0.0
+    for *kind, px, k in sorted(known):
+        if tuple(kind) != camera or px > largest:
+            groups.append([])
+        groups[-1].append(k)
+        camera = tuple(kind)
+        largest = ONE_CAMERA * px
+    return [sorted(group) for group in groups]
+
+
+def list_looks_beside(texts: Sequence[str]) -> list[Look]:
+    """List the photos that are not sure, each with others that are.
 
     These are the nearest in order: what was taken one after another mostly belongs together. A photo that was
     looked at beside the same photos is done.
@@ -69,8 +180,12 @@ def list_looks(texts: Sequence[str]) -> list[Look]:
         asked = digest_of(near)
         if asked != (line.beside["asked_sha256"] if line.beside else digest_of([])):
             first = "" if line.beside and line.beside["photos"] else line.text
-            looks.append(Look(k, line.status, line.pano, first, tuple(n.text for n in near), asked))
+            beside = tuple(n.text for n in near)
+            looks.append(Look(k, line.status, line.pano, first, beside, asked, line.focal))
     return looks
+
+
+LISTINGS = (list_looks_by_focal, list_looks_beside)  # in their order
 
 
 def digest_of(lines: Sequence[Line]) -> str:

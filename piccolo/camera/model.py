@@ -56,6 +56,8 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("EQUIRECTANGULAR", SPHERE, "w h"),
     )
 }
+FOCALS = "f", "fx", "fy"
+RADIAL = "k1"
 MAX_PERSPECTIVE = math.radians(89.9)  # half angle: no plane shows more
 MAX_ASPECT_ERROR = 0.01  # of a calibration of another size
 MAX_NUMBER = 1e6
@@ -194,6 +196,13 @@ class Camera:
     def lens(self) -> str:
         """Return the projection, which turns the angle from the optical axis into a radius."""
         return MODELS[self.model][0]
+
+    def change(self, log_focal: float, k1: float = 0.0) -> "Camera":
+        """Return the camera with changes of its focal length's logarithm and, if it has one, of its k1."""
+        factors = dict.fromkeys(FOCALS, math.exp(log_focal))
+        steps = {RADIAL: k1}
+        params = (value * factors.get(n, 1.0) + steps.get(n, 0.0) for n, value in self._named.items())
+        return replace(self, params=tuple(float(value) for value in params))
 
     @cached_property
     def _named(self) -> dict[str, float]:

@@ -18,7 +18,7 @@ from ..batch.localizer import Answer, Localizer
 from ..batch.outputs import FileOutput, Output, StreamOutput
 from ..batch.priors import read_priors
 from ..batch.results_file import Records
-from ..batch.second_look import Look, list_looks
+from ..batch.second_look import LISTINGS, Look, list_changed_by_consensus
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import InputError, printable
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
@@ -79,7 +79,7 @@ class Run:
     def looks_again(self) -> bool:
         """True if photos that are not sure are looked at again beside others."""
         is_default = isinstance(self.localizer.settings, CoarseToFineSettings)
-        return is_default and self.total not in (None, 1)
+        return is_default and self.total not in (None, 1) and not self.localizer.sends_photos
 
 
 def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
@@ -243,20 +243,41 @@ def localize_all(
     return interruption
 
 
-def plan_looks(run: Run, output: Output) -> list[Look]:
-    """Return which photos are to be looked at again beside others."""
-    is_possible = run.looks_again and not run.localizer.sends_photos
-    return list_looks(output.texts()) if is_possible else []
+def list_all_looks(run: Run, output: Output) -> list[Look]:
+    """Return which of the finished photos are to be looked at again."""
+    texts = follow_consensus(run, output) if run.looks_again else []
+    return [look for list_looks in LISTINGS for look in list_looks(texts)]
 
 
-def look_again(run: Run, looks: Sequence[Look], executor: Executor, output: Output) -> Interruption:
-    """Look again at photos that are not sure, beside those that are, until a signal ends it."""
+def follow_consensus(run: Run, output: Output) -> Sequence[str]:
+    """Change results by what all photos of a camera say of its focal length; return the lines."""
+    settings = run.localizer.settings
+    if not isinstance(settings, CoarseToFineSettings):
+        return output.texts()
+    for number, status, result in list_changed_by_consensus(output.texts(), settings.min_confidence):
+        replace_line = partial(output.replace, number)
+        if result.status == status:
+            replace_line(result.to_json())
+        else:
+            run.counts[status] -= 1
+            record(run, Answer(result, result.warnings), replace_line)
+    return output.texts()
+
+
+def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
+    """Look again at photos, with what others say of their camera, then beside others, until a signal."""
     localizer = run.localizer
-    values = executor.values(localizer.task(Path(look.pano))._replace(look=look) for look in looks)
-    with interruptible() as interruption:
-        pairs = show_progress(values, run.arguments.quiet, desc="second look", total=len(looks), unit="")
-        for look, (task, wait) in zip(looks, interruption.each(pairs, values.take_finished()), strict=False):
-            record_second(run, look, localizer.wait_for(task, wait, run.cloud_sha256), output)
+    for list_looks in LISTINGS:
+        looks = list_looks(follow_consensus(run, output))
+        values = executor.values(localizer.task(Path(look.pano))._replace(look=look) for look in looks)
+        with interruptible() as interruption:
+            pairs = show_progress(values, run.arguments.quiet, desc="second look", total=len(looks), unit="")
+            answers = interruption.each(pairs, values.take_finished())
+            for look, (task, wait) in zip(looks, answers, strict=False):
+                record_second(run, look, localizer.wait_for(task, wait, run.cloud_sha256), output)
+        if interruption.number:
+            return interruption
+    follow_consensus(run, output)
     return interruption
 
 
@@ -341,7 +362,7 @@ def main(arguments: argparse.Namespace) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        looks = plan_looks(run, output) if first is None else []
+        looks = list_all_looks(run, output) if first is None else []
         if first is None and not looks:
             print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
@@ -356,7 +377,7 @@ def main(arguments: argparse.Namespace) -> int:
                 output.begin()
             rest = itertools.chain([first] if first else [], left)
             interruption = localize_all(run, records, rest, executor, output.write)
-            if looks := [] if interruption.number else plan_looks(run, output):
-                interruption = look_again(run, looks, executor, output)
+            if run.looks_again and not interruption.number:
+                interruption = look_again(run, executor, output)
             note_left_handed(run, records, executor, interruption)
         return finish(run, records, output, interruption, watch.seconds["all"])

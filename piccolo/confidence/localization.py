@@ -1,6 +1,6 @@
 """Results of a method for one panorama."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ..camera import Mount
 from ..geometry.pose import Pose
@@ -44,6 +44,21 @@ class FocalLength:
     std_px: float
     given_px: float
     given_std_px: float
+    picture_px: float | None = None  # by the photo and the scan alone; None if they tell nothing
+    picture_std_px: float | None = None
+    doubt: float = 0.0  # probability that what was given is wrong
+    source: str = ""  # of what was given: the option, or EXIF
+    others_px: float | None = None  # by other photos of the camera, where that was taken for the one given
+    others_std_px: float | None = None
+
+    @property
+    def given_deviation(self) -> float:
+        """Standard deviation of the logarithm of what was given."""
+        return self.given_std_px / self.given_px
+
+    def after(self, found: "FocalLength | None") -> "FocalLength":
+        """Return what was found with what others say, beside what was given and what the photo said alone."""
+        return self if found is None else replace(self, px=found.px, std_px=found.std_px, doubt=found.doubt)
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,8 @@ from .bundle_search import (
     weigh_bundles,
 )
 from .comparison import score_pose
-from .focal_length import MOST_CONFLICT, FocalFit, calibrate
+from .focal_consensus import MOST_CONFLICT
+from .focal_length import FocalFit, calibrate
 from .judge import judge, judge_together
 from .localize import find_pose
 from .query import Query

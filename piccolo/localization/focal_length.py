@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Camera, Mount
-from ..camera.model import MODELS
+from ..camera import Mount
+from ..camera.model import MODELS, RADIAL
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
@@ -30,14 +30,13 @@ from ..panorama import Panorama
 from ..views.view import Cells
 from .comparison import mask_occluders, score_pose
 from .covariance import SCALE, remove_poles, sort_by_block, sum_by_block
+from .focal_consensus import MOST_CONFLICT, SLIPS, Opinion
 from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
 from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
 from .selection import Selection
 from .verification import matches_near
 
-FOCALS = "f", "fx", "fy"
-RADIAL = "k1"
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
 NUM_VALUES = 7  # of the parameter in a design of one
@@ -64,11 +63,7 @@ LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
 MOST_SHARE = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
-SLIPS = 0.02  # chosen: of given focal lengths, those that are wrong
-SLIP = 0.1  # chosen: deviation of the logarithm of a wrong one
-MOST_LOG = 50.0  # of odds
 MAX_CALIBRATIONS = 4  # fits of a focal length
-MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
 EDGE = 5  # [px] within the picture's edge that no point may come near
 NEARBY = Limits(FINE_LOSS, 12, 1e-4)
 CLOSE = Limits(FULL_LOSS, 30, 1e-6)
@@ -80,7 +75,8 @@ class FocalFit(NamedTuple):
     change: Array  # (p,) logarithm of the focal length, and k1 if it is fitted: the likeliest
     covariance: Array  # (p, p) of these
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
-    conflict: float  # deviations between what the picture says and what was given; 0 if it says nothing
+    opinion: Opinion | None  # what the picture alone says; None if it says nothing
+    conflict: float  # deviations between that and what was given; 0 if it says nothing
     doubt: float = 0.0  # probability that what was given is wrong by more than its deviation
 
     @property
@@ -110,18 +106,12 @@ class FocalFit(NamedTuple):
         focal = panorama.cameras[0].camera.focal[0]
         assert prior is not None
         given_std = prior.deviation * prior.focal
-        return FocalLength(focal, self.deviation * focal, prior.focal, given_std)
-
-
-def change_camera(camera: Camera, change: Array) -> Camera:
-    """Change the logarithm of a camera's focal length, and its k1 if `change` (p,) has two numbers."""
-    params = dict(zip(MODELS[camera.model][1], camera.params, strict=True))
-    for name in FOCALS:
-        if name in params:
-            params[name] *= math.exp(change[0])
-    if len(change) > 1:
-        params[RADIAL] += change[1]
-    return replace(camera, params=tuple(float(value) for value in params.values()))
+        found = FocalLength(focal, self.deviation * focal, prior.focal, given_std, source=prior.source)
+        if self.opinion is None:
+            return replace(found, doubt=self.doubt)
+        px = prior.focal * math.exp(self.opinion.off)
+        std = math.sqrt(self.opinion.variance) * px
+        return replace(found, doubt=self.doubt, picture_px=px, picture_std_px=std)
 
 
 class Crest(NamedTuple):
@@ -165,32 +155,22 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     crest = crest._replace(change=middle, information=both)
     conflict = 0.0
     doubt = SLIPS if prior.deviation <= WIDE else 0.0
+    opinion = None
     wide = precision.copy()
     if crest.information.any():
-        off = abs(crest.change[0] - expected[0])
+        opinion = Opinion(float(crest.change[0] - expected[0]), crest.variance)
+        conflict = opinion.conflict(prior.deviation)
+        doubt = opinion.doubt(prior.deviation) if doubt else 0.0
         spread = crest.variance + prior.deviation**2
-        conflict = float(off / math.sqrt(spread))
-        doubt = doubt_given(float(off), float(spread)) if doubt else 0.0
-        excess = max(off**2 - spread, 0.0)  # of the prior's variance, as by DerSimonian and Laird (1986)
+        # of the prior's variance, as by DerSimonian and Laird (1986)
+        excess = max(opinion.off**2 - spread, 0.0)
         wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
     if conflict > MOST_CONFLICT:
         precision = wide  # the picture alone says where to look next
     goal = crest.information @ crest.change + precision @ expected
     change = np.linalg.inv(crest.information + precision) @ goal
     total = np.linalg.inv(crest.information + wide)
-    return FocalFit(change, np.asarray(total), crest.motion, conflict, doubt)
-
-
-def doubt_given(off: float, spread: float) -> float:
-    """Return the probability that a given focal length is wrong, from how far off the picture says it is.
-
-    Some are: of another picture, a crop, a slip. Then they are off by a tenth; else by no more than the
-    variance `spread` of the difference says. Both are normal distributions of the logarithm.
-    """
-    wide = spread + SLIP**2
-    odds = SLIPS / (1.0 - SLIPS) * math.sqrt(spread / wide)
-    odds *= math.exp(min(0.5 * off**2 * (1.0 / spread - 1.0 / wide), MOST_LOG))
-    return odds / (1.0 + odds)
+    return FocalFit(change, np.asarray(total), crest.motion, opinion, conflict, doubt)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
@@ -251,7 +231,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
     def retake(change: Array) -> Panorama:
-        found = given.resample(change_camera(given.cameras[0].camera, change), whole.rgb.shape[1])
+        found = given.resample(given.cameras[0].camera.change(*change), whole.rgb.shape[1])
         return replace(found, is_valid=found.is_valid & is_left)
 
     narrowest = retake(changes.max(axis=0)).is_valid
@@ -363,7 +343,7 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:6])
 
     def find_residuals(delta: Array) -> Array:
-        after = before.with_camera(change_camera(before.camera, delta[6:]))
+        after = before.with_camera(before.camera.change(delta[6]))
         end = move(delta)
         offsets = rotate_points(matches.points - end.center_world, end.R_cam_from_world)
         rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
@@ -390,7 +370,7 @@ def recalibrate(query: Query, change: Array) -> Query:
     """Prepare the query again with another calibration; its matches stay, and their rays follow."""
     given = query.photo.given
     before = given.cameras[0]
-    after = before.with_camera(change_camera(before.camera, change))
+    after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
     features = tuple(Once(partial(_turn_features, part, before, after)) for part in query.features)

@@ -17,7 +17,7 @@ import numpy as np
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.covariance import describe_errors
-from ..confidence.localization import Alternative, Evidence, Localization
+from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
 from ..geometry.pose import Array, Pose
 from ..geometry.pose_gaussian import PoseGaussian, std_of
@@ -30,7 +30,8 @@ from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .brief import mirror_query
 from .covariance import estimate_covariance
-from .focal_length import MOST_CONFLICT, FocalFit, fit_focal
+from .focal_consensus import MOST_CONFLICT, Opinion
+from .focal_length import FocalFit, fit_focal
 from .last_descent import settle
 from .prior import contradictions
 from .query import Query
@@ -158,6 +159,28 @@ def reconsider(found: Localization, factor: float, min_confidence: float) -> Loc
     return decide(found, np.append(poses, 1.0 - poses.sum()), min_confidence)
 
 
+def follow_consensus(found: Localization, consensus: Opinion, min_confidence: float) -> Localization:
+    """Return the result of a photo whose focal length, as given, other photos of its camera confirm or doubt.
+
+    `consensus` is that of all of them. What it contradicts is ruled out, with a warning.
+    """
+    focal = found.focal_length
+    assert focal is not None
+    doubt = consensus.doubt(focal.given_deviation)
+    is_contradicted = consensus.conflict(focal.given_deviation) > MOST_CONFLICT
+    factor = (1.0 - doubt) / (1.0 - focal.doubt)
+    told = replace(found, focal_length=replace(focal, doubt=doubt), is_ruled_out=is_contradicted)
+    if is_contradicted:
+        px = focal.given_px * math.exp(consensus.off)
+        told = replace(told, warnings=(contradict("the pictures of this camera have", focal, px),))
+    return reconsider(told, factor, min_confidence)
+
+
+def contradict(who_has: str, focal: FocalLength, px: float) -> str:
+    """Return a warning that pictures have another focal length than the one given."""
+    return f"{who_has} a focal length of {px:.0f} px, not {focal.given_px:.0f}: check {focal.source}"
+
+
 def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> Localization:
     """Return a result with another pose of the same place."""
     described = describe_errors(fused, scan_map.R_map_from_world.T)
@@ -219,11 +242,8 @@ def promote(query: Query, found: Selection, alternative: Hypothesis) -> Selectio
 def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     """Explain how the focal length makes a pose doubtful, as warnings."""
     focal = fit.focal_length(panorama)
-    assert panorama.focal_prior is not None
-    source = panorama.focal_prior.source
     if fit.conflict > MOST_CONFLICT:
-        lengths = f"{focal.px:.0f} px, not {focal.given_px:.0f}"
-        return (f"the picture has a focal length of {lengths}: check {source}",)
+        return (contradict("the picture has", focal, focal.px),)
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
     if std <= TELLING_STD:
         return ()

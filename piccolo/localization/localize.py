@@ -5,8 +5,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-import numpy as np
-
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
@@ -18,7 +16,7 @@ from ..panorama import Panorama
 from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
-from .focal_length import WIDE, FocalFit, calibrate, change_camera
+from .focal_length import WIDE, FocalFit, calibrate
 from .judge import judge, reconsider
 from .last_descent import is_faint, refine_to_the_end
 from .prior import apply_prior, nothing_allowed
@@ -145,7 +143,7 @@ def localize_guessed(
     width = panorama.rgb.shape[1]
     found: list[Localization] = []
     for guess in GUESSES:
-        photo = panorama.resample(change_camera(camera, np.array([guess])), width)
+        photo = panorama.resample(camera.change(guess), width)
         found.append(localize(scan_map, photo, settings, workers, watch))
         if found[-1].status == LOCALIZED:
             break

@@ -64,6 +64,17 @@ class Panorama:
             is_valid = is_valid & (at_width == 0)
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
+    def expect_focal(self, focal_px: float, deviation: float) -> "Panorama":
+        """Return the panorama by another focal length, with the deviation of its logarithm, as is then known.
+
+        The panorama must have a focal_prior.
+        """
+        assert self.focal_prior is not None
+        camera = self.cameras[0].camera
+        taken = self.resample(camera.change(math.log(focal_px / camera.focal[0])), self.rgb.shape[1])
+        prior = replace(self.focal_prior, focal=focal_px, deviation=deviation)
+        return replace(taken, focal_prior=prior)
+
 
 @dataclass(frozen=True)
 class ReadOptions:
