@@ -13,6 +13,7 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
+from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.stopwatch import Stopwatch
@@ -21,7 +22,6 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization import localize as module
 from piccolo.localization.comparison import score_pose
-from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.localization.localize import localize, select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.selection import Selection
@@ -218,7 +218,7 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     )
     found = Selection(score_pose(query, scan().from_world(pose)), ())
     query, found = focal.follow_matches(query, found)
-    assert query.photo.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
+    assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert found.best.pose.distance(scan().from_world(pose)) < 0.15
     change, information, _ = focal.fit_matches(query, found.best.pose)
     assert abs(change) < 2.5 / math.sqrt(information)

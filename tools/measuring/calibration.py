@@ -58,7 +58,7 @@ class Outcome(NamedTuple):
     @property
     def kind(self) -> str:
         """Key in MODELS: what the photo was compared with."""
-        return self.standings[0].kind
+        return self.standings[0].evidence
 
     @property
     def std(self) -> float | None:
