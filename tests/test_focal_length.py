@@ -13,6 +13,7 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
+from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.stopwatch import Stopwatch
@@ -21,13 +22,12 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization import localize as module
 from piccolo.localization.comparison import score_pose
-from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.localization.localize import localize, select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
-from piccolo.scenes.synthetic.world import render_picture
+from research.synthetic.world import render_picture
 
 TRUE = 320.0  # [px] of the photos here, 640 x 480
 
