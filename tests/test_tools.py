@@ -16,8 +16,7 @@ from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, read_scene, write_queries
-from research.commands import benchmark
-from research.measuring import confidence, damage, page, photos, scaling
+from research.measuring import benchmark, confidence, damage, page, photos, scaling
 
 
 @pytest.fixture(scope="module")
