@@ -16,7 +16,8 @@ from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, read_scene, write_queries
-from research.measuring import benchmark, confidence, damage, page, photos, scaling
+from research.measuring import benchmark, confidence, page, scaling, trials
+from research.synthetic import photos
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +55,7 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
     for name in ("mirrored", "another place"):
         assert [damaged[name][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
-    assert set(damage.DAMAGED_SCANS) < set(damaged)
+    assert set(trials.DAMAGED_SCANS) < set(damaged)
     photos = table_of(text, page.PHOTOS)
     assert [row["queries"] for row in photos.values()] == ["1", "1"]
     paper = table_of(text, page.PAPER)

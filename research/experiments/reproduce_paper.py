@@ -42,10 +42,10 @@ from ..datasets.model import RigidTransform
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, summarize
+from ..synthetic.photos import UPSIDE_DOWN
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
 SceneTransform = Callable[[Scene, Path], Scene]
-UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
 
 
 def identity(scene: Scene, folder: Path) -> Scene:

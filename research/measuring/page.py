@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numba
@@ -30,13 +30,12 @@ from piccolo.result import Result
 from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.tables import Table
+from ..synthetic.photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
 from .calibration import pose_error
-from .confidence import Points
-from .damage import DAMAGED_SCANS, damage_panorama
 from .kernels import kernel_table
-from .photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
 from .scaling import clean_queries, size_table
+from .trials import DAMAGED_SCANS, Points, Trial, damage_trial
 
 EPILOG = """\
 examples:
@@ -231,11 +230,13 @@ class Bench:
         panoramas = [read_panorama(query.image).rgb for query in queries]
         for number, (query, rgb) in enumerate(zip(queries, panoramas, strict=True)):
             rng = np.random.default_rng([number, len(scene.queries), 60])
-            for damaged in damage_panorama(rgb, others[number % len(others)], rng):
-                options: dict[str, Any] = {} if damaged.is_masked is None else {"mask": damaged.is_masked}
-                true_pose = query.pose if damaged.has_answer else None
+            other = np.asarray(cv2.resize(others[number % len(others)], rgb.shape[1::-1]), np.uint8)
+            taken = Trial("as taken", rgb, query.pose)
+            elsewhere = Trial("another place", other, None)
+            for trial in (taken, *damage_trial(taken, other, rng), elsewhere):
                 name = f"{scene.name}/{query.image.name}"
-                self.add(DAMAGE, damaged.name, name, true_pose, scan.localize(damaged.rgb, **options))
+                result = scan.localize(trial.rgb, mask=trial.is_masked)
+                self.add(DAMAGE, trial.case, name, trial.true_pose, result)
         cloud = read_cloud(scene.cloud)
         points: Points = (cloud.points + cloud.origin_world, cloud.colors)
         for label, change in DAMAGED_SCANS.items():
