@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -13,6 +14,12 @@ PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_poi
 def command_of(script, *words):
     """The command line of a script of the checkout."""
     return [sys.executable, str(ROOT / script), *map(str, words)]
+
+
+def main_of(script):
+    """The `main` of a script of the checkout, to run in this process."""
+    text = (ROOT / script).read_text().splitlines()[-1]
+    return import_module(re.search(r'"(.+)"', text)[1]).main
 
 
 def start_localize(words, **options):

@@ -1,0 +1,200 @@
+"""Measure the status on seeded queries with and without an answer: how often each is called localized."""
+
+import argparse
+import json
+from collections.abc import Iterator, Sequence
+from itertools import chain
+
+import numpy as np
+
+from piccolo.cli.command import option
+from piccolo.cli.errors import print_note
+from piccolo.cloud import read_cloud
+from piccolo.cloud.stream import stream_of_arrays
+from piccolo.confidence.localization import Localization
+from piccolo.geometry.pose import Pose, is_correct
+from piccolo.jobs.stopwatch import Stopwatch
+from piccolo.jobs.threads import Workers, num_cores
+from piccolo.localization.localize import localize
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.panorama import ReadOptions, read_panorama, read_photo
+from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scene import Scene, read_scene
+
+from ..synthetic.photos import change_sensor, cut_photo, occlude
+from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
+from ..synthetic.room import PLAIN
+from ..synthetic.world import VARIANTS, World, make_query, make_world, scan_world
+from .calibration import Case, print_cases
+from .trials import Points, Trial, damage_trial, make_sceneless, thin_points, turn_over
+
+EPILOG = """\
+example:
+  python tools/benchmark.py confidence --seeds 0 0 --scenes BENCH/house BENCH/hospital --out bench.jsonl
+
+A seed makes rooms, and places that look the same from several positions. Scenes are folders with cloud.ply,
+queries.json and images; each panorama is localized in each cloud. With --photos, photos of 55 to 90 degrees
+are cut out of the panoramas, processed as by other cameras, and localized in their place. A false answer is
+a pose with the status localized that is more than 0.1 m or 5 degrees off. Writes the trials as JSON lines
+for tools/benchmark.py calibration, and prints a table.
+"""
+WIDTH = 1024  # of the panoramas [px]
+POINTS_PER_ROOM = 120_000
+PHOTO_FOVS_DEG = 55.0, 90.0  # of phone photos
+
+
+def remove_texture(world: World) -> World:
+    """Return the rooms with every surface in one colour."""
+    plain = [(room, room.materials.copy()) for room in world.rooms]
+    for _, materials in plain:
+        materials[:, 0] = PLAIN
+    return world._replace(rooms=tuple(room._replace(materials=m) for room, m in plain))
+
+
+def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
+    """Yield clouds of one to three rooms, whole, thinned and cut down, each with its trials."""
+    rng = np.random.default_rng([seed, 50])
+    size = rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])  # [m] from a box room to a hall
+    world = make_world(seed, size, int(rng.integers(1, 4)))
+    other = make_world(seed + 100_000, size, 1)  # of the same shape
+    if seed % 3 == 2:  # a third of the rooms
+        world = remove_texture(world)
+        other = remove_texture(other)
+    cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
+    right = [_make_trial(world, variant, variant, workers) for variant in VARIANTS]
+    elsewhere = [_make_trial(other, "elsewhere", variant, workers) for variant in ("clean", "photo")]
+    trials = [*right, *(trial._replace(true_pose=None) for trial in elsewhere)]
+    trials += make_sceneless(right[0], rng)
+    trials.append(turn_over(right[0]))
+    another = _make_trial(other, "another place", "clean", workers, 1)._replace(true_pose=None)
+    for trial in (right[0], another):
+        damaged = damage_trial(trial, _make_trial(other, "", "clean", workers, 2).rgb, rng)
+        trials += [one._replace(case=f"{trial.case}, {one.case}") for one in damaged]
+    yield cloud, trials
+    thin = [right[0]._replace(case="sparse"), trials[4]._replace(case="sparse, elsewhere")]
+    yield thin_points(cloud, rng), thin
+    wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + 0.15)
+    yield (cloud[0][wall], cloud[1][wall]), [r._replace(case="one wall") for r in right[:2]]
+
+
+def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
+    """Yield places alike to a degree: photos of them, one half hidden, and one of another such place."""
+    for kind in kinds:
+        rng = np.random.default_rng([seed, 53, ALIKE_KINDS.index(kind)])
+        elsewhere = World(seed, make_alike(kind, seed + 100_000, 0.2))
+        for changed in CHANGED:
+            world = World(seed, make_alike(kind, seed, changed))
+            cloud = scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
+            case = f"{kind}, {changed:.0%} changed"
+            trials = [_make_trial(world, case, "clean", workers, index) for index in range(4)]
+            another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)
+            another = another._replace(true_pose=None)
+            hidden = occlude(trials[0].rgb, another.rgb, 0.3, rng)
+            trials += [trials[0]._replace(case=f"{case}, hidden 30%", rgb=hidden), another]
+            yield cloud, trials
+
+
+def _make_trial(world: World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
+    query = make_query(world, index, variant, WIDTH, workers)
+    return Trial(case, query.rgb, query.pose)
+
+
+def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points, list[Trial]]]:
+    """Try every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
+    cloud = read_cloud(scene.cloud)
+    rng = np.random.default_rng([len(scene.queries), 52])
+    own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
+    upright = [trial for trial in own if trial.case == "clean"]
+    spoilt = [spoilt for trial in upright[:2] for spoilt in make_sceneless(trial, rng)]
+    foreign = [query.image for other in others for query in other.queries]
+    elsewhere = [Trial("elsewhere", read_panorama(image).rgb, None) for image in foreign]
+    points = (cloud.points + cloud.origin_world, cloud.colors)
+    yield points, [*own, *elsewhere, *spoilt, *map(turn_over, upright)]
+    yield thin_points(points, rng), [trial._replace(case="sparse") for trial in upright]
+
+
+def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator[tuple[Points, list[Trial]]]:
+    """Cut `number` photos out of each panorama of every scene, and try them in one scene's cloud."""
+    cloud = read_cloud(scene.cloud)
+    rng = np.random.default_rng([len(scene.queries), 54])
+    trials = []
+    for one in (scene, *others):
+        for query in (query for query in one.queries for _ in range(number)):
+            fov_deg = rng.uniform(*PHOTO_FOVS_DEG)
+            photo = cut_photo(read_panorama(query.image).rgb, query.pose, fov_deg, rng)
+            case = f"{fov_deg // 10:.0f}0 deg" if one is scene else "elsewhere"
+            true_pose = photo.pose if one is scene else None
+            rgb = change_sensor(photo.rgb, rng)
+            trials.append(Trial(case, rgb, true_pose, focal_px=photo.focal_px))
+    yield (cloud.points + cloud.origin_world, cloud.colors), trials
+
+
+def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
+    """Yield the name of a scene, its points, its trials."""
+    for seed in range(*arguments.seeds):
+        alike = alike_trials(seed, arguments.kinds, workers)
+        for points, trials in chain(room_trials(seed, workers), alike):
+            yield f"seed {seed}", points, trials
+    scenes = [read_scene(folder) for folder in arguments.scenes]
+    for scene in scenes:
+        others = [other for other in scenes if other is not scene]
+        number = arguments.photos
+        of_scene = photo_trials(scene, others, number) if number else scene_trials(scene, others)
+        for points, trials in of_scene:
+            yield scene.name, points, trials
+
+
+def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
+    """Return what tools/benchmark.py calibration reads of a trial."""
+    poses = [found.pose, *(a.pose for a in found.alternatives)] if found.pose else []
+    others = (alternative.probability for alternative in found.alternatives)
+    probabilities = [found.confidence, *others, found.probability_none]
+    return {
+        "case": trial.case,
+        "scene": scene,
+        "truth": trial.true_pose and pose_json(trial.true_pose),
+        "status": found.status,
+        "probabilities": probabilities,
+        "poses": [pose_json(pose) for pose in poses],
+        "standings": [list(standing) for standing in found.standings],
+        "covariance": found.covariance and found.covariance.matrix.tolist(),
+        "std_of_fit": found.std_of_fit,
+    }
+
+
+def pose_json(pose: Pose) -> dict[str, object]:
+    """Return a pose as JSON has it."""
+    return {name: array.tolist() for name, array in vars(pose).items()}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add all options."""
+    option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", required=True)
+    text = "kinds of places that look alike"
+    option(parser, "--kinds KIND ...", text, choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
+    option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
+    option(parser, "--photos N", "cut so many photos out of each panorama of the scenes", default=0)
+    option(parser, "--ignore-colors", "localize by the shape of the scans alone")
+    option(parser, "--out FILE", "write a JSON line per trial", required=True)
+    option(parser, "--threads N", "number of threads", default=num_cores())
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Localize every trial, write its line, print the table."""
+    workers = Workers(arguments.threads)
+    rows: list[Case] = []
+    with arguments.out.open("w") as file:
+        for scene, (points, colors), trials in all_trials(arguments, workers):
+            cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
+            scan_map = prepare_map(cloud, workers, has_features=False)
+            for trial in trials:
+                settings = CoarseToFineSettings(gravity=trial.gravity)
+                photo = read_photo(trial.rgb, ReadOptions(focal_px=trial.focal_px), trial.is_masked)
+                found = localize(scan_map, photo, settings, workers, Stopwatch())
+                truth = trial.true_pose
+                ok = truth is not None and is_correct(found.pose, truth)
+                rows.append((trial.case, found.status, ok))
+                file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
+                file.flush()
+                print_note(arguments, f"{scene}: {trial.case}: {found.status}, {'right' if ok else 'wrong'}")
+    return 1 if print_cases("case", rows) else 0
