@@ -101,7 +101,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
-    mirror = tilted.mirrored()
+    mirror = tilted.mirror()
     other = _query(_turned_over(panorama))
     for own, expected in zip(mirror.photo.images, other.photo.images, strict=True):
         levels = (image().rgbx.view(np.uint8).astype(int) for image in (own, expected))
@@ -109,7 +109,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     np.testing.assert_array_equal(mirror.photo.small.rgbx, other.photo.small.rgbx)
     np.testing.assert_array_equal(mirror.photo.panorama.is_valid, other.photo.panorama.is_valid)
     R = exp_so3(np.array([0.1, -0.2, 0.3]))
-    (turned,) = tilted.with_rotations(R[None]).mirrored().rotations
+    (turned,) = tilted.with_rotations(R[None]).mirror().rotations
     np.testing.assert_allclose(turned, ACROSS @ R @ ACROSS)
     assert mirror.settings.prior == Prior()
     d = np.array([0.6, -0.2, 0.77])
@@ -128,7 +128,7 @@ def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = asked.mirrored()
+    mirror = asked.mirror()
     own, other = (beam.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
 

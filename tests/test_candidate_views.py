@@ -160,7 +160,7 @@ def test_views_and_points_count_from_their_place():
 def test_points_depend_on_what_the_photo_shows(shift):
     query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
     height, width = query.photo.panorama.is_valid.shape
-    half = query.masked(np.arange(width)[None] < np.full((height, 1), width // 2))
+    half = query.mask(np.arange(width)[None] < np.full((height, 1), width // 2))
     assert half.cache.views is query.cache.views
     some, every = (asked.view_at(pose, "points") for asked in (half, query))
     assert 0.3 < len(some.weights) / len(every.weights) <= 1.01

@@ -13,7 +13,6 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
-from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.stopwatch import Stopwatch

@@ -210,7 +210,7 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
     whole, pose = _query(1), at(0.0, 0.0, 70.0).pose
     is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
-    narrow = whole.masked(is_hidden)
+    narrow = whole.mask(is_hidden)
     grid = make_grid(METHOD.full_view.num_rings)
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
     shown = narrow.photo.find_shown_cells(METHOD.full_view.num_rings, pose)

@@ -180,7 +180,7 @@ def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
         (None, "level"),
         (GPano(pitch_deg=12.0), "known"),
     ):
-        narrow = _query(gpano).masked(~is_left & np.ones((512, 1), bool))
+        narrow = _query(gpano).mask(~is_left & np.ones((512, 1), bool))
         assert narrow.photo.is_partial
         assert narrow.photo.has_tilt == (gpano is not None)
         searched = [
@@ -196,7 +196,7 @@ def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
 def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
     """With the means subtracted; nearer in angle than those of a whole photo, and near the true pose."""
     true_pose = rooms.scene(1)[2]
-    narrow = _query().masked(mask_outside_field(512, 90.0, 0.5))
+    narrow = _query().mask(mask_outside_field(512, 90.0, 0.5))
     starts = search.search_poses(narrow, "level")
     near = [
         np.linalg.norm(center - true_pose.center_world) < 0.8

@@ -209,7 +209,7 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid(monkeypatch):
     assert matches_near(query, Pose(middle.R_cam_from_world, middle.center_world + 0.6 * PLACE)) == 2
     turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * TURN, 0.0]))
     assert matches_near(query, Pose(turned, middle.center_world)) == 3
-    masked = query.masked(np.zeros((8, 16), bool))
+    masked = query.mask(np.zeros((8, 16), bool))
     assert matches_near(masked, middle) == 4
     assert matches_near(query, middle) == 1
 

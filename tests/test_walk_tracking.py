@@ -13,10 +13,11 @@ from piccolo.jobs.threads import Workers
 from piccolo.localization import ladder, near, verification
 from piccolo.localization.attempts import CHANCE_MATCHES
 from piccolo.localization.beam import brief_query, score_briefly, score_mirror
-from piccolo.localization.comparison import score_pose
+from piccolo.localization.comparison import Comparison, score_pose
 from piccolo.localization.near import Near
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
@@ -225,7 +226,10 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
 def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, odds, score, is_found):
     query, true = seen
     probability = 1.0 / (1.0 + np.exp(-odds))
-    monkeypatch.setattr(tracker, "refine_near", lambda query, start: Near(start, score, None, probability))
+    seen_there = Comparison(np.array([CHANCE + (1.0 - CHANCE) * score]), np.ones(1), np.ones(1), 1.0)
+    monkeypatch.setattr(
+        tracker, "refine_near", lambda query, start: Near(start, seen_there, None, probability)
+    )
     assert (track(query, true) is not None) == is_found
 
 

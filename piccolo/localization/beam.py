@@ -147,7 +147,7 @@ def score_briefly(query: Query) -> float:
 
 def score_mirror(query: Query) -> float:
     """Return the best score of a brief search with the photo mirrored."""
-    return score_briefly(brief_query(query.mirrored(), NUM_SCORED))
+    return score_briefly(brief_query(query.mirror(), NUM_SCORED))
 
 
 def score_near(query: Query, pose: Pose) -> float:

@@ -250,7 +250,7 @@ def mask_occluders(query: Query, seen: Comparison) -> Query:
         return query
     key = seen.contradicts.tobytes()
     if key not in query.cache.masked:
-        query.cache.masked[key] = query.masked(seen.contradicts[pixel_blocks()])
+        query.cache.masked[key] = query.mask(seen.contradicts[pixel_blocks()])
     return query.cache.masked[key]
 
 

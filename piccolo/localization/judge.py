@@ -285,4 +285,4 @@ def is_mirrored(query: Query, best: Hypothesis) -> bool:
     num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
     if not found or found[0].num_matches <= num_matches:
         return False
-    return refine_matches(query.mirrored(), [found[0].pose])[0].score > MIRROR_RATIO * best.score
+    return refine_matches(query.mirror(), [found[0].pose])[0].score > MIRROR_RATIO * best.score

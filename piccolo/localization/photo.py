@@ -73,14 +73,14 @@ class Photo:
         rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
         return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
 
-    def masked(self, is_hidden: NDArray[np.bool_]) -> "Photo":
+    def mask(self, is_hidden: NDArray[np.bool_]) -> "Photo":
         """Return the photo without pixels (h, 2 h), the rest normalised again."""
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
         return self._remake(rest)
 
-    def mirrored(self) -> "Photo":
+    def mirror(self) -> "Photo":
         """Return the photo mirrored left to right."""
         rgb = self.panorama.rgb[:, ::-1]
         panorama = replace(self.panorama, rgb=rgb, is_valid=self.panorama.is_valid[:, ::-1])

@@ -105,16 +105,16 @@ class Query:
         colors = Once(partial(make_texels, self.given))
         return replace(self, photo=self.photo.forget(), colors=colors, cache=Cache(make_views(self.scan_map)))
 
-    def masked(self, is_hidden: NDArray[np.bool_]) -> "Query":
+    def mask(self, is_hidden: NDArray[np.bool_]) -> "Query":
         """Return the query of the photo without pixels (h, 2 h)."""
-        return replace(self, photo=self.photo.masked(is_hidden), cache=Cache(self.cache.views))
+        return replace(self, photo=self.photo.mask(is_hidden), cache=Cache(self.cache.views))
 
-    def mirrored(self) -> "Query":
+    def mirror(self) -> "Query":
         """Return the query by whole views of the mirrored photo, without the prior's heading."""
         prior = replace(self.settings.prior, heading_deg=None)
         return replace(
             self.by_views(),
-            photo=self.photo.mirrored(),
+            photo=self.photo.mirror(),
             settings=replace(self.settings, prior=prior),
             beside=(),
         ).with_rotations(None if self.rotations is None else ACROSS @ self.rotations @ ACROSS)

@@ -28,13 +28,12 @@ def is_explained(found: Selection, searched: Query) -> bool:
     return found.best.score > CLEAR_SHAPE and is_alone
 
 
-def align_lines(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) -> Array | None:
+def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_level: Array) -> Array | None:
     """Return the rotations (4, 3, 3), camera from map, that put level lines of a photo along the walls.
 
-    The axes (3,) are those of the photo's lines, the yaw is `ScanMap.yaw_of_walls`. None if the lines or the
-    scan have no such directions.
+    The yaw is `ScanMap.yaw_of_walls`, the axes (3,) are those of the photo's lines, R_cam_from_level (3, 3)
+    is its tilt. None if the lines or the scan have no such directions.
     """
-    R_cam_from_level = query.photo.R_cam_from_level
     level = np.array([axis @ R_cam_from_level for axis in axes]).reshape(-1, 3)
     level = level[np.abs(level[:, 2]) < LEVEL_SINE]
     if yaw_of_walls is None or len(level) != 4:
@@ -46,7 +45,7 @@ def align_lines(query: Query, axes: Sequence[Array], yaw_of_walls: float | None)
 def align_level(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) -> Query:
     """Return the query at the camera's tilt: level unless the photo or the settings say another."""
     known = replace(query, settings=replace(query.settings, gravity="known"))
-    return known.with_rotations(align_lines(query, axes, yaw_of_walls))
+    return known.with_rotations(align_lines(yaw_of_walls, axes, query.photo.R_cam_from_level))
 
 
 def find_tilts(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) -> list[Query]:
