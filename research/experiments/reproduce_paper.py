@@ -29,7 +29,7 @@ from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
-from piccolo.geometry.pose import Array, Pose
+from piccolo.geometry.pose import Array, Pose, move, transform_points
 from piccolo.geometry.rotations import random_rotation
 from piccolo.jobs.memory import limit_memory
 from piccolo.localization.settings import CoarseToFineSettings
@@ -38,7 +38,6 @@ from piccolo.paper.settings import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy
 from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
-from ..datasets.model import RigidTransform
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, summarize
@@ -67,9 +66,10 @@ def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | No
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """Return the cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
     cloud = read_cloud(scene.cloud, IN_COLORS)
-    turn = RigidTransform(random_rotation(_rng(scene)), np.zeros(3))
-    points = turn.of_points(cloud.points.astype(np.float64) + cloud.origin_world)
-    queries = tuple(replace(query, pose=turn.of_pose(query.pose)) for query in scene.queries)
+    T = np.eye(4)
+    T[:3, :3] = random_rotation(_rng(scene))
+    points = transform_points(cloud.points.astype(np.float64) + cloud.origin_world, T)
+    queries = tuple(replace(query, pose=move(query.pose, T, 1.0)) for query in scene.queries)
     return replace(scene, cloud=_write_cloud(folder, points, cloud.colors), queries=queries)
 
 

@@ -187,7 +187,8 @@ def run(arguments: argparse.Namespace) -> int:
         called = [classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
         print_cases(f"case, {name}", rows)
-        each = np.concatenate(stated).tolist(), np.concatenate(right).tolist()
-        print(reliability_table(f"probability, {name}", *each, TENTHS).markdown())
+        all_stated = np.concatenate(stated).tolist()
+        table = reliability_table(f"probability, {name}", all_stated, np.concatenate(right).tolist(), TENTHS)
+        print(table.markdown())
         print_coverage(f"covariance, {name}", outcomes)
     return 0
