@@ -49,7 +49,7 @@ def array_of(where: str, value: object, wanted: str, *shapes: tuple[int, ...]) -
     try:
         array = np.array(value, np.float64)
     except (OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"{where}: found {error}, {wanted}") from error
+        raise InputError(f"{where}: found {error!r}, {wanted}") from error
     if array.shape not in shapes:
         raise InputError(f"{where}: found the shape {array.shape}, {wanted}")
     return array
