@@ -137,7 +137,7 @@ def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
     for text, message in (
         (
             '{"camera_location": [1, 2], "final_camera_rotation": [0, 0, 0]}',
-            "camera_location has the shape (2,)",
+            "camera_location: found the shape (2,)",
         ),
         ('{"camera_location": [0, 0, "x"], "final_camera_rotation": [0, 0, 0]}', "found ValueError"),
         ("[]", "wanted JSON with camera_location"),

@@ -18,13 +18,12 @@ from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from piccolo.opened_scan import OpenedScan
 from piccolo.result import Result
-from piccolo.scene import Query, Scene
+from piccolo.scene import Query, Scene, document_of_pose, pose_of
 
 FORMAT = "piccolo-evaluation/2"
 WANTED = "wanted a run of tools/evaluate.py"
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 MAX_DIFFERENCE = 1e-6  # [m], [rad] between the same poses
-POSE = ("R_cam_from_world", "center_world")  # as JSON has it
 VIDEO_FRAME = re.compile(r"(.+)#t=(\d+\.\d+)")
 MAX_TIME_DIFFERENCE = 2e-3  # [s] of a video's frame from a walk's
 
@@ -101,7 +100,7 @@ class QueryResult:
         line: dict[str, object] = {"format": FORMAT, **{name: getattr(self, name) for name in names}}
         line["position_error"] = self.position_error if self.has_errors else None
         line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if self.has_errors else None
-        line["true_pose"] = self.true_pose and {k: v.tolist() for k, v in vars(self.true_pose).items()}
+        line["true_pose"] = self.true_pose and document_of_pose(self.true_pose)
         line["result"] = json.loads(self.result.to_json())
         return json.dumps(line, allow_nan=False)
 
@@ -109,8 +108,7 @@ class QueryResult:
     def from_json(cls, text: str) -> "QueryResult":
         """Read back what `to_json` wrote; any other text is an InputError."""
         with document_of(text, FORMAT, "evaluation") as row:
-            pose = row["true_pose"]
-            true_pose = None if pose is None else Pose(*(np.array(pose[name], float) for name in POSE))
+            true_pose = None if row["true_pose"] is None else pose_of(row["true_pose"])
             scene = str(row["scene"])
             image = str(row["image"])
             variant = str(row["variant"])

@@ -11,7 +11,6 @@ import argparse
 import json
 import math
 import time
-from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +38,8 @@ from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
 from piccolo.scene import read_scene
 from piccolo.views.zbuffer import is_free_space, visible_points
+
+from ..evaluation.plots import figure_png
 
 POOL_PER_POINT = 8  # points of which visible ones are taken, for one that is used
 FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space
@@ -153,9 +154,7 @@ def surface_png(
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title=title)
     axes.legend(loc="upper right")
     figure.colorbar(mesh, ax=axes, label="least sampling loss over height and rotation", shrink=0.8)
-    file = BytesIO()
-    figure.savefig(file, format="png", dpi=120)
-    return file.getvalue()
+    return figure_png(figure)
 
 
 EPILOG = """\

@@ -28,8 +28,9 @@ from piccolo.confidence.confidence import (
 )
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
-from piccolo.geometry.pose import Pose, is_correct
+from piccolo.geometry.pose import is_correct
 from piccolo.geometry.pose_gaussian import subtract
+from piccolo.scene import pose_of
 
 from ..evaluation.tables import Table, reliability_table
 
@@ -79,7 +80,7 @@ class Outcome(NamedTuple):
 def read_outcome(line: str) -> Outcome | None:
     """Read a line of tools/benchmark.py confidence; None if no pose was found."""
     trial = json.loads(line)
-    poses = [read_pose(pose) for pose in trial["poses"]]
+    poses = [pose_of(pose) for pose in trial["poses"]]
     if not poses:
         return None
     standings = [Standing(*standing) for standing in trial["standings"]]
@@ -88,16 +89,11 @@ def read_outcome(line: str) -> Outcome | None:
     error = np.full(6, np.nan)
     right = len(poses)
     if trial["truth"] is not None:
-        true_pose = read_pose(trial["truth"])
+        true_pose = pose_of(trial["truth"])
         error = subtract(true_pose, poses[0])
         right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
     is_refused = trial["probabilities"][-1] == 1.0
     return Outcome(str(trial["case"]), standings, covariance, trial["std_of_fit"], right, is_refused, error)
-
-
-def read_pose(document: dict[str, list[float]]) -> Pose:
-    """Read a pose that tools/benchmark.py confidence wrote."""
-    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
 
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
@@ -188,7 +184,8 @@ def run(arguments: argparse.Namespace) -> int:
         called = [classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
         print_cases(f"case, {name}", rows)
-        each = np.concatenate(stated).tolist(), np.concatenate(right).tolist()
-        print(reliability_table(f"probability, {name}", *each, TENTHS).markdown())
+        all_stated = np.concatenate(stated).tolist()
+        table = reliability_table(f"probability, {name}", all_stated, np.concatenate(right).tolist(), TENTHS)
+        print(table.markdown())
         print_coverage(f"covariance, {name}", outcomes)
     return 0

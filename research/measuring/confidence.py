@@ -12,14 +12,14 @@ from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization
-from piccolo.geometry.pose import Pose, is_correct
+from piccolo.geometry.pose import is_correct
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, read_panorama, read_photo
 from piccolo.scan_map.scan_map import prepare_map
-from piccolo.scene import Scene, read_scene
+from piccolo.scene import Scene, document_of_pose, read_scene
 
 from ..synthetic.photos import change_sensor, cut_photo, occlude
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
@@ -152,19 +152,14 @@ def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, objec
     return {
         "case": trial.case,
         "scene": scene,
-        "truth": trial.true_pose and pose_json(trial.true_pose),
+        "truth": trial.true_pose and document_of_pose(trial.true_pose),
         "status": found.status,
         "probabilities": probabilities,
-        "poses": [pose_json(pose) for pose in poses],
+        "poses": list(map(document_of_pose, poses)),
         "standings": [list(standing) for standing in found.standings],
         "covariance": found.covariance and found.covariance.matrix.tolist(),
         "std_of_fit": found.std_of_fit,
     }
-
-
-def pose_json(pose: Pose) -> dict[str, object]:
-    """Return a pose as JSON has it."""
-    return {name: array.tolist() for name, array in vars(pose).items()}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
