@@ -40,7 +40,7 @@ from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
-from ..evaluation.tables import Table, summarize
+from ..evaluation.tables import statistics, table_of
 from ..synthetic.photos import UPSIDE_DOWN
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
@@ -230,27 +230,14 @@ EXPERIMENTS = {
 }
 
 
-def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> Table:
-    """Return a line a condition, the paper's figure at its end."""
-    lines = [_cells(condition, rows) for condition, rows in found]
-    return Table(title, tuple(lines[0]), tuple(tuple(line.values()) for line in lines), 2)
-
-
-def _cells(condition: Condition, rows: Sequence[QueryResult]) -> dict[str, str]:
-    summary = summarize(rows)
-    of_correct = [row.position_error for row in rows if row.is_correct()] or [np.nan]
+def cells(condition: Condition, rows: Sequence[QueryResult]) -> dict[str, str]:
+    """Return the line of a condition by its columns, the paper's figure at its end."""
     seconds = {s: [row.result.seconds.get(s, 0.0) for row in rows] for s in ("search", "refine")}
     return {
         "": condition.name,
         "preset": condition.preset,
-        "queries": f"{summary.num_queries}",
-        "accuracy": f"{summary.accuracy:.3f}",
-        "t 50 % [m]": f"{summary.position_quartiles[1]:.4f}",
-        "t of correct [m]": f"{np.median(of_correct):.4f}",
-        "R 50 % [deg]": f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
+        **statistics(rows),
         **{f"{stage} s": f"{np.median(values):.2f}" for stage, values in seconds.items()},
-        "localized": f"{summary.num_localized}",
-        "wrong of these": f"{summary.num_wrong}",
         "the paper": condition.paper,
     }
 
@@ -338,7 +325,7 @@ def run_experiment(
         raise InputError(f"{name}: no query could be localized; check --scenes and --variants")
     num_scenes = len({row.scene for _, rows in found for row in rows})
     title = f"{experiment.title}: {experiment.note}; {num_scenes} scenes"
-    text = table(title, found).markdown()
+    text = table_of([cells(*one) for one in found], title, num_left=2).markdown()
     print(text, flush=True)
     write_atomically(page, text.encode())
     return num_failed
