@@ -61,10 +61,7 @@ def find_calibration(given: Calibration | Path | None, pano: Path) -> Calibratio
 
 
 def read_cameras(path: Path) -> Calibration:
-    """Return the cameras in a file, told by its content.
-
-    Raises InputError if it can't be read, is of no format known, or holds what is no camera.
-    """
+    """Return the cameras in a file, told by its content; InputError if it holds none."""
     text = read_text(path, WANTED, MAX_SIZE)
     with _naming(path, WANTED):
         if text.lstrip()[:1] in ("{", "["):

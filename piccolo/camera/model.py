@@ -254,10 +254,7 @@ class Camera:
         return self.scale_to_size(width, max(1, round(width * self.height / self.width)))
 
     def pixels(self, rays: Array) -> tuple[Array, Mask]:
-        """Pixels (..., 2) that rays (..., 3) of any length come to, and which are in the picture (...).
-
-        Pixels of rays that are not in the picture mean nothing.
-        """
+        """Return pixels (..., 2) of rays (..., 3) of any length, and which are in the picture (...)."""
         if self.lens == SPHERE:
             u, v = compute_pixels(rays, self.width)
             return np.stack([u, v * (2.0 * self.height / self.width)], axis=-1), np.ones(u.shape, np.bool_)

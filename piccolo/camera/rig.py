@@ -91,10 +91,7 @@ class Calibration:
         return float(np.linalg.norm([mount.center_cam for mount in self.mounts], axis=1).max())
 
     def for_picture(self, width: int, height: int) -> tuple[Mount, ...]:
-        """Return the cameras of one picture of this size [px].
-
-        Raises InputError if none fits, or several of a choice do.
-        """
+        """Return the cameras of a picture of this size [px]; InputError if none fits, or several do."""
         if not self.is_choice:
             return self._scale(width, height)
         sizes = {(m.camera.width, m.camera.height) for m in self.mounts}

@@ -274,10 +274,7 @@ def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> 
 
 
 def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
-    """Return True if a place [deg], (x, y) [m] in the system, is in its area with a margin.
-
-    Some cross 180 E.
-    """
+    """Return True if a place [deg], (x, y) [m], is in an area, which may cross 180 E, with a margin."""
     margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
     width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
     is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin

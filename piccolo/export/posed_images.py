@@ -95,10 +95,7 @@ def true_results(scene: Scene) -> list[Result]:
 
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:
-    """Return the results with a pose that are localized, or all with a pose.
-
-    Those of `clouds` only, if given.
-    """
+    """Return the results, of `clouds` only if given, that are localized, or all that have a pose."""
     known = {result.cloud_name for result in results}
     if missing := [cloud for cloud in clouds if cloud not in known]:
         wanted = ", ".join(sorted(known))
@@ -207,10 +204,7 @@ def _size(path: Path, options: Options) -> tuple[int, int]:
 
 
 def _name(pano: Path, images: Path | None) -> str:
-    """Return the picture's name in the folder of images, with slashes.
-
-    As given if there is no such folder.
-    """
+    """Return the picture's name, with slashes, in the folder of images if there is one."""
     if images is None:
         return pano.as_posix()
     name = Path(os.path.relpath(pano, images))

@@ -93,10 +93,7 @@ def own_names(ending: str) -> re.Pattern[str]:
 
 
 def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:
-    """Return a folder for files of ours, made and marked if it is new.
-
-    Stale files of a marked one are deleted.
-    """
+    """Return a folder of our files, made and marked if it is new; in a marked one stale ones are deleted."""
     folder.mkdir(mode, parents=True, exist_ok=True)
     tag = folder / TAG
     if not any(folder.iterdir()):
@@ -108,10 +105,7 @@ def own_folder(folder: Path, name: re.Pattern[str], mode: int = ALL) -> Path:
 
 @cache
 def private_folder(name: str, files: re.Pattern[str]) -> Path | None:
-    """Return a folder of the user's cache that nobody else can write to, made now.
-
-    None where that can't be.
-    """
+    """Return a folder of the cache, made now, that nobody else can write to; None where that can't be."""
     with suppress(OSError):
         folder = own_folder(cache_root() / name, files, PRIVATE)
         return folder if is_own(folder.stat(), WRITABLE) else None

@@ -20,10 +20,7 @@ _held: ContextVar[dict[Path, bytes] | None] = ContextVar("held", default=None)  
 
 
 def read_bytes(path: Path, wanted: str, max_size: float = math.inf) -> bytes:
-    """Return the content of a file of at most `max_size` bytes.
-
-    `wanted` says in an error what it should hold.
-    """
+    """Return a file's content, at most `max_size` bytes; `wanted` says in an error what it should hold."""
     held = _held.get()
     if held is not None and path in held:
         return held[path]

@@ -256,10 +256,7 @@ def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
 
 
 def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:
-    """Return a pose of the source in the target's coordinates.
-
-    T (4, 4) is rigid, its translation in units of `metres_per_unit`.
-    """
+    """Return a pose of the source in the target's coordinates; T (4, 4) is rigid, in `metres_per_unit`."""
     R = T_target_from_source[:3, :3]
     center = R @ pose.center_world + T_target_from_source[:3, 3] * metres_per_unit
     return Pose(orthonormal(pose.R_cam_from_world @ R.T), center)

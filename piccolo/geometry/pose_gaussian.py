@@ -83,10 +83,7 @@ def std_of(found: PoseGaussian | None) -> float | None:
 
 
 def probability_within(std: float | None, distance: float = MAX_DISTANCE) -> float:
-    """Return the probability that a position is within a distance [m] of the truth, by its deviation [m].
-
-    It is 1 where no deviation is known.
-    """
+    """Return the probability that an error is within a distance [m], by its deviation [m]; 1 for None."""
     return 1.0 if std is None else math.erf(distance / (max(std, 1e-9) * math.sqrt(2.0)))
 
 

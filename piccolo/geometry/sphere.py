@@ -57,10 +57,7 @@ def atan2(y: Scalar, x: Scalar) -> Scalar:
 
 @inline_kernel
 def direction_to_pixel(x: Scalar, y: Scalar, z: Scalar, rho: Scalar, width: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the continuous pixel (u, v) of a camera direction (x, y, z) in an image of `width`.
-
-    rho is hypot(x, y).
-    """
+    """Return the pixel (u, v) of a direction (x, y, z), rho = hypot(x, y), in an image of `width`."""
     scale = width / (PI + PI)
     u = HALF * width - scale * atan2(y, x)
     v = HALF * HALF * width - scale * atan2(z, rho)

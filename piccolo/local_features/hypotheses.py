@@ -102,10 +102,7 @@ descend_matches = kernel(levenberg_marquardt(angular_equations))
 
 @inline_kernel
 def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scalar:
-    """Return the cosine between a match's ray and its point seen from a pose.
-
-    -1 if that is less than `cos_rough`, or if size or tangent differ.
-    """
+    """Return the cosine from a match's ray to its point; -1 below `cos_rough` or if the keypoint differs."""
     ray = rotate(R, minus(row(m.points, j), t))
     length = math.sqrt(dot(ray, ray))
     cosine = dot(ray, m.rays[j]) / max(length, 1e-9)

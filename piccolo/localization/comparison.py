@@ -17,16 +17,7 @@ from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import (
-    CHUNK,
-    Texels,
-    bilinear_weights,
-    blend,
-    gather,
-    is_valid,
-    make_projected,
-    project,
-)
+from ..panorama.texels import CHUNK, Texels, make_projected, project, sample
 from ..views.points_around import round_position
 from ..views.view import ViewArrays, average_colors, cell_statistics, empty_cells, locate
 from .query import Query
@@ -86,13 +77,13 @@ def sample_photo(
 
     The camera's `center` (3,) [m] is relative to the point from which the offsets of the cells are measured.
     """
-    texels = photo.rgbx
-    width = photo.width
     p = make_projected()
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
-        project(offsets[0][lo:hi], offsets[1][lo:hi], offsets[2][lo:hi], R_cam_from_map, center, width, p)
-        gather(texels, width, p, hi - lo)
+        x = offsets[0][lo:hi]
+        y = offsets[1][lo:hi]
+        z = offsets[2][lo:hi]
+        project(x, y, z, R_cam_from_map, center, photo.rgbx, photo.width, p)
         count = hi - lo
         c0 = colors[0, lo:hi]
         c1 = colors[1, lo:hi]
@@ -100,13 +91,9 @@ def sample_photo(
         both = shared[lo:hi]
         weight = weights[lo:hi]
         for n in range(count):
-            bilinear = bilinear_weights(p.fu[n], p.fv[n])
-            t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
-            r = blend(t00, t10, t01, t11, bilinear, 0) * PER_LEVEL
-            g = blend(t00, t10, t01, t11, bilinear, 8) * PER_LEVEL
-            b = blend(t00, t10, t01, t11, bilinear, 16) * PER_LEVEL
-            c0[n], c1[n], c2[n] = opponent(r, g, b)
-            both[n] = weight[n] * is_valid(t00, t10, t01, t11)
+            r, g, b, shown = sample(p, n)
+            c0[n], c1[n], c2[n] = opponent(r * PER_LEVEL, g * PER_LEVEL, b * PER_LEVEL)
+            both[n] = weight[n] * shown
         copy_to(rays[0][lo:hi], p.x[:count])
         copy_to(rays[1][lo:hi], p.y[:count])
         copy_to(rays[2][lo:hi], p.z[:count])

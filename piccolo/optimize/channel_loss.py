@@ -13,16 +13,7 @@ from ..arrays import Array, Array32, Int32s, Int64s
 from ..geometry.sphere import BLOCK_RINGS, make_grid
 from ..kernels.jit import F1, HALF, Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import (
-    CHUNK,
-    bilinear_weights,
-    blend,
-    gather,
-    is_valid,
-    make_projected,
-    project,
-    texels_around,
-)
+from ..panorama.texels import CHUNK, make_projected, project, sample
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 
@@ -129,22 +120,23 @@ def correlate(
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
         part = slice(lo, hi)
-        project(points[0][part], points[1][part], points[2][part], R_cam_from_world, center_world, width, p)
-        gather(texels, width, p, hi - lo)
+        x = points[0][part]
+        y = points[1][part]
+        z = points[2][part]
+        project(x, y, z, R_cam_from_world, center_world, texels, width, p)
         f0 = channels[0][part]
         f1 = channels[1][part]
         f2 = channels[2][part]
         weight = weights[part]
         for n in range(hi - lo):
-            bilinear = bilinear_weights(p.fu[n], p.fv[n])
-            t00, t10, t01, t11 = texels_around(p, n)
+            b0, b1, b2, shown = sample(p, n)
             a0 = f0[n] - ZERO
             a1 = f1[n] - ZERO
             a2 = f2[n] - ZERO
-            b0 = blend(t00, t10, t01, t11, bilinear, 0) - ZERO
-            b1 = blend(t00, t10, t01, t11, bilinear, 8) - ZERO
-            b2 = blend(t00, t10, t01, t11, bilinear, 16) - ZERO
-            w = weight[n] * is_valid(t00, t10, t01, t11)
+            b0 -= ZERO
+            b1 -= ZERO
+            b2 -= ZERO
+            w = weight[n] * shown
             found[0, n] = w * (a0 * b0 + a1 * b1 + a2 * b2)
             found[1, n] = w * (a0 * a0 + a1 * a1 + a2 * a2)
             found[2, n] = w * (b0 * b0 + b1 * b1 + b2 * b2)

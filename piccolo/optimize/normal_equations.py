@@ -18,7 +18,6 @@ from ..panorama.texels import (
     CHUNK,
     Projected,
     blend_with_gradient,
-    gather,
     is_valid,
     make_projected,
     project,
@@ -152,8 +151,7 @@ def block_adder(
         X, Y, Z = xyz
         for lo in range(0, len(X), CHUNK):
             hi = min(lo + CHUNK, len(X))
-            project(X[lo:hi], Y[lo:hi], Z[lo:hi], R_cam_from_world, center_world, width, points)
-            gather(texels, width, points, hi - lo)
+            project(X[lo:hi], Y[lo:hi], Z[lo:hi], R_cam_from_world, center_world, texels, width, points)
             add_chunk(points, hi - lo, colors, lo, np.float32(width), scale, sums)
 
     return add_points

@@ -132,10 +132,7 @@ def descend_lbfgs(objective: Objective, start: Pose, num_iterations: int) -> Ref
 
 
 def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int) -> Refined:
-    """Take at most `num_iterations` Levenberg-Marquardt steps; return the best pose.
-
-    They minimise reweighted least squares.
-    """
+    """Minimise reweighted least squares in at most `num_iterations` steps; return the best pose."""
     best = Refined(start)
 
     def equations(_: None, R_cam_from_world: Array, center_world: Array, sums: Array) -> None:

@@ -25,7 +25,6 @@ from ..panorama.texels import (
     bilinear_weights,
     blend,
     channel,
-    gather,
     is_valid,
     make_projected,
     project,
@@ -39,36 +38,29 @@ BLOCK = 4096
 MIN_SHOWN_SHARE = 0.5
 HALF_LEVEL = np.float32(0.5)  # a residual below half an 8-bit level has the weight of half a level
 TO_UNIT = 1.0 / 255.0
+Points = tuple[Array32, Array32, Array32, Int32s]  # x, y, z [m] and packed colours (N,)
 
 
 @kernel
 def loss_blocks(
-    x: Array32,
-    y: Array32,
-    z: Array32,
-    rgbx: Int32s,
-    R_cam_from_world: Array,
-    center_world: Array,
-    texels: Int32s,
-    width: int,
-    first_block: int,
-    sums: Array,
+    points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, first_block: int, sums: Array
 ) -> None:
     """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
-    points = make_projected()
+    x, y, z, rgbx = points
+    p = make_projected()
     for block in range(len(sums)):
         begin = (first_block + block) * BLOCK
         end = min(len(x), begin + BLOCK)
         sums[block] = 0.0
         for lo in range(begin, end, CHUNK):
             hi = min(lo + CHUNK, end)
-            project(x[lo:hi], y[lo:hi], z[lo:hi], R_cam_from_world, center_world, width, points)
-            gather(texels, width, points, hi - lo)
+            part = slice(lo, hi)
+            project(x[part], y[part], z[part], R_cam_from_world, center_world, image.rgbx, image.width, p)
             colors = rgbx[lo:hi]
             total = count = F0
             for n in range(hi - lo):
-                weights = bilinear_weights(points.fu[n], points.fv[n])
-                t00, t10, t01, t11 = texels_around(points, n)
+                weights = bilinear_weights(p.fu[n], p.fv[n])
+                t00, t10, t01, t11 = texels_around(p, n)
                 c = colors[n]
                 dr = blend(t00, t10, t01, t11, weights, 0) - channel(c, 0)
                 dg = blend(t00, t10, t01, t11, weights, 8) - channel(c, 8)
@@ -102,25 +94,17 @@ add_packed = block_adder(read_packed, norm)
 
 @kernel
 def normal_blocks(
-    x: Array32,
-    y: Array32,
-    z: Array32,
-    rgbx: Int32s,
-    R_cam_from_world: Array,
-    center_world: Array,
-    texels: Int32s,
-    width: int,
-    first_block: int,
-    sums: Array,
+    points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, first_block: int, sums: Array
 ) -> None:
     """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum J^T J / norm."""
+    x, y, z, rgbx = points
     R, t = R_cam_from_world, center_world
     for block in range(len(sums)):
         lo = (first_block + block) * BLOCK
         part = slice(lo, min(len(x), lo + BLOCK))
         sums[block] = 0.0
         xyz = (x[part], y[part], z[part])
-        add_packed(xyz, rgbx[part], texels, width, R, t, HALF_LEVEL, sums[block])
+        add_packed(xyz, rgbx[part], image.rgbx, image.width, R, t, HALF_LEVEL, sums[block])
 
 
 def _sum_blocks(
@@ -135,8 +119,8 @@ def _sum_blocks(
 
     def run(part: int) -> None:
         lo, hi = bounds[part : part + 2]
-        R, t = pose.R_cam_from_world, pose.center_world
-        blocks(points.x, points.y, points.z, points.rgbx, R, t, texels.rgbx, texels.width, lo, sums[lo:hi])
+        arrays = points.x, points.y, points.z, points.rgbx
+        blocks(arrays, texels, pose.R_cam_from_world, pose.center_world, lo, sums[lo:hi])
 
     list(Workers(num_threads).map(run, range(num_threads), "blocks"))
     return np.asarray(sums.sum(axis=0))

@@ -94,10 +94,7 @@ def _pad_face(faces: Faces, letter: str) -> Bytes:
 
 
 def _sample_faces(faces: Faces, directions: Array32, rim: int) -> Bytes:
-    """Sample pixels (H, W, 4) along directions (H, W, 3), each from the face that it meets.
-
-    The faces have a rim of `rim` pixels.
-    """
+    """Sample pixels (H, W, 4) along directions (H, W, 3), each from its face, with a rim of `rim` pixels."""
     pixels = np.empty((*directions.shape[:2], 4), dtype=np.uint8)
     largest = np.abs(directions).max(axis=2)
     for letter, R in R_FACE_FROM_CAM.items():
@@ -135,10 +132,7 @@ def is_cube(folder: Path) -> bool:
 
 
 def face_paths(folder: Path) -> dict[str, Path]:
-    """Return the files of a folder's one complete cube, by the letters of their faces.
-
-    Files belong to one cube if the rest of their names is the same.
-    """
+    """Return a folder's one complete cube, by letters of faces; the rest of its files' names is the same."""
     try:
         files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
     except OSError as error:
@@ -208,10 +202,7 @@ def _cell(picture: Picture, size: int, row: int, column: int) -> Bytes:
 
 
 def _is_empty(pixels: Bytes) -> bool:
-    """Return True for a cell of one colour or of alpha 0 only.
-
-    A thin rim is ignored, as it may show a little of the neighbours.
-    """
+    """Return True for a cell that but for a thin rim, as neighbours show there, has one colour or alpha 0."""
     rim = max(len(pixels) // 32, 1)
     inner = pixels[rim:-rim, rim:-rim].reshape(-1, 4)
     is_constant = (inner.max(axis=0).astype(int) - inner.min(axis=0)).max() <= MAX_EMPTY_RANGE

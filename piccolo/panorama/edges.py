@@ -26,10 +26,7 @@ Pixel = TypeVar("Pixel", np.uint8, np.float32)
 
 
 def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> Panorama:
-    """Return a panorama of the edges of another, of WIDTH, taken with a camera of a known tilt (3, 3).
-
-    With the other's grey too, or without.
-    """
+    """Return a panorama, of WIDTH, of another's edges, with its grey or without, for a known tilt (3, 3)."""
     source = resize(panorama, WIDTH)
     across, down = gradients(source)
     strength = np.hypot(across, down)

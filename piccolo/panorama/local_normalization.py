@@ -12,17 +12,7 @@ from ..geometry.sphere import pixel_rays, solid_angles
 from ..geometry.vectors import row
 from ..kernels.jit import F0, F1, HALF, Scalar, copy_to, inline_kernel, kernel
 from . import Panorama
-from .texels import (
-    CHUNK,
-    Texels,
-    bilinear_weights,
-    blend,
-    gather,
-    is_valid,
-    make_projected,
-    project,
-    texels_around,
-)
+from .texels import CHUNK, Texels, make_projected, project, sample
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -50,10 +40,7 @@ def zscore(value: Scalar, mean: Scalar, inverse_std: Scalar) -> Scalar:
 
 @inline_kernel
 def mean_and_inverse_std(total: Scalar, squares: Scalar, per: Scalar) -> tuple[Scalar, Scalar]:
-    """Return mean and 1 / standard deviation from weighted sums; bounded where nothing varies.
-
-    `per` is 1 / the sum of the weights.
-    """
+    """Return mean and 1 / deviation, bounded, from weighted sums, `per` being 1 / the sum of the weights."""
     mean = total * per
     return mean, F1 / math.sqrt(max(squares * per - mean * mean, F0) + _MIN_VARIANCE)
 
@@ -231,17 +218,17 @@ def sample_channels(
     for k in range(len(rotations)):
         for lo in range(0, len(directions), CHUNK):
             hi = min(lo + CHUNK, len(directions))
-            project(axes[0, lo:hi], axes[1, lo:hi], axes[2, lo:hi], rotations[k], center, width, p)
-            gather(texels, width, p, hi - lo)
+            x = axes[0, lo:hi]
+            y = axes[1, lo:hi]
+            z = axes[2, lo:hi]
+            project(x, y, z, rotations[k], center, texels, width, p)
             s0 = samples[k, 0, lo:hi]
             s1 = samples[k, 1, lo:hi]
             s2 = samples[k, 2, lo:hi]
             valid = validity[k, lo:hi]
             for n in range(hi - lo):
-                bilinear = bilinear_weights(p.fu[n], p.fv[n])
-                t00, t10, t01, t11 = texels_around(p, n)
-                v = is_valid(t00, t10, t01, t11)
-                s0[n] = v * (blend(t00, t10, t01, t11, bilinear, 0) - zero)
-                s1[n] = v * (blend(t00, t10, t01, t11, bilinear, 8) - zero)
-                s2[n] = v * (blend(t00, t10, t01, t11, bilinear, 16) - zero)
+                a, b, c, v = sample(p, n)
+                s0[n] = v * (a - zero)
+                s1[n] = v * (b - zero)
+                s2[n] = v * (c - zero)
                 valid[n] = v

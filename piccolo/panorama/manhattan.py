@@ -24,10 +24,7 @@ SQUARE = 0.1  # cosine of the angle between two axes, at most
 
 
 def find_axes(panorama: Panorama) -> list[Array]:
-    """Return unit vectors (3,) along the three directions, in both senses, the nearest to +z first.
-
-    None for a photo without edges.
-    """
+    """Return unit vectors (3,) along three directions, both ways, nearest to +z first; none without edges."""
     normals, weights = edge_normals(panorama)
     if len(normals) < LEAST_EDGES:
         return []

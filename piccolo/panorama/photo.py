@@ -99,10 +99,7 @@ def read_photo_facts(photo: str | PathLike[str] | Bytes, rig: Calibration | None
 
 
 def _exif_chunk(content: bytes) -> bytes:
-    """Return the EXIF in a PNG file, before or behind the pixels.
-
-    Empty if there is none, or for another file.
-    """
+    """Return the EXIF in a PNG file, before or behind the pixels; empty without, or for another file."""
     begin = len(PNG_MAGIC) if content.startswith(PNG_MAGIC) else len(content)
     while begin + 8 <= len(content):
         end = begin + 8 + int.from_bytes(content[begin : begin + 4])

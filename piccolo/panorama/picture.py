@@ -157,10 +157,7 @@ def picture_orientation(path: Path) -> object:
 
 @contextmanager
 def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
-    """Yield the picture in `data` as Pillow opens it, not decoded.
-
-    Any exception of Pillow becomes an InputError.
-    """
+    """Yield the picture in `data`, opened but not decoded; what Pillow raises becomes an InputError."""
     if not data:
         raise InputError(f"{path}: the file is empty, {WANTED}")
     kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)

@@ -1,8 +1,8 @@
 """The panorama as texels, one int32 a pixel; points are projected to them a chunk at a time.
 
-`project` and `gather` are separate loops: the arithmetic before and after the loads is vectorised, the loads
-are not. On processors that gather slowly that is three times faster (AMD up to Zen 3), and others lose
-nothing. The arrays of a chunk fit the first-level cache.
+`project` has two loops: the arithmetic of the first is vectorised, the loads of the second are not. On
+processors that gather slowly that is three times faster (AMD up to Zen 3), and others lose nothing. The
+arrays of a chunk fit the first-level cache.
 """
 
 import math
@@ -162,10 +162,11 @@ def project(
     Z: Array32,
     R_cam_from_world: Floats,
     center_world: Floats,
+    texels: Int32s,
     width: int,
     projected: Projected,
 ) -> None:
-    """Write camera coordinates, and the place in an image of `width`, of at most CHUNK points (n,)."""
+    """Write camera coordinates of at most CHUNK points (n,), and their places in an image with the texels."""
     p = projected
     pose = pose_float32(R_cam_from_world, center_world)
     for n in range(len(X)):
@@ -174,25 +175,30 @@ def project(
         p.x[n] = x
         p.y[n] = y
         p.z[n] = z
-
-
-@inline_kernel
-def texels_around(projected: Projected, n: int) -> Four:
-    """Return the four texels around a projected point; `gather` has written them."""
-    return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
-
-
-@inline_kernel
-def gather(texels: Int32s, width: int, projected: Projected, count: int) -> None:
-    """Write the four texels around each of `count` projected points."""
-    p = projected
     stride = np.int32(width + 2)
     right = texels[1:]
     below = texels[stride:]
     below_right = texels[stride + 1 :]
-    for n in range(count):
+    for n in range(len(X)):
         k = np.uintp(p.texel[n])  # an unsigned index needs no test for being negative
         p.t00[n] = texels[k]
         p.t10[n] = right[k]
         p.t01[n] = below[k]
         p.t11[n] = below_right[k]
+
+
+@inline_kernel
+def texels_around(projected: Projected, n: int) -> Four:
+    """Return the four texels around a projected point."""
+    return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
+
+
+@inline_kernel
+def sample(projected: Projected, n: int) -> tuple[Scalar, Scalar, Scalar, np.float32]:
+    """Interpolate the three channels [levels] at a projected point; return also 1 if all texels count."""
+    weights = bilinear_weights(projected.fu[n], projected.fv[n])
+    t00, t10, t01, t11 = texels_around(projected, n)
+    a = blend(t00, t10, t01, t11, weights, 0)
+    b = blend(t00, t10, t01, t11, weights, 8)
+    c = blend(t00, t10, t01, t11, weights, 16)
+    return a, b, c, is_valid(t00, t10, t01, t11)

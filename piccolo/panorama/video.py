@@ -49,10 +49,7 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
 
 
 def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[VideoFrame]:
-    """Write the frames at the given times [s], in whole milliseconds, into a folder, and yield them.
-
-    InputError as of `frames_of`.
-    """
+    """Write the frames at times [s], in whole milliseconds, into a folder, and yield them."""
     left = {round(1000.0 * time) for time in times}
     for time, frame in _decode(video) if left else ():
         if round(1000.0 * time) in left:
@@ -63,10 +60,7 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
 
 
 def measure_sharpness(rgb: Bytes) -> float:
-    """Measure the sharpness of an image (H, W, 3): the variance of the Laplacian of a small copy.
-
-    The measure is that of Pech-Pacheco et al. (2000).
-    """
+    """Return the variance of a small copy's Laplacian (Pech-Pacheco et al., 2000) of an image (H, W, 3)."""
     height = max(round(rgb.shape[0] * SHARPNESS_WIDTH / rgb.shape[1]), 1)
     small = cv2.resize(rgb, (SHARPNESS_WIDTH, height), interpolation=cv2.INTER_AREA)
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())

@@ -69,40 +69,29 @@ def encode_level(channel: Scalar) -> np.int8:
 
 @kernel
 def render_block(
-    tree: Octree,
-    centers: Array,
-    voxel_per_range: float,
-    view: ViewArrays,
-    scratch: Scratch,
-    offsets: NDArray[np.int16],
-    unit: Array32,
-    levels: Int8s,
-    is_seen: Mask,
+    tree: Octree, voxel_per_range: float, view: ViewArrays, scratch: Scratch, views: Views
 ) -> None:
-    """Write views from several centres (n, 3) [m] in few bits: the arrays of `Views`.
-
-    `unit` (n,) [m] is what one step of an offset stands for; `levels` are the channels.
-    """
+    """Write the views from their centres."""
     n = len(view.solid_angle)
     points = np.empty((3, n), np.float32)
     channels = np.empty((3, n), np.float32)
     weights = np.empty(n, np.float32)
     shown = np.ones(n, np.bool_)
     sums = np.empty((n, 8), np.float32)
-    for k in range(len(centers)):
-        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
+    for k in range(len(views.centers)):
+        average_nodes(tree, views.centers[k], voxel_per_range, view, scratch, sums)
         normalize_cells(sums, view, shown, points, channels, weights)
         largest = np.float32(1e-3)
         for i in range(3):
             for c in range(n):
                 largest = max(largest, abs(points[i, c]))
-        unit[k] = largest / np.float32(32767)
+        views.offset_unit[k] = largest / np.float32(32767)
         for i in range(3):
             for c in range(n):
-                offsets[k, i, c] = np.int16(points[i, c] / unit[k])
-                levels[k, i, c] = encode_level(channels[i, c])
+                views.offsets[k, i, c] = np.int16(points[i, c] / views.offset_unit[k])
+                views.features[k, i, c] = encode_level(channels[i, c])
         for c in range(n):
-            is_seen[k, c] = weights[c] > F0
+            views.is_seen[k, c] = weights[c] > F0
 
 
 @kernel
@@ -153,18 +142,8 @@ def render_views(octree: Octree, centers: Array, config: ViewConfig, workers: Wo
     views.centers[:] = centers
 
     def run(lo: int) -> None:
-        part = slice(lo, lo + BLOCK)
-        render_block(
-            octree,
-            views.centers[part],
-            config.voxel_per_range,
-            config.arrays,
-            thread_scratch(),
-            views.offsets[part],
-            views.offset_unit[part],
-            views.features[part],
-            views.is_seen[part],
-        )
+        part: list[Any] = [values[lo : lo + BLOCK] for values in views]
+        render_block(octree, config.voxel_per_range, config.arrays, thread_scratch(), Views(*part))
 
     list(workers.map(run, range(0, len(centers), BLOCK), "render views"))
     return views
@@ -181,17 +160,12 @@ def render_wide(octree: Octree, centers: Array, config: ViewConfig, workers: Wor
     features = np.empty((num, 3, num_wide), np.int8)
     seen = np.empty((num, num_wide), np.uint8)
 
+    voxel = config.voxel_per_range
+    view = config.arrays
+
     def run(lo: int) -> None:
         part = slice(lo, lo + BLOCK)
-        render_wide_block(
-            octree,
-            centers[part],
-            config.voxel_per_range,
-            config.arrays,
-            thread_scratch(),
-            features[part],
-            seen[part],
-        )
+        render_wide_block(octree, centers[part], voxel, view, thread_scratch(), features[part], seen[part])
 
     list(workers.map(run, range(0, num, BLOCK), "render views"))
     return WideViews(features.reshape(num, 3 * num_wide), seen)
@@ -218,10 +192,7 @@ class CandidateViews:
         self._row = np.full(len(self.centers), -1, np.int64)
 
     def at(self, candidates: Int64s, workers: Workers) -> tuple[Int64s, Views]:
-        """Return the rows (n,) of some candidates (n,) in the views made so far, and these views.
-
-        Views of candidates that have none yet are rendered first.
-        """
+        """Return the rows (n,) of candidates (n,) in the views, made if missing, and the views."""
         with self._lock:
             missing = np.unique(candidates[self._row[candidates] < 0])
             if len(missing) and self.num_made + len(missing) > MOST_KEPT:

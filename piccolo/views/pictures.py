@@ -97,18 +97,12 @@ def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: W
 
 
 def sphere_width_for(camera: Camera) -> int:
-    """Return the even width [px] of a sphere with the resolution of the camera at its axis.
-
-    It is at most MAX_SPHERE_WIDTH.
-    """
+    """Return the even width [px] of a sphere as fine as the camera at its axis, up to MAX_SPHERE_WIDTH."""
     return min(2 * math.ceil(math.pi * camera.resolution), MAX_SPHERE_WIDTH)
 
 
 def cut(image: Bytes, camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> Bytes:
-    """Return a camera's picture (height, width, 3), sampled from a sphere's (H, W, 3).
-
-    Pixels that show no direction are black.
-    """
+    """Return a camera's picture (height, width, 3) of a sphere's (H, W, 3); black where it shows nothing."""
     u, v, is_in = _places(camera, image.shape[1], R_lens_from_cam)
     around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
     found = cv2.remap(around, u + np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR)
@@ -117,10 +111,7 @@ def cut(image: Bytes, camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> Bytes
 
 
 def cut_view(view: View, camera: Camera) -> View:
-    """Return a camera's view, sampled from that of the sphere.
-
-    Its ranges are those of the nearest pixel, infinite where a pixel shows no direction.
-    """
+    """Return a camera's view from the sphere's: ranges of the nearest pixels, inf where it shows nothing."""
     width = view.depth.shape[1]
     u, v, is_in = _places(camera, width, UPRIGHT)
     rows = np.clip(v.astype(np.int64), 0, width // 2 - 1)

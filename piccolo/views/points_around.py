@@ -8,7 +8,7 @@ from functools import lru_cache, partial
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s, Mask
+from ..arrays import Array32, Int32s, Mask
 from ..cloud.octree import Octree, collect
 from ..cloud.soa import PackedPoints, pack_points
 from ..geometry.pose import Pose
@@ -88,22 +88,15 @@ def take_children(tree: Octree, nodes: Int32s, kept: np.float32, found: Int32s) 
 
 
 @kernel
-def render_points(
-    tree: Octree,
-    center: Array,
-    voxel_per_range: float,
-    view: ViewArrays,
-    shown: Mask,
-    scratch: Scratch,
-    offsets: Array32,
-    channels: Array32,
-    weights: Array32,
+def sample_visible(
+    tree: Octree, voxel_per_range: float, view: ViewArrays, shown: Mask, scratch: Scratch, sample: Cells
 ) -> int:
     """Write a sample of the visible points in cells that are shown; return their number.
 
-    The sample fits the arrays. Offsets and channels are as in `normalize_cells`, weights are 1. Occlusion
+    It fits the arrays of `sample`. Offsets and channels are as in `normalize_cells`, weights are 1. Occlusion
     and local statistics are computed from voxels twice as large.
     """
+    offsets, channels, weights, center = sample
     s = scratch
     num_cells = len(view.solid_angle)
     sums = np.empty((num_cells, 8), np.float32)
@@ -148,13 +141,11 @@ def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown
 
     `shown` has a byte for each cell of `config`: 1 if points in it are wanted, else 0.
     """
-    *found, center = empty_cells(count, center_map)
+    sample = empty_cells(count, center_map)
     is_shown = np.frombuffer(shown, np.bool_)
-    n = render_points(
-        octree, center, config.voxel_per_range, config.arrays, is_shown, thread_scratch(), *found
-    )
-    offsets, channels, weights = (values[..., :n].copy() for values in found)
-    return Cells(offsets, channels, weights, center)
+    n = sample_visible(octree, config.voxel_per_range, config.arrays, is_shown, thread_scratch(), sample)
+    offsets, channels, weights = (values[..., :n].copy() for values in sample[:3])
+    return Cells(offsets, channels, weights, sample.center_map)
 
 
 def points_around(octree: Octree, center_map: Center, voxel_per_range: float) -> PackedPoints:

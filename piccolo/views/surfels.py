@@ -89,10 +89,7 @@ def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
 
 
 def planes(neighborhoods: Array32) -> tuple[Array32, Mask]:
-    """Fit planes to neighbourhoods (N, K, 3); return unit normals (N, 3), and which fill a volume (N,).
-
-    The normal is 0 where there is no plane.
-    """
+    """Return unit normals (N, 3) of neighbourhoods (N, K, 3), 0 without a plane, and which are thick (N,)."""
     offsets = neighborhoods - neighborhoods.mean(axis=1, keepdims=True)
     values, vectors = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
     is_thick = values[:, 0] > MAX_THICKNESS * values.sum(axis=1)
