@@ -10,7 +10,7 @@ import rooms
 
 from piccolo.cloud.settings import IN_METRES
 from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Once, Workers
 from piccolo.opening import open_scan
 from piccolo.scan_map import open_map, scan_map
 from piccolo.scan_map.map_file import load_map, save_map
@@ -52,9 +52,9 @@ def test_they_are_made_once_and_threads_wait_for_them():
         time.sleep(0.2)
         return "features"
 
-    late = scan_map.LateFeatures(make)
+    late = Once(make)
     with ThreadPoolExecutor(3) as pool:
-        assert list(pool.map(late.get, [WORKERS] * 3)) == ["features"] * 3
+        assert list(pool.map(late, [WORKERS] * 3)) == ["features"] * 3
     assert made == [WORKERS]
 
 

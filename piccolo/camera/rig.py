@@ -122,7 +122,16 @@ class Calibration:
 
         Raises InputError if a camera has none or several.
         """
-        return [self._image_in(folder, mount) for mount in self.mounts]
+        names = _names_in(folder)
+        images = []
+        for mount in self.mounts:
+            patterns = (mount.image or "").split("|")
+            found = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
+            if len(found) != 1:
+                text = f"found {len(found)} pictures for the camera {mount.image!r} of {self.path}"
+                raise InputError(f"{folder}: {text}, wanted one: a folder has the pictures of one instant")
+            images.append(folder / found[0])
+        return images
 
     def is_instant(self, folder: Path) -> bool:
         """Return True for a folder that holds one picture of each camera."""
@@ -130,15 +139,6 @@ class Calibration:
             return len(self.images_in(folder)) == len(self.mounts)
         except InputError:
             return False
-
-    def _image_in(self, folder: Path, mount: Mount) -> Path:
-        names = _names_in(folder)
-        patterns = (mount.image or "").split("|")
-        found = [name for name in names if any(fnmatchcase(name, pattern) for pattern in patterns)]
-        if len(found) != 1:
-            text = f"found {len(found)} pictures for the camera {mount.image!r} of {self.path}"
-            raise InputError(f"{folder}: {text}, wanted one: a folder has the pictures of one instant")
-        return folder / found[0]
 
 
 def _names_in(folder: Path) -> Sequence[str]:

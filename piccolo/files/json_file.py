@@ -64,9 +64,9 @@ def read_text(path: Path, wanted: str, max_size: int = MAX_SIZE) -> str:
         raise InputError(f"{path}: found bytes that are no text, {wanted}") from error
 
 
-def read_json(path: Path, wanted: str, max_size: int = MAX_SIZE) -> Any:
+def read_json(path: Path, wanted: str) -> Any:
     """Return what a JSON file holds."""
-    text = read_text(path, wanted, max_size)
+    text = read_text(path, wanted)
     try:
         return json.loads(text)
     except (ValueError, RecursionError) as error:  # bad JSON, and numbers of thousands of digits

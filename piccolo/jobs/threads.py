@@ -141,15 +141,15 @@ def submit(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterator[l
 class Once(Generic[Value]):
     """A value that is worked out by the first thread that asks; others wait for it."""
 
-    def __init__(self, function: Callable[[], Value]) -> None:
-        self._function: Callable[[], Value] | None = function
+    def __init__(self, function: Callable[..., Value]) -> None:
+        self._function: Callable[..., Value] | None = function
         self._lock = threading.Lock()
         self._value: Value
 
-    def __call__(self) -> Value:
-        """Return the value. What the function raises is raised, and it is asked again by the next."""
+    def __call__(self, *arguments: object) -> Value:
+        """Return the function's value. What it raises is raised, and it is asked again by the next."""
         with self._lock:
             if self._function is not None:
-                self._value = self._function()
+                self._value = self._function(*arguments)
                 self._function = None  # what it holds may be large
         return self._value

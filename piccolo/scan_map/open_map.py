@@ -16,13 +16,13 @@ from ..errors import InputError
 from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points
 from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Once, Workers
 from ..local_features.feature_map import FeatureMap
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .named_scans import name_scan
 from .prior import NOTHING_KNOWN, Prior
 from .scan_addition import add_scan
-from .scan_map import LateFeatures, ScanMap, add_features, prepare_map
+from .scan_map import ScanMap, add_features, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
@@ -195,12 +195,12 @@ def keep_when_made(scan_map: ScanMap, path: Path) -> ScanMap:
             found = load_map(path, remembers=True)
             if found.scan_sha256 == scan_map.scan_sha256 and not found.lacks_features:
                 return found.local_features
-        features = late.get(workers)
+        features = late(workers)
         with suppress(OSError):  # they are made again by the next process
             save_map(replace(scan_map, local_features=features), path)
         return features
 
-    return replace(scan_map, late=LateFeatures(make))
+    return replace(scan_map, late=Once(make))
 
 
 def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers) -> LocalCloud:

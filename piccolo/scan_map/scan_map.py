@@ -1,7 +1,5 @@
 """The map prepared once per cloud: octree, candidate camera positions, and their coarse views."""
 
-import threading
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Protocol
@@ -19,10 +17,10 @@ from ..cloud.voxels import Voxels
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Once, Workers
 from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
-from ..views.view import ViewConfig, ranges_around
+from ..views.view import ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
@@ -47,21 +45,6 @@ class Voxelized(Protocol):
         """Average the points in each voxel, in axes rotated by a matrix (3, 3)."""
 
 
-class LateFeatures:
-    """Local features that are made once, when a photo first needs them; other threads wait."""
-
-    def __init__(self, make: Callable[[Workers], FeatureMap]) -> None:
-        self._make = make
-        self._made: FeatureMap | None = None
-        self._lock = threading.Lock()
-
-    def get(self, workers: Workers) -> FeatureMap:
-        """Return the features; make them on the first call."""
-        with self._lock:
-            self._made = self._made or self._make(workers)
-            return self._made
-
-
 @dataclass(frozen=True)
 class ScanMap:
     """A prepared cloud, in a frame of its own: x_map = R_map_from_world @ (x_world - origin_world), z up."""
@@ -84,7 +67,7 @@ class ScanMap:
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
     crs: str = ""  # coordinate system that the scan's file names, as WKT or EPSG:code; empty if none
     is_partial: bool = False  # of a scan too large as a whole: candidates where a prior asks; not in files
-    late: LateFeatures | None = None  # of a map that was prepared without local features; not in files
+    late: Once[FeatureMap] | None = None  # local features of a map prepared without, by Workers; not in files
 
     @cached_property
     def points(self) -> PackedPoints:
@@ -130,7 +113,7 @@ class ScanMap:
 
     def features_now(self, workers: Workers) -> FeatureMap:
         """Return the local features, made now if they were deferred."""
-        return self.late.get(workers) if self.late else self.local_features
+        return self.late(workers) if self.late else self.local_features
 
     def to_world(self, pose: Pose) -> Pose:
         """Transform a pose of the map's frame to the world."""
@@ -181,7 +164,6 @@ def prepare_map(
     workers: Workers,
     up: UpAxis | Array = "auto",
     watch: Stopwatch | None = None,
-    view: ViewConfig = SEARCH_VIEW,
     prior: Prior = NOTHING_KNOWN,
     has_features: bool = True,
 ) -> ScanMap:
@@ -212,7 +194,7 @@ def prepare_map(
             octree = paint_shape(octree, workers)
         centers, notes = find_candidates(octree, R_map_from_world, origin_world, prior, workers)
         sparse, _ = sparse_candidates(centers)
-        wide = render_wide(octree, centers[sparse], view, workers)
+        wide = render_wide(octree, centers[sparse], SEARCH_VIEW, workers)
         scan_map = ScanMap(
             octree=octree,
             R_map_from_world=R_map_from_world,
@@ -223,7 +205,7 @@ def prepare_map(
             sparse=sparse,
             wide_features=wide.features,
             wide_seen=wide.seen,
-            views=CandidateViews(octree, centers, view),
+            views=CandidateViews(octree, centers),
             local_features=make_feature_map(octree, centers[:0], Workers()),
             warnings=warnings + notes,
             is_partial=bool(notes),
@@ -243,7 +225,7 @@ def change_colors(scan_map: ScanMap, octree: Octree, workers: Workers) -> ScanMa
         octree=octree,
         wide_features=wide.features,
         wide_seen=wide.seen,
-        views=CandidateViews(octree, scan_map.centers, SEARCH_VIEW),
+        views=CandidateViews(octree, scan_map.centers),
         has_shape=False,
     )
     return defer_features(changed)
@@ -282,4 +264,4 @@ def add_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
 
 def defer_features(scan_map: ScanMap) -> ScanMap:
     """Return the map such that it makes its local features when they are first needed."""
-    return replace(scan_map, late=LateFeatures(lambda workers: find_local_features(scan_map, workers)))
+    return replace(scan_map, late=Once(lambda workers: find_local_features(scan_map, workers)))
