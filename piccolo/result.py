@@ -22,7 +22,7 @@ from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .scan_map.prior import GpsPrior
+from .scan_map.gps import GpsPrior
 from .walk.path import Gap
 from .walk.results import Alone, WalkFrame
 

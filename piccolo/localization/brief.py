@@ -80,7 +80,7 @@ def mirror_query(query: Query) -> Query:
     mirrored = replace(
         photo, panorama=panorama, images=images, small=photo.small.mirror(), R_cam_from_level=level
     )
-    prior = replace(query.settings.prior, heading_deg=None)
+    prior = query.settings.prior.without_heading()
     settings = replace(query.settings, prior=prior, max_starts=min(NUM_SCORED, query.settings.max_starts))
     rotations = ACROSS @ query.rotations @ ACROSS
     return replace(

@@ -81,7 +81,9 @@ def find_pose(
     level = align_level(yaw_of_walls, panorama, axes, settings)
 
     def search(one: Aligned) -> Found:
-        return find_once(scan_map, allowed_map, panorama, one.settings, workers, watch, method, one.rotations)
+        return find_once(
+            scan_map, allowed_map, one.panorama, one.settings, workers, watch, method, one.rotations
+        )
 
     found = [search(level)]  # most cameras are about level
     if not is_tilt_known(panorama, settings) and not is_explained(found[0].selection, level):

@@ -9,6 +9,7 @@ import numpy as np
 from ..geometry.pose import Array, yaw_rotation
 from ..jobs.threads import Workers
 from ..panorama import Panorama
+from ..panorama.gpano import attitude_of_gravity
 from ..scan_map.scan_map import ScanMap
 from .brief import brief_query, score_starts
 from .query import find_tilt, prepare_query
@@ -23,14 +24,14 @@ LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the hori
 class Aligned(NamedTuple):
     """A tilt of the camera, and rotations to be searched with it."""
 
+    panorama: Panorama  # with the tilt
     settings: CoarseToFineSettings
     rotations: Array  # (N, 3, 3) camera from map, that put the photo's lines along the walls; N = 4 or 0
 
 
 def is_tilt_known(panorama: Panorama, settings: CoarseToFineSettings) -> bool:
-    """Return True if the settings, or the photo's metadata, say how the camera was tilted."""
-    has_attitude = settings.prior.gravity_vector is not None or panorama.gpano is not None
-    return settings.gravity == "known" or (has_attitude and settings.gravity != "unknown")
+    """Return True if the settings, or the photo, say how the camera was tilted."""
+    return settings.gravity == "known" or (panorama.gpano is not None and settings.gravity != "unknown")
 
 
 def is_explained(found: Selection, searched: Aligned) -> bool:
@@ -56,10 +57,10 @@ def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_le
 def align_level(
     yaw_of_walls: float | None, panorama: Panorama, axes: Sequence[Array], settings: CoarseToFineSettings
 ) -> Aligned:
-    """Return the known tilt of a camera, level unless the photo or the settings say another."""
+    """Return the known tilt of a camera, level unless the photo says another."""
     known = replace(settings, gravity="known")
-    R_cam_from_level, _ = find_tilt(panorama, known)
-    return Aligned(known, align_lines(yaw_of_walls, axes, R_cam_from_level))
+    R_cam_from_level, _ = find_tilt(panorama)
+    return Aligned(panorama, known, align_lines(yaw_of_walls, axes, R_cam_from_level))
 
 
 def find_tilts(
@@ -77,11 +78,11 @@ def find_tilts(
     """
     tried = []
     for axis in axes:
-        prior = replace(settings.prior, gravity_vector=tuple((-axis).tolist()))
-        tried.append(align_level(yaw_of_walls, panorama, axes, replace(settings, prior=prior)))
+        tilted = replace(panorama, gpano=attitude_of_gravity(tuple((-axis).tolist())))
+        tried.append(align_level(yaw_of_walls, tilted, axes, settings))
     scores = []
     for one in tried:
-        query = prepare_query(panorama, scan_map, one.settings, workers, method, one.rotations)
+        query = prepare_query(one.panorama, scan_map, one.settings, workers, method, one.rotations)
         brief = brief_query(query)
         scores.append(score_starts(brief, search_poses(brief, "known")))
     ranked = sorted(range(len(tried)), key=lambda k: -scores[k])

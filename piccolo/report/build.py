@@ -114,7 +114,7 @@ def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task
     if settings.images is not None:
         photo = settings.images / photo.name
     try:
-        digest = read_photo_facts(photo, read_options_of(result).rig).sha256
+        digest = read_photo_facts(photo_of(result, photo)).sha256
     except (OSError, InputError):
         digest = ""
     parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
