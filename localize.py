@@ -6,4 +6,4 @@ import sys
 from piccolo.cli.start import run
 
 if __name__ == "__main__":
-    sys.exit(run("localize"))
+    sys.exit(run("piccolo.cli.localize"))

@@ -4,7 +4,10 @@ import re
 import subprocess
 import sys
 import time
+from importlib import import_module
 from pathlib import Path
+
+from piccolo.cli.start import COMMANDS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
@@ -13,6 +16,13 @@ PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_poi
 def command_of(script, *words):
     """The command line of a script of the checkout."""
     return [sys.executable, str(ROOT / script), *map(str, words)]
+
+
+def main_of(script):
+    """The `main` of a script of the checkout, to run in this process."""
+    name = Path(script).stem
+    package = "piccolo.cli" if name in COMMANDS else "research.commands"
+    return import_module(f"{package}.{name}").main
 
 
 def start_localize(words, **options):

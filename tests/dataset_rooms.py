@@ -11,16 +11,16 @@ from pictures import encoded
 from plyfile import PlyData
 from scipy.spatial.transform import Rotation
 
-from piccolo.cli import convert_dataset
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.raycast import cast_rays
+from piccolo.scene import read_scene
 from piccolo.views.zbuffer import visible_points
+from research.commands import convert_dataset
+from research.synthetic.raycast import cast_rays
 
 SEED = 5
 WIDTH = 256

@@ -10,10 +10,10 @@ from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.result import Result, Source, unreadable_result
-from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query, scan_world
 from piccolo.views.pictures import encode_image
 from piccolo.walk.path import Gap
 from piccolo.walk.results import WalkFrame
+from research.synthetic.world import make_world, photograph, pose_of_query, scan_world
 
 SIZE = np.array([4.5, 3.5, 2.5])
 STOREY = 3.0  # [m] from floor to floor

@@ -5,7 +5,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from piccolo.cli import make_room
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
@@ -13,8 +12,9 @@ from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
-from piccolo.scenes.synthetic.world import make_query, make_world, scan_world
 from piccolo.views.view import average_view, normalize_view
+from research.commands import make_room
+from research.synthetic.world import make_query, make_world, scan_world
 
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000

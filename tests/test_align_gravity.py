@@ -18,7 +18,7 @@ from test_cloud_ptx import write as write_lines
 
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3, transform_points
-from piccolo.scenes.scene import Query, read_scene, write_queries
+from piccolo.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])

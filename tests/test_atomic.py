@@ -21,7 +21,7 @@ from piccolo.files.atomic import (
     write_atomically,
 )
 from piccolo.geometry.pose import Pose
-from piccolo.scenes.scene import Query, write_queries
+from piccolo.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 

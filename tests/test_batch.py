@@ -21,7 +21,7 @@ from piccolo.cli import localize, options
 from piccolo.errors import InputError
 from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.result import read_results
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 
 
 @pytest.fixture

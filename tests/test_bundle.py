@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import rooms
 from made_up import at
-from measuring.confidence import mask_outside_field
 from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
@@ -29,7 +28,8 @@ from piccolo.localization.localize import localize
 from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
-from piccolo.scenes.synthetic.world import photograph
+from research.measuring.confidence import mask_outside_field
+from research.synthetic.world import photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5

@@ -10,6 +10,7 @@ from rooms import errors, scan_map
 import piccolo
 from piccolo.cli.localize import main
 from piccolo.cloud.settings import CloudSettings
+from piccolo.export import Options, export
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
@@ -17,8 +18,7 @@ from piccolo.opened_scan import OpenedScan
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import read_results
 from piccolo.scan import Scan
-from piccolo.scenes.export import Options, export
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 
 COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))
 NAMES = ("clean_2.jpg", "clean_0.jpg", "clean_1.jpg")  # in another order than in the files

@@ -20,7 +20,7 @@ from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from piccolo.scenes.synthetic.world import (
+from research.synthetic.world import (
     make_query,
     photograph,
     picture_of_all,

@@ -12,13 +12,14 @@ from rooms import write_room
 from piccolo.camera import Camera, Mount
 from piccolo.camera.files import document_of
 from piccolo.camera.model import pinhole
-from piccolo.cli import evaluate, export_poses, localize, make_room, render_pose
+from piccolo.cli import export_poses, localize, render_pose
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
-from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.world import make_world, photograph, pose_of_query, render_picture
+from piccolo.scene import read_scene
 from piccolo.views.pictures import cut, sphere_width_for
+from research.commands import evaluate, make_room
+from research.synthetic.world import make_world, photograph, pose_of_query, render_picture
 
 WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))
 TURN = tuple(map(tuple, exp_so3(np.radians([0.0, 0.0, 90.0])).tolist()))

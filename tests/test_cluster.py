@@ -10,8 +10,9 @@ import time
 import pytest
 from batches import PAPER, ROOT, start_localize, untimed, wait_for_lines, workers_of
 
-from piccolo.cli import evaluate, localize
+from piccolo.cli import localize
 from piccolo.jobs import cluster
+from research.commands import evaluate
 
 PANOS = [f"images/clean_{k % 3}.jpg" for k in range(12)]
 

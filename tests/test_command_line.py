@@ -23,6 +23,8 @@ from piccolo.cloud.settings import IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.result import Result
 
+SCRIPTS = [ROOT / "localize.py", *sorted((ROOT / "tools").glob("[a-z]*.py"))]
+
 ONE = ["--cloud", "a.ply", "--pano", "b.jpg"]
 
 
@@ -128,13 +130,13 @@ def test_errors_have_codes_and_name_the_command_as_it_was_started(monkeypatch, c
     def fail(arguments):
         raise error
 
-    monkeypatch.setattr("sys.argv", ["/usr/bin/piccolo-make-room"])
-    assert command("make_room.py", "", "", lambda parser: None)(fail)([]) == code
+    monkeypatch.setattr("sys.argv", ["/usr/bin/piccolo-report"])
+    assert command("report.py", "", "", lambda parser: None)(fail)([]) == code
     err = capsys.readouterr().err
-    assert err.startswith(f"piccolo-make-room: {text}")
+    assert err.startswith(f"piccolo-report: {text}")
     assert err.count("\n") == 1
     assert "Traceback" not in err
-    command("make_room.py", "", "", lambda parser: None)(fail)(["--debug"])
+    command("report.py", "", "", lambda parser: None)(fail)(["--debug"])
     assert "Traceback" in capsys.readouterr().err
     with pytest.raises(UsageError), checking_options():
         raise InputError("in an option")
@@ -153,21 +155,31 @@ def test_a_signal_during_a_callback_from_c_is_not_lost(capsys, number, code, tex
             raise RuntimeError("no compiled object yet")
         time.sleep(20.0)
 
-    assert command("make_room.py", "", "", lambda parser: None)(compiled)([]) == code
-    assert capsys.readouterr().err == f"make_room.py: {text}\n"
+    assert command("report.py", "", "", lambda parser: None)(compiled)([]) == code
+    assert capsys.readouterr().err == f"report.py: {text}\n"
+
+
+def _help(monkeypatch, capsys, program, start):
+    monkeypatch.setattr("sys.argv", [f"bin/{program}", "--help"])
+    with pytest.raises(SystemExit):
+        start()
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: {program} ")
+    assert "4 internal error" in text
+    return text
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_names_commands_as_they_were_started(monkeypatch, capsys, name):
-    script = ROOT / ("" if name == "localize" else "tools") / f"{name}.py"
-    installed = f"piccolo-{name.replace('_', '-')}", import_module(f"piccolo.cli.{name}").main, "\n  piccolo-"
-    scripted = script.name, lambda: runpy.run_path(str(script), run_name="__main__"), "  python "
-    for program, start, example in (installed, scripted):
-        monkeypatch.setattr("sys.argv", [f"bin/{program}", "--help"])
-        with pytest.raises(SystemExit):
-            start()
-        text = capsys.readouterr().out
-        assert text.startswith(f"usage: {program} ")
-        assert example in text
-        assert ("piccolo-" in text) != (".py" in text)
-        assert "4 internal error" in text
+def test_help_of_an_installed_command_names_no_scripts(monkeypatch, capsys, name):
+    program = f"piccolo-{name.replace('_', '-')}"
+    text = _help(monkeypatch, capsys, program, import_module(f"piccolo.cli.{name}").main)
+    assert "\n  piccolo-" in text
+    assert ".py" not in text
+
+
+@pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.name)
+def test_help_of_a_script_names_no_installed_commands(monkeypatch, capsys, script):
+    monkeypatch.syspath_prepend(script.parent)
+    text = _help(monkeypatch, capsys, script.name, lambda: runpy.run_path(str(script), run_name="__main__"))
+    assert "  python " in text
+    assert "piccolo-" not in text

@@ -7,7 +7,6 @@ import naive
 import numpy as np
 import pytest
 import rooms
-from measuring.confidence import mask_outside_field, occlude
 
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
@@ -30,6 +29,7 @@ from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
+from research.measuring.confidence import mask_outside_field, occlude
 
 WIDTH = rooms.WIDTH
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))

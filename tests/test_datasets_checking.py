@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 
-from piccolo.scenes.datasets import checking
-from piccolo.scenes.datasets.files import AXES, DIRECTIONS, pose_of_transform
+from research.datasets import checking
+from research.datasets.files import AXES, DIRECTIONS, pose_of_transform
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from poses import jpeg
 from refusals import mutated, read_or_refused
 
-from piccolo.scenes.datasets import DATASETS
-from piccolo.scenes.datasets.model import ConvertOptions
+from research.datasets import DATASETS
+from research.datasets.model import ConvertOptions
 
 T = np.eye(4)[[1, 2, 0, 3]]
 STEM = "camera_00_office_1_frame_equirectangular_domain"

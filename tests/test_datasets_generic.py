@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli import export_poses
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 
 AXES = {"optical": made.OPTICAL, "piccolo": made.FORWARD_LEFT_UP, "opengl": made.OPENGL}
 COLUMNS = ("image", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "direction", "axes", "variant", "room")

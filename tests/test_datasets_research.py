@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from piccolo.cloud.ply_writer import vertex_rows
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 
 # 360loc
 SEQUENCES = ("daytime_360_1", "nighttime_360_2")

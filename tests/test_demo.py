@@ -4,10 +4,10 @@ import hashlib
 import json
 import re
 import shlex
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from batches import main_of
 
 ROOT = Path(__file__).resolve().parents[1]
 FLAT = ROOT / "examples" / "flat"
@@ -22,7 +22,7 @@ def _run_demo():
     """Run the recipe's Python commands as a shell would do it, but in this process."""
     for line in re.findall(r"^\t\$\(BIN\)/python (.*)", RECIPE, flags=re.MULTILINE):
         program, *words = shlex.split(line)
-        assert import_module(f"piccolo.cli.{Path(program).stem}").main(words) == 0
+        assert main_of(program)(words) == 0
 
 
 @pytest.fixture(scope="module")

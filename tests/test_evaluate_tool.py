@@ -13,12 +13,12 @@ from poses import result, write_results
 from rooms import write_room
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import evaluate
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.scenes.evaluation.query_result import read_run
-from piccolo.scenes.scene import Query, read_scene, write_queries
+from piccolo.scene import Query, read_scene, write_queries
+from research.commands import evaluate
+from research.evaluation.query_result import read_run
 
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]
 

@@ -11,9 +11,10 @@ from refusals import assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
-from piccolo.scenes.evaluation import tables
-from piccolo.scenes.evaluation.plots import errors_figure, figure_png, risk_figure
-from piccolo.scenes.evaluation.query_result import (
+from piccolo.scene import Query, Scene
+from research.evaluation import tables
+from research.evaluation.plots import errors_figure, figure_png, risk_figure
+from research.evaluation.query_result import (
     PAPER_THRESHOLDS,
     QueryResult,
     Thresholds,
@@ -21,7 +22,6 @@ from piccolo.scenes.evaluation.query_result import (
     match_results,
     read_run,
 )
-from piccolo.scenes.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
 

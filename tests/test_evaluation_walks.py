@@ -6,19 +6,19 @@ import numpy as np
 from poses import result
 
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.scenes.evaluation.query_result import (
+from piccolo.scene import Query, Scene
+from piccolo.walk.results import Alone, WalkFrame
+from research.evaluation.query_result import (
     PAPER_THRESHOLDS,
     QueryResult,
     make_query_result,
     match_results,
 )
-from piccolo.scenes.evaluation.walks import (
+from research.evaluation.walks import (
     alone_table,
     group_walks,
     walk_table,
 )
-from piccolo.scenes.scene import Query, Scene
-from piccolo.walk.results import Alone, WalkFrame
 
 RATE = 2.0
 

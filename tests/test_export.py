@@ -8,8 +8,8 @@ from poses import SIZE, WIDTH, jpeg, json_of, lines_of, pixels_and_points, resul
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
+from piccolo.export import Options, export
 from piccolo.geometry.pose import exp_so3, log_so3
-from piccolo.scenes.export import Options, export
 
 POSES = tilted_poses(4)
 TOLERANCE = 1e-6  # px

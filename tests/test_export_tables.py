@@ -10,10 +10,10 @@ import pytest
 from poses import json_of, lines_of, result, tilted_poses
 
 from piccolo.errors import InputError
+from piccolo.export import Options, export
 from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.result import Source
-from piccolo.scenes.export import Options, export
 from piccolo.walk.path import Gap
 from piccolo.walk.results import WalkFrame
 

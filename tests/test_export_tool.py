@@ -16,9 +16,9 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
+from piccolo.export import FORMATS, select
 from piccolo.result import Source, read_results
-from piccolo.scenes.datasets.generic import _table
-from piccolo.scenes.export import FORMATS, select
+from research.datasets.generic import _table
 
 POSES = tilted_poses(5)
 MIXED = [

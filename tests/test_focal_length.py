@@ -13,6 +13,7 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
+from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.stopwatch import Stopwatch
@@ -21,13 +22,12 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization import localize as module
 from piccolo.localization.comparison import score_pose
-from piccolo.localization.focal_consensus import SLIPS, Opinion, combine
 from piccolo.localization.localize import localize, select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import ReadOptions, panorama_of_array
-from piccolo.scenes.synthetic.world import render_picture
+from research.synthetic.world import render_picture
 
 TRUE = 320.0  # [px] of the photos here, 640 x 480
 
@@ -319,7 +319,11 @@ def test_photos_of_one_camera_agree_on_its_focal_length_whatever_some_say():
         stds = rng.uniform(0.005, 0.03, 12)
         offs = rng.normal(0.05, stds)
         offs[:3] = rng.uniform(-0.3, 0.3, 3)
-        consensus = combine([Opinion(off, std**2) for off, std in zip(offs, stds, strict=True)])
+        opinions = [Opinion(off, std**2) for off, std in zip(offs, stds, strict=True)]
+        consensus = Consensus([None, *opinions]).opinion()
         misses.append((consensus.off - 0.05) / math.sqrt(consensus.variance))
     assert 0.5 < np.std(misses) < 1.4
-    assert combine([Opinion(0.0, 1e-4)] * 2) is None
+    one_less = Consensus(opinions).opinion(without=4)
+    assert one_less.variance > consensus.variance
+    assert Consensus([Opinion(0.0, 1e-4), None, Opinion(0.0, 1e-4)]).opinion() is None
+    assert Consensus([None]).opinion() is None

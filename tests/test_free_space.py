@@ -8,7 +8,7 @@ from piccolo.cloud.stream import stream_of_arrays
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map.free_space import FreeSpace
 from piccolo.scan_map.scan_map import prepare_map
-from piccolo.scenes.synthetic.world import make_world, scan_world
+from research.synthetic.world import make_world, scan_world
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The structure of the package, read from its sources."""
+"""The structure of the packages, read from their sources."""
 
 import ast
 from graphlib import CycleError, TopologicalSorter
@@ -7,18 +7,20 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGE = ROOT / "piccolo"
+PACKAGES = ("piccolo", "research")
 
 # A module imports from its own folder or from one further down this list.
 LAYERS = [
+    "research.commands",
+    "research.measuring",
+    "research.experiments",
+    "research.evaluation",
+    "research.datasets",
+    "research.synthetic",
     "cli",
     "report",
-    "scenes.reproduce_paper",
-    "scenes.evaluation",
-    "scenes.datasets",
-    "scenes.synthetic",
-    "scenes.export",
-    "scenes",
+    "export",
+    "scene",
     "batch",
     "opening",
     "scan",
@@ -48,11 +50,14 @@ LAYERS = [
 ]
 
 
+WITH_ARGPARSE = ("cli", "research.commands", "research.measuring")
+
+
 def _module(path):
     return ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
 
 
-MODULES = {_module(path): path for path in sorted(PACKAGE.rglob("*.py"))}
+MODULES = {_module(path): path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))}
 
 
 def _folder(module):
@@ -63,19 +68,24 @@ def _folder(module):
 
 
 def _imported(module):
-    """The package's modules that one imports."""
+    """The modules that one imports, of these packages and others."""
     path = MODULES[module]
     base = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.level:
-            parent = ".".join([*base[: len(base) - node.level + 1], *filter(None, [node.module])])
+        if isinstance(node, ast.ImportFrom):
+            above = base[: len(base) - node.level + 1] if node.level else []
+            parent = ".".join([*above, *filter(None, [node.module])])
             for alias in node.names:
                 name = f"{parent}.{alias.name}"
                 yield name if name in MODULES else parent
+        elif isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
 
 
 def _graph():
-    return {module: set(_imported(module)) - {"piccolo"} for module in MODULES if module != "piccolo"}
+    """The modules that each module imports, but for the package's own `__init__`."""
+    modules = set(MODULES) - {"piccolo"}
+    return {module: set(_imported(module)) & modules for module in modules}
 
 
 def test_imports_go_down_the_list():
@@ -83,6 +93,14 @@ def test_imports_go_down_the_list():
         for other in imported:
             above, below = LAYERS.index(_folder(module)), LAYERS.index(_folder(other))
             assert above <= below, f"{module} imports {other}, which is above it"
+
+
+def test_product_and_research_import_no_scripts_and_the_product_no_research():
+    scripts = {path.stem for path in (ROOT / "tools").glob("*.py")} | {"tools", "examples", "tests"}
+    for module in MODULES:
+        tops = {name.split(".")[0] for name in _imported(module)}
+        assert not tops & scripts, module
+        assert module.startswith("research.") or "research" not in tops, module
 
 
 def test_no_modules_import_each_other():
@@ -96,7 +114,7 @@ def test_only_commands_know_argparse():
     for module, path in MODULES.items():
         imports = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Import)]
         imports = {a.name for n in imports for a in n.names}
-        assert "argparse" not in imports or _folder(module) == "cli", module
+        assert "argparse" not in imports or _folder(module) in WITH_ARGPARSE, module
 
 
 def test_one_module_makes_statuses():

@@ -11,7 +11,7 @@ from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.view_image import fill_gaps, render_gray
-from piccolo.scenes.synthetic.raycast import cast_rays
+from research.synthetic.raycast import cast_rays
 
 WIDTH = 256
 EVERYWHERE = np.ones((WIDTH // 2, WIDTH), bool)

@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from measuring.places import REPEATED_KINDS, make_repeated
 from rooms import as_panorama, errors, query
 
 from piccolo.cloud import stream_points
@@ -24,8 +23,9 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
-from piccolo.scenes.synthetic.world import World, make_query, scan_world
 from piccolo.views.view import Cells
+from research.measuring.places import REPEATED_KINDS, make_repeated
+from research.synthetic.world import World, make_query, scan_world
 
 SETTINGS = CoarseToFineSettings(gravity="known")
 

@@ -22,7 +22,7 @@ from piccolo.camera.model import pinhole
 from piccolo.cli import localize, prepare_map
 from piccolo.confidence.localization import FocalLength
 from piccolo.result import Result
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 

@@ -30,7 +30,7 @@ from piccolo.panorama import ReadOptions, read_panorama
 from piccolo.panorama.photo import sha256_of
 from piccolo.result import Beside, Result, read_results
 from piccolo.scan import Scan
-from piccolo.scenes.synthetic.world import (
+from research.synthetic.world import (
     make_query,
     photograph,
     picture_of_all,

@@ -6,11 +6,12 @@ import pytest
 from plyfile import PlyData
 from rooms import errors, write_room
 
-from piccolo.cli import evaluate, localize, prepare_map
+from piccolo.cli import localize, prepare_map
 from piccolo.result import Result
-from piccolo.scenes.evaluation.query_result import read_run
-from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.room import LABEL_NAMES
+from piccolo.scene import read_scene
+from research.commands import evaluate
+from research.evaluation.query_result import read_run
+from research.synthetic.room import LABEL_NAMES
 
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 

@@ -8,17 +8,17 @@ import poses
 import pytest
 import rooms
 
-from piccolo.cli import loss_surface as tool
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_yaws
 from piccolo.jobs.threads import Workers
-from piccolo.optimize.loss_surface import LossSurface, PoseGrid, loss_surface
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 from piccolo.views.zbuffer import visible_points
+from research.commands import loss_surface as tool
+from research.experiments.loss_surface import LossSurface, PoseGrid, loss_surface
 
 STEP = 0.3
 

@@ -8,11 +8,11 @@ import cv2
 import numpy as np
 import pytest
 
-from piccolo.cli import make_room as tool
 from piccolo.geometry.pose import rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM
-from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.walk_frames import BAD_KINDS
+from piccolo.scene import read_scene
+from research.commands import make_room as tool
+from research.synthetic.walk_frames import BAD_KINDS
 
 
 def written(folder, words):

@@ -18,7 +18,7 @@ from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
-from piccolo.scenes.synthetic.world import photograph, render_picture
+from research.synthetic.world import photograph, render_picture
 
 
 def test_a_bundle_of_one_keeps_what_its_photo_rules_out():

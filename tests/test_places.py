@@ -5,14 +5,20 @@ import itertools
 import numpy as np
 import pytest
 import rooms
-from measuring import confidence
-from measuring.confidence import MOST_RADIUS, light_unevenly, mask_outside_field, occlude, remove_texture
-from measuring.places import ALIKE_KINDS, CHANGED, make_alike
 
 from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
-from piccolo.scenes.synthetic.room import PLAIN
-from piccolo.scenes.synthetic.world import World, make_query
+from research.measuring import confidence
+from research.measuring.confidence import (
+    MOST_RADIUS,
+    light_unevenly,
+    mask_outside_field,
+    occlude,
+    remove_texture,
+)
+from research.measuring.places import ALIKE_KINDS, CHANGED, make_alike
+from research.synthetic.room import PLAIN
+from research.synthetic.world import World, make_query
 
 WIDTH = 256
 

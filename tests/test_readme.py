@@ -6,10 +6,10 @@ import shlex
 import subprocess
 import sys
 import textwrap
-from importlib import import_module
 from pathlib import Path
 
 import pytest
+from batches import main_of
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text()
@@ -35,8 +35,7 @@ def _run_all(commands, folder, monkeypatch, capsys):
         if program == "mkdir":
             Path(*words).mkdir()
         else:
-            main = import_module(f"piccolo.cli.{Path(program).stem}").main
-            assert main(words) == 0, capsys.readouterr().err
+            assert main_of(program)(words) == 0, capsys.readouterr().err
     return capsys.readouterr().out
 
 

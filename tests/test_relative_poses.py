@@ -11,7 +11,7 @@ from refusals import assert_refused
 from piccolo.batch.frame_times import times_of
 from piccolo.batch.relative_poses import read_odometry, read_relative_poses
 from piccolo.errors import InputError
-from piccolo.scenes.export import Options, export
+from piccolo.export import Options, export
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
 PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]

@@ -14,7 +14,7 @@ from piccolo.cli import prepare_map, render_pose
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.optimize import descent_animation as animation
 from piccolo.optimize.refine import DescentSettings
-from piccolo.scenes.scene import read_scene
+from piccolo.scene import read_scene
 
 
 @pytest.fixture(scope="module")

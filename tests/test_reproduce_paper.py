@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from rooms import write_room
 
-from piccolo.cli import reproduce_paper
 from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
@@ -18,10 +17,11 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
-from piccolo.scenes.evaluation.query_result import read_run
-from piccolo.scenes.reproduce_paper import EXPERIMENTS, flip, identity, thin, with_random_rotation
-from piccolo.scenes.scene import Query, read_scene, write_queries
+from piccolo.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
+from research.commands import reproduce_paper
+from research.evaluation.query_result import read_run
+from research.experiments.reproduce_paper import EXPERIMENTS, flip, identity, thin, with_random_rotation
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
 QUICK = PaperSettings(num_translations=8, num_iterations=20)

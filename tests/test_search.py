@@ -6,7 +6,6 @@ import naive
 import numpy as np
 import pytest
 import rooms
-from measuring.confidence import mask_outside_field
 
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
@@ -20,6 +19,7 @@ from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
 from piccolo.scan_map.prior import Prior
+from research.measuring.confidence import mask_outside_field
 
 AREA = make_grid(24).solid_angle
 

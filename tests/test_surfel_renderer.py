@@ -17,7 +17,6 @@ from piccolo.geometry.pose import Pose, angle_between, exp_so3, step
 from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.scenes.synthetic.raycast import cast_rays
 from piccolo.views.pictures import encode_image, fill_holes
 from piccolo.views.surfels import (
     BAND,
@@ -30,6 +29,7 @@ from piccolo.views.surfels import (
     splat,
 )
 from piccolo.views.zbuffer import View
+from research.synthetic.raycast import cast_rays
 
 WORKERS = Workers(2)
 WIDTH = 256

@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 from rooms import query, room
 
-from piccolo.cli import make_room as tool
 from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.scenes.scene import read_scene
-from piccolo.scenes.synthetic.raycast import cast_rays
-from piccolo.scenes.synthetic.room import make_room
-from piccolo.scenes.synthetic.world import (
+from piccolo.scene import read_scene
+from research.commands import make_room as tool
+from research.synthetic.raycast import cast_rays
+from research.synthetic.room import make_room
+from research.synthetic.world import (
     RANGE_NOISE,
     VARIANTS,
     free_position,

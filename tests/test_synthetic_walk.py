@@ -8,11 +8,11 @@ import pytest
 from piccolo.geometry.pose import Pose, angle_between, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.scenes.synthetic.office import make_office
-from piccolo.scenes.synthetic.raycast import cast_rays
-from piccolo.scenes.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
-from piccolo.scenes.synthetic.walking import HEIGHT, Walker
-from piccolo.scenes.synthetic.world import photograph, scan_world
+from research.synthetic.office import make_office
+from research.synthetic.raycast import cast_rays
+from research.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
+from research.synthetic.walking import HEIGHT, Walker
+from research.synthetic.world import photograph, scan_world
 
 SIZE = np.array([4.0, 3.2, 2.5])
 WORKERS = Workers(2)

@@ -4,20 +4,20 @@ import datetime
 import json
 import re
 
-import benchmark
 import cv2
 import numba
 import numpy as np
 import pytest
 from batches import ROOT, command_of, run
-from measuring import confidence, damage, page, photos, scaling
 from rooms import write_room
 
 from piccolo.geometry.pose import Pose
 from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
-from piccolo.scenes.scene import Query, read_scene, write_queries
+from piccolo.scene import Query, read_scene, write_queries
+from research.commands import benchmark
+from research.measuring import confidence, damage, page, photos, scaling
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,6 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from measuring.confidence import mask_outside_field
 
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
@@ -36,7 +35,8 @@ from piccolo.localization.verification import (
 )
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
-from piccolo.scenes.synthetic.world import change_light, photograph, scan_world
+from research.measuring.confidence import mask_outside_field
+from research.synthetic.world import change_light, photograph, scan_world
 
 NUM_POINTS = 200_000
 WIDTH = 1024

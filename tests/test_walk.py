@@ -14,16 +14,16 @@ from piccolo.cli import localize as localize_command
 from piccolo.cli import walking as walk_command
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
+from piccolo.export.formats import tum_lines
+from piccolo.export.video import writing_video
 from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import picture
 from piccolo.result import read_results
 from piccolo.scan_walk import Walk
-from piccolo.scenes.export.formats import tum_lines
-from piccolo.scenes.export.video import writing_video
-from piccolo.scenes.synthetic.world import free_position, photograph
 from piccolo.walk import tracker as tracker_module
+from research.synthetic.world import free_position, photograph
 
 NUM_FRAMES, STEP_S = 8, 0.5
 

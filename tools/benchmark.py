@@ -1,32 +1,4 @@
 #!/usr/bin/env python3
-"""Measure the method, write BENCHMARK.md, and fit the confidence."""
+from _checkout import run
 
-import argparse
-import sys
-
-import _checkout  # noqa: F401
-from measuring import calibration, confidence, page
-
-from piccolo.cli.command import HelpFormatter, add_run_options, command
-
-MEASUREMENTS = {"all": page, "confidence": confidence, "calibration": calibration}
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add a subcommand for each measurement."""
-    subparsers = parser.add_subparsers(dest="measurement", required=True)
-    for name, module in MEASUREMENTS.items():
-        lines = {"help": module.__doc__, "description": module.__doc__, "epilog": module.EPILOG}
-        subparser = subparsers.add_parser(name, formatter_class=HelpFormatter, **lines)
-        module.add_arguments(subparser)
-        add_run_options(subparser)
-
-
-@command(__file__, __doc__, "", add_arguments, "0 done, 1 confidence found a false answer")
-def main(arguments: argparse.Namespace) -> int:
-    """Run the measurement asked for; returns the exit code."""
-    return int(MEASUREMENTS[arguments.measurement].run(arguments))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+run(__name__, "research.commands.benchmark")

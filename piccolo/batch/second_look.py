@@ -9,15 +9,15 @@ from hashlib import sha256
 from typing import Any, NamedTuple
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..confidence.focal_length import Consensus, Opinion
 from ..confidence.localization import FocalLength, Localization
-from ..localization.focal_consensus import Opinion, combine
 from ..localization.focal_length import WIDE
 from ..localization.judge import follow_consensus
 from ..result import Result
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
 LEAST_CONFIDENCE = 0.95  # of these: about the log odds of 3 that frames of walks need
-BETTER = 0.5  # of the deviation of a focal length that others must leave
+BETTER = 0.7  # of the deviation of a focal length: most that others must have
 ONE_CAMERA = 1.02  # most between focal lengths given of one camera, as focusing changes them
 TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
 
@@ -76,11 +76,11 @@ def list_looks_by_focal(texts: Sequence[str]) -> list[Look]:
     lines = [parse_line(text) for text in texts]
     looks = []
     for camera in group_by_camera(lines):
-        for k in camera:
+        consensus = Consensus([known.opinion for _, known in camera])
+        for n, (k, focal) in enumerate(camera):
             line = lines[k]
-            focal = line.focal
-            others = combine([o for n in camera if n != k and (o := opinion_of(lines[n].focal))])
-            if others is None or focal is None or focal.others_px is not None:
+            others = consensus.opinion(without=n)
+            if others is None or focal.others_px is not None:
                 continue
             px = focal.given_px * math.exp(others.off)
             std_px = math.sqrt(others.variance) * px
@@ -99,10 +99,10 @@ def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> li
     lines = [parse_line(text) for text in texts]
     changed = []
     for camera in group_by_camera(lines):
-        consensus = combine([o for n in camera if (o := opinion_of(lines[n].focal))])
-        for k in camera:
-            if consensus is None:
-                break
+        consensus = Consensus([known.opinion for _, known in camera]).opinion()
+        if consensus is None:
+            continue
+        for k, _ in camera:
             before = Result.from_json(texts[k])
             after = take_consensus(before, consensus, min_confidence)
             is_other = after.status != before.status or after.warnings != before.warnings
@@ -132,34 +132,26 @@ def take_consensus(result: Result, consensus: Opinion, min_confidence: float) ->
     )
 
 
-def opinion_of(focal: FocalLength | None) -> Opinion | None:
-    """Return what a photo alone says of its focal length, if anything."""
-    if focal is None or focal.picture_px is None or focal.picture_std_px is None:
-        return None
-    off = math.log(focal.picture_px / focal.given_px)
-    return Opinion(off, (focal.picture_std_px / focal.picture_px) ** 2)
-
-
-def group_by_camera(lines: Sequence[Line]) -> list[list[int]]:
-    """Return the numbers of photos by camera: of one size, source and about the focal length given.
+def group_by_camera(lines: Sequence[Line]) -> list[list[tuple[int, FocalLength]]]:
+    """Return numbers and focal lengths of photos by camera: of one size, source and about what was given.
 
     Those whose focal length was a mere guess are left out.
     """
     known = [
-        (line.image_size, line.focal.source, line.focal.given_px, k)
+        (line.image_size, line.focal.source, line.focal.given_px, k, line.focal)
         for k, line in enumerate(lines)
         if line.focal is not None and line.focal.given_deviation <= WIDE
     ]
-    groups: list[list[int]] = []
+    groups: list[list[tuple[int, FocalLength]]] = []
     camera: tuple[object, ...] = ()
     largest = 0.0
-    for *kind, px, k in sorted(known):
-        if tuple(kind) != camera or px > largest:
+    for size, source, px, k, focal in sorted(known, key=lambda one: one[:4]):
+        if (size, source) != camera or px > largest:
             groups.append([])
-        groups[-1].append(k)
-        camera = tuple(kind)
+        groups[-1].append((k, focal))
+        camera = size, source
         largest = ONE_CAMERA * px
-    return [sorted(group) for group in groups]
+    return groups
 
 
 def list_looks_beside(texts: Sequence[str]) -> list[Look]:

@@ -22,7 +22,7 @@ from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
-from ..scenes.scene import QUERIES_NAME, read_scene, write_queries
+from ..scene import QUERIES_NAME, read_scene, write_queries
 from .command import command, option, print_warnings
 from .errors import checking_options, print_error
 from .options import add_cloud_options, cloud_settings_from

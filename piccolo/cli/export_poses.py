@@ -7,13 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
+from ..export import FORMATS, Options, Selection, export, select, true_results
+from ..export.formats import offset_file
 from ..geometry.rotations import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
-from ..scenes.evaluation.query_result import input_files
-from ..scenes.export import FORMATS, Options, Selection, export, select, true_results
-from ..scenes.export.formats import offset_file
-from ..scenes.scene import find_scenes
+from ..scene import find_scenes, input_files
 from .command import command, option
 from .errors import checking_options, print_note
 from .outputs import check_distinct, print_report

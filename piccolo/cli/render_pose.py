@@ -14,6 +14,7 @@ from ..camera import Camera, Mount
 from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
 from ..errors import InputError
+from ..export.video import writing_video
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
 from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
@@ -27,8 +28,7 @@ from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
 from ..result import read_results
 from ..scan_map.open_map import open_points
-from ..scenes.export.video import writing_video
-from ..scenes.scene import read_scene
+from ..scene import read_scene
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
 from .command import command, option, print_warnings

@@ -18,7 +18,7 @@ from ..jobs.arenas import share_arenas
 # Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
 COMMANDS = (
     "localize", "align_gravity", "prepare_map", "render_pose", "color_scan", "export_poses", "report",
-    "e57_images", "make_room", "convert_dataset", "evaluate", "reproduce_paper", "loss_surface",
+    "e57_images",
 )  # fmt: skip
 SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
 # a parameter of the API in a message, the unit in its name, and those whose flag has another name
@@ -42,7 +42,7 @@ def __getattr__(name: str) -> Callable[[], int]:
     """Return a function that runs the command `name`."""
     if name not in COMMANDS:
         raise AttributeError(f"piccolo has no command {name!r}")
-    return partial(run, name)
+    return partial(run, f"piccolo.cli.{name}")
 
 
 def for_terminal(text: str) -> str:
@@ -59,8 +59,8 @@ def as_started(text: str) -> str:
     return SCRIPT.sub(lambda match: f"piccolo-{match[1].replace('_', '-')}", text)
 
 
-def run(name: str) -> int:
-    """Import the command `name` of piccolo.cli and run it; returns its exit code."""
+def run(module: str) -> int:
+    """Import the `module` of a command and run its `main`; returns the exit code."""
     open_closed_streams()
     share_arenas()
     space, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -73,7 +73,7 @@ def run(name: str) -> int:
     signal.signal(signal.SIGINT, handler if is_ignored else _quit)
     signal.signal(signal.SIGTERM, _quit)
     try:
-        main = import_module(f"piccolo.cli.{name}").main
+        main = import_module(module).main
     except (ImportError, MemoryError, OSError) as error:  # a library is missing, or memory for it
         print_line(f"the libraries cannot be loaded ({' '.join(str(error).split()) or 'not enough memory'})")
         return EXIT_CANNOT_START

@@ -1,5 +1,6 @@
 """Results of a method for one panorama."""
 
+import math
 from dataclasses import dataclass, replace
 
 from ..camera import Mount
@@ -7,6 +8,7 @@ from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from .confidence import NOT_LOCALIZED, Standing
 from .covariance import PoseCovariance
+from .focal_length import Opinion
 
 
 @dataclass(frozen=True)
@@ -46,7 +48,7 @@ class FocalLength:
     given_std_px: float
     picture_px: float | None = None  # by the photo and the scan alone; None if they tell nothing
     picture_std_px: float | None = None
-    doubt: float = 0.0  # probability that what was given is wrong
+    doubt: float = 0.0  # probability that it rests on what was given, and that this is wrong
     source: str = ""  # of what was given: the option, or EXIF
     others_px: float | None = None  # by other photos of the camera, where that was taken for the one given
     others_std_px: float | None = None
@@ -55,6 +57,14 @@ class FocalLength:
     def given_deviation(self) -> float:
         """Standard deviation of the logarithm of what was given."""
         return self.given_std_px / self.given_px
+
+    @property
+    def opinion(self) -> Opinion | None:
+        """The opinion of the photo alone; None if it has none."""
+        if self.picture_px is None or self.picture_std_px is None:
+            return None
+        off = math.log(self.picture_px / self.given_px)
+        return Opinion(off, (self.picture_std_px / self.picture_px) ** 2)
 
     def after(self, found: "FocalLength | None") -> "FocalLength":
         """Return what was found with what others say, beside what was given and what the photo said alone."""

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.confidence import LOCALIZED
+from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
@@ -42,7 +43,6 @@ from .bundle_search import (
     weigh_bundles,
 )
 from .comparison import score_pose
-from .focal_consensus import MOST_CONFLICT
 from .focal_length import FocalFit, calibrate
 from .judge import judge, judge_together
 from .localize import find_pose

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
+from ..confidence.focal_length import MOST_CONFLICT, SLIPS, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
@@ -30,7 +31,6 @@ from ..panorama import Panorama
 from ..views.view import Cells
 from .comparison import mask_occluders, score_pose
 from .covariance import SCALE, remove_poles, sort_by_block, sum_by_block
-from .focal_consensus import MOST_CONFLICT, SLIPS, Opinion
 from .last_descent import refine_to_the_end
 from .query import Features, Query, make_images, prepare_query
 from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
@@ -77,7 +77,7 @@ class FocalFit(NamedTuple):
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
     opinion: Opinion | None  # what the picture alone says; None if it says nothing
     conflict: float  # deviations between that and what was given; 0 if it says nothing
-    doubt: float = 0.0  # probability that what was given is wrong by more than its deviation
+    doubt: float = 0.0  # probability that it rests on what was given, and that this is wrong
 
     @property
     def deviation(self) -> float:
@@ -160,7 +160,8 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     if crest.information.any():
         opinion = Opinion(float(crest.change[0] - expected[0]), crest.variance)
         conflict = opinion.conflict(prior.deviation)
-        doubt = opinion.doubt(prior.deviation) if doubt else 0.0
+        if doubt:
+            doubt = opinion.doubt(prior.deviation) * opinion.share_of_given(prior.deviation)
         spread = crest.variance + prior.deviation**2
         # of the prior's variance, as by DerSimonian and Laird (1986)
         excess = max(opinion.off**2 - spread, 0.0)

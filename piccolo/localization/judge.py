@@ -17,6 +17,7 @@ import numpy as np
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.covariance import describe_errors
+from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
 from ..geometry.pose import Array, Pose
@@ -30,7 +31,6 @@ from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .brief import mirror_query
 from .covariance import estimate_covariance
-from .focal_consensus import MOST_CONFLICT, Opinion
 from .focal_length import FocalFit, fit_focal
 from .last_descent import settle
 from .prior import contradictions
@@ -162,11 +162,15 @@ def reconsider(found: Localization, factor: float, min_confidence: float) -> Loc
 def follow_consensus(found: Localization, consensus: Opinion, min_confidence: float) -> Localization:
     """Return the result of a photo whose focal length, as given, other photos of its camera confirm or doubt.
 
-    `consensus` is that of all of them. What it contradicts is ruled out, with a warning.
+    `consensus` is that of all of them. What it contradicts is ruled out, with a warning. A pose that rests on
+    what the others say is not doubted with what was given.
     """
     focal = found.focal_length
     assert focal is not None
-    doubt = consensus.doubt(focal.given_deviation)
+    doubt = focal.doubt
+    if focal.others_px is None:
+        share = focal.opinion.share_of_given(focal.given_deviation) if focal.opinion else 1.0
+        doubt = share * consensus.doubt(focal.given_deviation)
     is_contradicted = consensus.conflict(focal.given_deviation) > MOST_CONFLICT
     factor = (1.0 - doubt) / (1.0 - focal.doubt)
     told = replace(found, focal_length=replace(focal, doubt=doubt), is_ruled_out=is_contradicted)

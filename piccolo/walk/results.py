@@ -10,10 +10,10 @@ import numpy as np
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED
 from ..confidence.covariance import describe_errors
+from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import probability_within, std_of
-from ..localization.focal_consensus import MOST_CONFLICT
 from ..localization.judge import decide, take_pose
 from ..localization.prior import contradictions
 from ..optimize.smoothing import smooth_positions

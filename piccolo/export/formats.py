@@ -1,0 +1,332 @@
+"""Poses as text: tables, trajectories, Potree, COLMAP, nerfstudio, OpenSfM, points and tracks on maps.
+
+Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
+written beside it: <name>.offset.txt.
+"""
+
+import csv
+import io
+import json
+from collections.abc import Iterable, Sequence
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..errors import InputError, printable
+from ..files.atomic import is_stream, replacing_folder, write_atomically
+from ..geometry import rotations
+from ..geometry.pose import Pose, log_so3, quaternion_wxyz
+from ..geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM, OPTICAL_FROM_CAM, turn_axes
+from ..optional import import_optional
+from .posed_images import NO_UTF8, Format, Options, PosedImage
+
+COLUMNS = (
+    *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
+    *("quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"),  # of R_cam_from_world
+    *("heading_deg", "pitch_deg", "roll_deg"),
+)
+STEP = 10.0  # [m] ahead, to find true north
+MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
+LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
+GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
+
+
+def numbers(values: Iterable[float], separator: str = " ") -> str:
+    """Return the shortest text of each number that reads back as the same float64."""
+    return separator.join(repr(float(value)) for value in values)
+
+
+def offset_comment(options: Options) -> list[str]:
+    """Return a comment line that gives the offset; none without."""
+    if options.offset is None:
+        return []
+    return [f"# world position = position here + {numbers(options.offset)}"]
+
+
+def write_lines(out: Path, lines: Sequence[str]) -> None:
+    """Write a text file, UTF-8."""
+    write_atomically(out, "".join(f"{line}\n" for line in lines).encode())
+
+
+def offset_file(out: Path) -> Path:
+    """Return the file of the offset beside one that has no place for it."""
+    return out.with_name(f"{out.name}.offset.txt")
+
+
+def write_offset_beside(out: Path, options: Options) -> None:
+    """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
+    if options.offset is None:
+        return
+    if is_stream(out):
+        raise InputError(f"`offset`: nothing can be written beside {out}, wanted a file as `out`")
+    write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
+
+
+def cell(text: str) -> str:
+    """Text that no spreadsheet takes for a formula: after an apostrophe, which marks text there."""
+    return f"'{text}" if text.startswith(("=", "+", "-", "@", "\t", "\r", "'")) else text
+
+
+def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a header and a row a result, in our own axes; what is not known is empty, paths as of `cell`."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(COLUMNS)
+    for image in images:
+        result = image.result
+        pose = image.pose
+        score = result.evidence.score if result.evidence else None
+        words = (cell(image.name), cell(result.cloud_name), result.status, result.confidence, score)
+        wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
+        table.writerow([*words, *pose.center_world.tolist(), *wxyz, *rotations.heading_pitch_roll_deg(pose)])
+    write_offset_beside(out, options)
+    write_atomically(out, text.getvalue().encode())
+
+
+def write_tum(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write rows "timestamp tx ty tz qx qy qz qw", world from camera, by time, below a comment."""
+    ordered = sorted(images, key=lambda image: Decimal(image.time))
+    header, *rows = tum_lines([(image.time, image.pose) for image in ordered], options.axes)
+    write_lines(out, [header, *offset_comment(options), *rows])
+
+
+def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
+    """Return a comment and the rows of poses, each with the text of its time; `axes` as in CAMERA_AXES."""
+    lines = [f"# timestamp tx ty tz qx qy qz qw, camera axes {axes}"]
+    for time, pose in poses:
+        T = turn_axes(pose, CAMERA_AXES[axes]).T_world_from_cam
+        w, x, y, z = quaternion_wxyz(T[:3, :3])
+        lines.append(f"{time} {numbers([*T[:3, 3], x, y, z, w])}")
+    return lines
+
+
+def write_kitti(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write the twelve numbers of a 3 x 4 matrix, world from camera, a row; the format has no comments."""
+    matrices = [turn_axes(image.pose, CAMERA_AXES[options.axes]).T_world_from_cam for image in images]
+    write_offset_beside(out, options)
+    write_lines(out, [numbers(T[:3].ravel()) for T in matrices])
+
+
+def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write coordinates.txt of Potree's 360 images (src/modules/Images360/Images360.js).
+
+    Columns, by tabs: file, time, x, y, z in the cloud's coordinates, course, pitch, roll [deg]. Potree turns
+    the sphere by R_z(90 - course) R_y(-pitch) R_x(90 + roll); with the picture as three.js lays it on the
+    sphere these are heading, pitch and roll of Photo Sphere XMP. The first line is empty: by its version
+    Potree skips the first line or reads it.
+    """
+    lines = [""]
+    for image in images:
+        values = [*image.pose.center_world, *rotations.heading_pitch_roll_deg(image.pose)]
+        lines.append("\t".join([image.name, image.time, numbers(values, "\t")]))
+    write_offset_beside(out, options)
+    write_lines(out, lines)
+
+
+def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write cameras.txt, images.txt and a points3D.txt without points into a new folder.
+
+    https://colmap.github.io/format.html: T_cam_from_world, camera axes right, down, forward. The camera model
+    EQUIRECTANGULAR came with COLMAP 4; its parameters are the width and height. Its pixels are ours. Photos
+    have their own models, which are COLMAP's; of a rig each picture is an image.
+    """
+    texts = [_colmap_camera(image) for image in images]
+    camera_ids = {text: i for i, text in enumerate(dict.fromkeys(texts), 1)}
+    cameras = [f"{i} {text}" for text, i in camera_ids.items()]
+    lines = []
+    for i, (image, text) in enumerate(zip(images, texts, strict=True), 1):
+        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
+        values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *rotations.translation(pose)])
+        lines += [f"{i} {values} {camera_ids[text]} {image.name}", ""]  # a line of points follows
+    offset = offset_comment(options)
+    with replacing_folder(out) as folder:
+        comment = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
+        write_lines(folder / "cameras.txt", [comment, *offset, *cameras])
+        comment = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points"
+        write_lines(folder / "images.txt", [comment, *offset, *lines])
+        write_lines(folder / "points3D.txt", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"])
+
+
+def _colmap_camera(image: PosedImage) -> str:
+    """Model, size and parameters."""
+    if camera := image.camera:
+        return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
+    w, h = image.size
+    return f"EQUIRECTANGULAR {w} {h} {w} {h}"
+
+
+def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write transforms.json: T_world_from_cam, camera axes right, up, back; the offset is applied_transform.
+
+    Rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py: theta = -pi (x - cx) / fl_x,
+    phi = pi (1/2 + (y - cy) / fl_y), direction (-sin theta sin phi, cos phi, -cos theta sin phi): the image
+    centre looks along -z.
+    """
+    is_one_size = len({image.size for image in images}) == 1
+    document: dict[str, object] = {"camera_model": "EQUIRECTANGULAR"}
+    if is_one_size:
+        document |= _intrinsics(images[0].size)
+    if options.offset is not None:
+        moved = np.column_stack([np.eye(3), -np.array(options.offset)])
+        document["applied_transform"] = moved.tolist()
+    frames = []
+    for image in images:
+        own = {} if is_one_size else _intrinsics(image.size)
+        matrix = turn_axes(image.pose, OPENGL_FROM_CAM).T_world_from_cam.tolist()
+        frames.append({"file_path": image.name, **own, "transform_matrix": matrix})
+    write_json(out, document | {"frames": frames})
+
+
+def _intrinsics(size: tuple[int, int]) -> dict[str, float]:
+    """Return sphere as a focal length: x - cx reaches +-fl_x at the seam, y - cy +-fl_y / 2 at the poles."""
+    w, h = size
+    return {"w": w, "h": h, "fl_x": w / 2, "fl_y": float(h), "cx": w / 2, "cy": h / 2}
+
+
+def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a list of one reconstruction without points. Camera axes right, down, forward.
+
+    https://opensfm.org/docs/geometry.html: rotation is an angle-axis vector and translation t of
+    x_cam = R x_world + t. Its spherical camera takes the sphere to be W = 2 H exactly.
+    """
+    cameras = {}
+    shots = {}
+    for image in images:
+        width, height = image.size
+        camera = f"spherical {width} {height}"
+        cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
+        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
+        rotation = log_so3(pose.R_cam_from_world).tolist()
+        shot = {"rotation": rotation, "translation": rotations.translation(pose).tolist(), "camera": camera}
+        shots[image.name] = shot
+    write_offset_beside(out, options)
+    write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
+
+
+def _check_shape(image: PosedImage) -> None:
+    """Refuse a sphere that OpenSfM can't take."""
+    width, height = image.size
+    if width != 2 * height:
+        raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
+
+
+def write_json(out: Path, document: object) -> None:
+    """Write a JSON file."""
+    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+
+
+def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a FeatureCollection (RFC 7946) with a point a result: longitude and latitude in WGS84."""
+    geod, transformer, crs = _in_degrees("GeoJSON", images, options)
+    features = [_feature(image, transformer, geod, crs) for image in images]
+    write_json(out, {"type": "FeatureCollection", "features": features})
+
+
+def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a track (GPX 1.1) with a point a result, in order; a new segment behind each gap of a walk."""
+    _, transformer, _ = _in_degrees("GPX", images, options)
+    root = ElementTree.Element("gpx", version="1.1", creator="piccolo", xmlns=GPX_NAMESPACE)
+    track = ElementTree.SubElement(root, "trk")
+    segment = ElementTree.SubElement(track, "trkseg")
+    for image in images:
+        if image.result.walk is not None and image.result.walk.gap is not None:
+            segment = ElementTree.SubElement(track, "trkseg")
+        longitude, latitude = transformer.transform(*image.pose.center_world[:2].tolist())
+        point = ElementTree.SubElement(segment, "trkpt", lat=repr(latitude), lon=repr(longitude))
+        if taken := image.result.source.capture_time:
+            ElementTree.SubElement(point, "time").text = taken
+        ElementTree.SubElement(point, "name").text = printable(image.name)
+    write_atomically(out, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tuple[Any, Any, str]:
+    """Return the ellipsoid, what turns positions into longitude and latitude, and the system's name."""
+    pyproj = import_optional(what, "pyproj", "tools")
+    crs = str(options.crs)
+    try:
+        system = pyproj.CRS.from_user_input(crs)
+    except pyproj.exceptions.CRSError as error:
+        raise InputError(f"`crs`: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    units = {axis.unit_name for axis in system.axis_info[:2]}
+    if not system.is_projected or units != {"metre"}:
+        raise InputError(f"`crs`: found {crs} ({system.name}), wanted a projected system in metres")
+    transformer = pyproj.Transformer.from_crs(system, "EPSG:4326", always_xy=True)
+    for image in images:
+        _check_place(image, system, transformer, crs)
+    return pyproj.Geod(ellps="WGS84"), transformer, crs
+
+
+def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> None:
+    """Refuse a camera outside of the area where the system is used, as far as the system says it."""
+    x, y = image.pose.center_world[:2].tolist()
+    longitude, latitude = transformer.transform(x, y)
+    parts = [system, *system.sub_crs_list]  # a system with a height says it of its parts
+    area = next((part.area_of_use for part in parts if part.area_of_use), None)
+    if not np.isfinite([longitude, latitude]).all() or (area and not _is_in(area, longitude, latitude, x, y)):
+        name = str(system.name)
+        if area:
+            name += f", {area.west:g} to {area.east:g} E, {area.south:g} to {area.north:g} N"
+        found = f"found a camera at ({x:g}, {y:g})"
+        raise InputError(f"{image.path}: {found}, wanted one where {crs} holds ({name})")
+
+
+def _is_in(area: Any, longitude: float, latitude: float, x: float, y: float) -> bool:
+    """Return True if a place [deg], (x, y) [m] in the system, is in its area with a margin.
+
+    Some cross 180 E.
+    """
+    margin = 0.0 if np.hypot(x, y) < LOCAL else MARGIN_DEG
+    width = 360.0 if area.east - area.west >= 360.0 else (area.east - area.west) % 360.0
+    is_between = (longitude - area.west + margin) % 360.0 <= width + 2.0 * margin
+    return bool(is_between and area.south - margin <= latitude <= area.north + margin)
+
+
+def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[str, object]:
+    """Return the point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
+    result = image.result
+    x, y, z = image.pose.center_world.tolist()
+    heading, pitch, roll = rotations.heading_pitch_roll_deg(image.pose)
+    ahead = np.radians(heading)
+    eastings = [x, x + STEP * np.sin(ahead)]
+    northings = [y, y + STEP * np.cos(ahead)]
+    longitudes, latitudes = transformer.transform(eastings, northings)
+    true_heading, _, _ = geod.inv(longitudes[0], latitudes[0], longitudes[1], latitudes[1])
+    properties = {
+        "image": image.name,
+        "cloud": result.cloud_name,
+        "status": result.status,
+        "confidence": result.confidence,
+        "score": result.evidence and result.evidence.score,
+        **{"crs": crs, "x": x, "y": y, "z": z},
+        **{"heading_deg": heading, "heading_true_deg": true_heading % 360.0},
+        **{"pitch_deg": pitch, "roll_deg": roll},
+    }
+    point = {"type": "Point", "coordinates": [longitudes[0], latitudes[0]]}
+    return {"type": "Feature", "geometry": point, "properties": properties}
+
+
+OFFSET = frozenset({"offset"})
+MODEL = OFFSET | {"size"}
+COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; `out` is a new folder"
+NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder of `images`"
+POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder of `images`"
+# a blank ends a name, for COLMAP as for the readers in Python
+COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=rf"\s|{NO_UTF8}", cameras="own")
+NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL, cameras="spheres")
+OPENSFM_TEXT = "reconstruction.json of OpenSfM"
+OPENSFM = Format("opensfm", OPENSFM_TEXT, write_opensfm, MODEL, cameras="spheres", check=_check_shape)
+CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
+TRAJECTORY = "trajectory for evo and other tools"
+TUM = Format("tum", TRAJECTORY, write_tum, OFFSET | {"axes", "timestamps"}, forbidden="")
+KITTI = Format("kitti", TRAJECTORY, write_kitti, OFFSET | {"axes"}, forbidden="")
+NOT_IN_POTREE = rf"[\"\t\n\r]|{NO_UTF8}"
+POTREE = Format(
+    "potree", POTREE_TEXT, write_potree, OFFSET | {"timestamps"}, forbidden=NOT_IN_POTREE, cameras="spheres"
+)
+GEOJSON_TEXT = "points for maps, in WGS84; needs `crs` and the library pyproj"
+GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
+GPX_TEXT = "track of the positions in WGS84; needs `crs` and the library pyproj"
+GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")

@@ -1,0 +1,1 @@
+"""The commands, a module each: scripts of the same names in tools/."""

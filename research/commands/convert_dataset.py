@@ -1,0 +1,119 @@
+"""Write research datasets, or your own panoramas with known poses, as scenes that tools/evaluate.py reads."""
+
+import argparse
+import json
+from collections import Counter
+from dataclasses import fields
+
+from piccolo.cli.command import HelpFormatter, add_run_options, check_least, command, option
+from piccolo.cli.errors import EXIT_BAD_INPUT, print_error, print_note
+from piccolo.cli.outputs import check_folder_name
+from piccolo.cli.progress import progress_bar
+from piccolo.errors import InputError
+from piccolo.jobs.threads import Progress, Workers, num_cores
+from piccolo.scene import read_scene
+
+from ..datasets import DATASETS
+from ..datasets.checking import check_scene
+from ..datasets.files import AXES, DIRECTIONS
+from ..datasets.model import ConvertOptions, SceneSpec
+from ..datasets.writing import write_scene
+
+EXIT_BAD_FIT = 1
+_DATASETS = "\n".join(f"  {name:<14} {dataset.description}" for name, dataset in DATASETS.items())
+EPILOG = f"""\
+datasets:
+{_DATASETS}
+
+example:
+  python tools/convert_dataset.py stanford2d3ds --from data/stanford --out scenes --areas 1 3 --check 3
+
+Writes OUT/SCENE/cloud.ply, images/ (links to the dataset's files, or copies), labels/ and queries.json.
+docs/DATASETS.md describes them, and the folders and poses of each dataset. An existing scene is not changed.
+A scene with a damaged file is left out and named on stderr. Prints one JSON object per scene.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options; those that one dataset alone has are in its own subparser."""
+    subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
+    for name, dataset in DATASETS.items():
+        one = subparsers.add_parser(name, description=dataset.description, formatter_class=HelpFormatter)
+        option(one, "--from FOLDER", "folder of the dataset", required=True, dest="folder")
+        option(one, "--out FOLDER", "folder of the scenes; created if missing", required=True)
+        text = "only these, the last parts of scene names: office_1, weddingHall_1, a house"
+        option(one, "--rooms NAME ...", text, default=[])
+        option(one, "--check N", "check the poses of N panoramas of each scene against its cloud", default=0)
+        text = "copy the panoramas, so that the dataset can be deleted (default: link to them)"
+        option(one, "--copy", text)
+        add_own_options(one, name)
+        add_run_options(one)
+
+
+def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
+    """Add the options of one dataset alone; of `generic` those where the list has no column."""
+    if dataset == "stanford2d3ds":
+        option(parser, "--areas 1-6 ...", "only these areas", default=[])
+        text = "write clouds with a label per point (from Annotations), and labels/ of the panoramas"
+        option(parser, "--labels", text)
+    elif dataset == "mpo":
+        option(parser, "--seed N", "seed of the random transforms", default=0)
+    elif dataset == "generic":
+        option(parser, "--poses FILE", "list of poses (default: poses.csv, .json, .txt or .tum in --from)")
+        option(parser, "--cloud FILE", "cloud of the scene (default: the only cloud in --from)")
+        option(parser, "--images FOLDER", "pictures named by their times (default: images in --from)")
+        text = "piccolo: forward, left, up; optical: right, down, forward; opengl: right, up, back"
+        option(parser, "--axes", f"axes of the camera; {text}", choices=AXES)
+        text = "direction of the transform [R | t] of a row"
+        option(parser, "--direction", text, choices=DIRECTIONS)
+
+
+def choose_scenes(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
+    """Return the scenes of some rooms, or all."""
+    counts = Counter(spec.name for spec in specs)
+    if twice := [name for name, count in counts.items() if count > 1]:
+        raise InputError(f"--from: found the scene {twice[0]} twice")
+    names = {spec.name.split("/")[-1] for spec in specs}
+    if missing := [room for room in rooms if room not in names]:
+        raise InputError(f"--rooms: found no {missing[0]}, wanted one of {', '.join(sorted(names))}")
+    return [spec for spec in specs if not rooms or spec.name.split("/")[-1] in rooms]
+
+
+@command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit")
+def main(arguments: argparse.Namespace) -> int:
+    """Write the scenes one by one; returns the exit code."""
+    check_least(arguments, check=0, seed=0)
+    check_folder_name("--out", arguments.out)
+    # a dataset's subparser has only some of the options
+    own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
+    options = ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})
+    found = DATASETS[arguments.dataset].list_scenes(options)
+    specs = choose_scenes(found.specs, arguments.rooms)
+    for note in found.notes:
+        print_note(arguments, note)
+    show = progress_bar(arguments.quiet)
+    # bad input goes before a bad fit
+    return max((convert_scene(spec, arguments, show) for spec in specs), default=0)
+
+
+def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress) -> int:
+    """Write a scene, check it, and print its line; returns the exit code."""
+    try:
+        written = write_scene(spec, arguments.out, arguments.copy, show)
+        check = None
+        if arguments.check:
+            scene = read_scene(written.folder, spec.name)
+            check = check_scene(scene, arguments.check, Workers(num_cores(), show), show)
+    except InputError as error:
+        return print_error(arguments, f"{spec.name}: {error}", EXIT_BAD_INPUT)
+    for warning in written.warnings:
+        print_note(arguments, warning)
+    status = "there already" if written.num_points is None else "written"
+    line: dict[str, object] = {"scene": spec.name, "folder": str(written.folder), "status": status}
+    line |= {"points": written.num_points, "queries": written.num_queries}
+    if check:
+        line |= {"fits": check.is_passed, "check": [panorama._asdict() for panorama in check.panoramas]}
+    print(json.dumps(line), flush=True)
+    if check and not check.is_passed:
+        return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)
+    return 0

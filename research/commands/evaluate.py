@@ -1,0 +1,310 @@
+"""Localize the panoramas of scenes with true poses, and measure the errors of the poses."""
+
+import argparse
+import json
+import signal
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from piccolo.batch.localizer import Localizer
+from piccolo.cli import options
+from piccolo.cli.command import check_least, command, option
+from piccolo.cli.errors import (
+    EXIT_BAD_INPUT,
+    Terminated,
+    UsageError,
+    checking_options,
+    print_error,
+    print_note,
+)
+from piccolo.cli.executing import (
+    Interruption,
+    check_execution,
+    connecting,
+    count_jobs,
+    executing,
+    interruptible,
+)
+from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix, print_report
+from piccolo.cli.progress import progress_bar
+from piccolo.errors import InputError
+from piccolo.files.atomic import check_output, is_stream, write_atomically
+from piccolo.files.line_file import LineFile, open_locked
+from piccolo.jobs.cluster import Cluster
+from piccolo.jobs.memory import limit_memory
+from piccolo.jobs.threads import Workers
+from piccolo.opened_scan import OpenedScan, settings_json
+from piccolo.result import UNREADABLE, Result, check_scan, describe_failure, read_results
+from piccolo.scan_map.open_map import scan_sha256_of
+from piccolo.scene import Query, Scene, find_scenes, input_files
+
+from ..evaluation import query_result, tables
+from ..evaluation.plots import errors_figure, figure_png, risk_figure
+from ..evaluation.query_result import QueryResult, Thresholds
+from ..evaluation.walks import alone_table, group_walks, walk_table
+
+EPILOG = """\
+examples:
+  python tools/evaluate.py --scenes datasets/stanford --out run.jsonl --jobs 4
+  python tools/evaluate.py --scenes room --results poses.jsonl
+  python tools/evaluate.py --compare paper.jsonl run.jsonl
+
+Scenes are folders with a queries.json, a cloud and images, at any depth below --scenes (docs/DATASETS.md).
+--out localizes the queries that the run lacks, and appends a line for each: repeat the command to resume a
+stopped run. --results are lines of localize.py instead; each belongs to the query with the same path, or else
+with the same file name. Tables are Markdown on stdout (on stderr if one of the files is stdout).
+For walks (make_room.py --walk) there is a table with a line per walk, and one of the frames that were
+searched alone, by themselves and with the others. A query with "answerable": false is correct if it is not
+localized.
+Errors of a path as evo defines them: tools/export_poses.py --format tum --timestamps walk, then evo_ape.
+Queries that can't be read and --results without a query are named on stderr; the others are still evaluated,
+and the exit code is 3.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """All options."""
+    group = parser.add_argument_group("input and output")
+    option(group, "--scenes FOLDER ...", "scenes with true poses")
+    option(group, "--variants NAME ...", "only these splits of the data", default=[])
+    kind = group.add_mutually_exclusive_group(required=True)
+    option(kind, "--out JSONL", "file of the run, which is begun or resumed")
+    option(kind, "--results JSONL", "evaluate these results of localize.py instead of running it")
+    option(kind, "--compare JSONL", "compare two runs", nargs=2)
+    option(group, "--force", "also take --results of other clouds than the scene's")
+    option(group, "--cache FOLDER", options.CACHE_TEXT)
+    group = parser.add_argument_group("tables and plots")
+    option(group, "--max-distance M", "position error below which a pose is correct [m]", default=0.1)
+    option(group, "--max-angle DEG", "rotation error below which a pose is correct", default=5.0)
+    option(group, "--csv FILE", "write a line per query; - is stdout, also for the other files")
+    option(group, "--markdown FILE", "write the tables to this file too")
+    option(group, "--errors PNG", "plot: fraction of queries below each error, and recall over thresholds")
+    option(group, "--risk PNG", "plot: fraction wrong over fraction accepted, for falling minimum confidence")
+    options.add_cloud_reading_options(parser.add_argument_group("clouds"))
+    options.add_panorama_reading_options(parser.add_argument_group("panoramas"))
+    options.add_method_options(parser)
+    options.add_execution_options(parser, default_jobs=1)
+
+
+def check_usage(arguments: argparse.Namespace) -> None:
+    """Refuse options that do not go together, and values that are wrong whatever the files hold."""
+    if (arguments.scenes is None) == (arguments.compare is None):
+        raise UsageError("--scenes: needed with --out and --results, not with --compare")
+    if arguments.compare and (arguments.csv or arguments.risk):
+        raise UsageError("--csv, --risk: not with --compare, they show one run")
+    if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
+        raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
+    check_least(arguments, jobs=1, threads=1)
+    check_execution(arguments)
+    for option_ in ("errors", "risk"):
+        check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
+    if arguments.out and is_stream(arguments.out):
+        raise UsageError(f"--out {arguments.out}: a run is read again to be resumed, wanted a file")
+
+
+def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: Thresholds) -> str:
+    """All tables of one run as Markdown."""
+    inside = [row for row in rows if row.is_in_box]
+    num_outside = sum(row.is_in_box is False for row in rows)
+    found = [tables.per_query(rows), tables.summary_table(rows, thresholds, f"all {len(rows)} queries")]
+    if num_outside and inside:
+        title = f"without the {num_outside} queries taken outside the cloud's bounding box"
+        found.append(tables.summary_table(inside, thresholds, title))
+    found.append(tables.threshold_table(rows, thresholds))
+    found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
+    if walks := group_walks(scenes, rows):
+        found += [walk_table(walks, thresholds), alone_table(walks, thresholds)]
+    return "\n".join(table.markdown() for table in found)
+
+
+def write_report(
+    arguments: argparse.Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
+) -> None:
+    """Print the tables of one run or two, and write them and the plot of their errors if asked for."""
+    if arguments.markdown:
+        write_atomically(arguments.markdown, text.encode())
+    if arguments.errors:
+        write_atomically(arguments.errors, figure_png(errors_figure(runs, thresholds)))
+    print_report(arguments, outputs_of(arguments), text, end="")
+
+
+def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
+    """Print two runs side by side."""
+    runs = [query_result.read_run(path)[0] for path in arguments.compare]
+    if arguments.variants:
+        runs = [[row for row in rows if row.variant in arguments.variants] for rows in runs]
+    pairs = tables.pair_up(*runs)
+    first, second = names = tuple(str(path) for path in arguments.compare)
+    if not pairs:
+        raise InputError(f"{first}, {second}: no query in common; compare runs of the same scenes")
+    text = tables.side_by_side(pairs, (first, second), thresholds).markdown()
+    for path, rows in zip(names, runs, strict=True):
+        text += f"\nonly in {path}: {len(rows) - len(pairs)} queries"
+    text += f"\n\n{tables.changes(pairs, thresholds).markdown()}"
+    both = {first: [pair[0] for pair in pairs], second: [pair[1] for pair in pairs]}
+    write_report(arguments, text, both, thresholds)
+    return 0
+
+
+def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+    """Return the files beside a run, by option."""
+    return {f"--{name}": getattr(arguments, name) for name in ("csv", "markdown", "errors", "risk")}
+
+
+def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
+    """Refuse outputs that would replace an input, a run or each other."""
+    given = arguments.results, arguments.mask, arguments.camera, arguments.rig
+    more = filter(None, (*given, *(arguments.compare or ())))
+    check_distinct({"--out": arguments.out, **outputs_of(arguments)}, [*inputs, *more])
+    check_outputs(outputs_of(arguments))
+
+
+def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: argparse.Namespace) -> None:
+    """Refuse results of other content than the scenes' clouds have, or with --force say so."""
+    for scene in scenes:
+        results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
+        if results and scene.cloud.is_file():
+            digest = scan_sha256_of([scene.cloud], options.cache_from(arguments))
+            if note := check_scan(results, digest, str(scene.cloud), arguments.force):
+                print_note(arguments, f"warning: {note}")
+
+
+def run_scenes(
+    arguments: argparse.Namespace,
+    path: Path,
+    config: Localizer,
+    scenes: Sequence[Scene],
+    variants: Sequence[str],
+) -> tuple[list[QueryResult], int]:
+    """Localize the queries that a run does not have yet; `config` is for any scan, no variants are all.
+
+    Returns the run's queries of these scenes and variants, and how many failed. Raises InputError if the file
+    can't be written, holds something else, or rows made with other settings.
+    """
+    query_result.check_variants(scenes, variants)
+    check_output(path)
+    settings = settings_json(config.settings, config.cloud_settings, config.read_options)
+    with open_locked(path) as file, ExitStack() as stack:
+        rows, size = query_result.read_run(path)
+        query_result.check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
+        pairs = [(scene, query) for scene in scenes for query in scene.queries]
+        keys = {(s.name, s.name_of(q)) for s, q in pairs if not variants or q.variant in variants}
+        open_keys = keys - {row.key for row in rows}
+        found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
+        left = [(scene, queries) for scene, queries in found if queries]
+        evaluation = Evaluation(arguments, config, file, rows)
+        if left:
+            file.cut(size)
+            num_jobs = count_jobs(arguments, max(len(queries) for _, queries in left))
+            cluster = stack.enter_context(connecting(arguments, num_jobs))
+            with interruptible() as interruption:
+                for scene, queries in left:
+                    if not interruption.number:
+                        evaluation.localize(scene, queries, cluster, interruption)
+            if interruption.number:
+                raise Terminated if interruption.number == signal.SIGTERM else KeyboardInterrupt
+    return [row for row in evaluation.rows if row.key in keys], evaluation.num_failed
+
+
+@dataclass
+class Evaluation:
+    """A run over scenes that is being written."""
+
+    arguments: argparse.Namespace
+    config: Localizer  # of any scan
+    file: LineFile
+    rows: list[QueryResult]
+    num_failed: int = 0
+
+    def localize(
+        self, scene: Scene, queries: Sequence[Query], cluster: Cluster | None, interruption: Interruption
+    ) -> None:
+        """Localize queries of a scene, and append their lines."""
+        show = progress_bar(self.arguments.quiet)
+        are_inside: list[bool] = []  # the cloud's box
+
+        def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
+            scan = localizer.open_scan(Workers(num_threads, show))
+            are_inside.extend(query_result.is_in_box(scan, query.pose) for query in queries)
+            return scan
+
+        if cluster:
+            cluster.forget()  # a worker may not have room for the last scene's map and this one's
+        localizer = replace(self.config, paths=(scene.cloud,))
+        if has_labels := localizer.read_options.labels is not None:
+            queries = self.select_labelled(scene, queries)
+        num_jobs = count_jobs(self.arguments, len(queries))
+        with ExitStack() as stack:
+            place = executing(self.arguments, localizer, num_jobs, cluster, open_scan)
+            try:
+                executor, localizer = stack.enter_context(place)
+            except Exception as error:
+                self.report(f"{scene.name}: {describe_failure(error).text}", len(queries))
+                return
+            pictures = (query.labels if has_labels and query.labels else query.image for query in queries)
+            tasks = (localizer.task(p, q.calibration) for p, q in zip(pictures, queries, strict=True))
+            values = executor.values(tasks)
+            pairs = interruption.each(show(iter(values), len(queries), scene.name), values.take_finished())
+            for query, is_inside, (task, wait) in zip(queries, are_inside, pairs, strict=False):
+                self.record(scene, query, localizer.wait_for(task, wait, None).result, is_inside)
+
+    def select_labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:
+        """Return the queries that have labels; the others are reported."""
+        for query in queries:
+            if query.labels is None:
+                self.report(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
+        return [query for query in queries if query.labels]
+
+    def record(self, scene: Scene, query: Query, result: Result, is_inside: bool) -> None:
+        """Append the line of a query, or say why it has none."""
+        if result.error is not None and (result.status != UNREADABLE or query.is_answerable):
+            self.report(result.error)
+            return
+        row = query_result.make_query_result(scene, query, result, None if result.error else is_inside)
+        line = row.to_json()
+        self.file.append(line)
+        self.rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
+
+    def report(self, text: str, num_queries: int = 1) -> None:
+        """Say why queries could not be localized."""
+        print_error(self.arguments, text, EXIT_BAD_INPUT)
+        self.num_failed += num_queries
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: argparse.Namespace) -> int:
+    """Run or read the results, print the tables; returns the exit code."""
+    check_usage(arguments)
+    with checking_options():
+        limit_memory(arguments.max_memory)
+        config = options.localizer_from(arguments)
+    thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
+    scenes = find_scenes(arguments.scenes or [])
+    check_files(arguments, input_files(scenes))
+    if arguments.compare:
+        return compare(arguments, thresholds)
+    if arguments.results:
+        results = read_results([arguments.results])
+        report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
+        rows = list(query_result.match_results(scenes, results, report))
+        num_failed = len(results) - len(rows)
+        check_clouds(scenes, rows, arguments)
+        rows = [row for row in rows if not arguments.variants or row.variant in arguments.variants]
+    else:
+        rows, num_failed = run_scenes(arguments, arguments.out, config, scenes, arguments.variants)
+    if not rows:
+        raise InputError("no query could be localized; check --scenes and --variants")
+    rows = sorted(rows, key=lambda row: row.key)
+    if arguments.csv:
+        write_atomically(arguments.csv, tables.csv_text(rows).encode())
+    if arguments.risk:
+        points = tables.risk_and_coverage(rows, thresholds)
+        write_atomically(arguments.risk, figure_png(risk_figure(points)))
+    name = (arguments.out or arguments.results).stem
+    write_report(arguments, report_of(scenes, rows, thresholds), {name: rows}, thresholds)
+    return EXIT_BAD_INPUT if num_failed else 0

@@ -1,0 +1,184 @@
+"""Four data sets of papers: their folders and files of poses. docs/DATASETS.md has the sources."""
+
+import math
+import re
+import zlib
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from piccolo.errors import InputError
+from piccolo.files.json_file import read_json
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.panorama.cube import SUFFIXES
+
+from .files import WORLD_FROM_CAM, is_cloud, only_cloud_in, pose_of_transform, read_matrix
+from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
+
+LOC360 = "360loc"
+QUERIES = "query_360"
+CAMERA_POSES = "camera_pose.json"
+WANTED = 'wanted JSON {"NAME.jpg": a matrix of 4 x 4 numbers}'
+
+MATTERPORT = "matterport3d"
+SKYBOXES = "matterport_skybox_images"
+MAX_DEPTH = 5  # v1/scans/HOUSE/HOUSE/matterport_skybox_images
+FACE = re.compile(r"([0-9a-f]+)_skybox([0-5])_sami\.jpg$")
+POSE_FILES = "matterport_camera_poses/{}_pose_1_{}.txt"  # 1: the level camera of three, 0 looks up, 2 down
+SKYBOX_YAW = 5  # the stop at which that camera looks through the middle of skybox 1
+# House by house the first of these that is there. Coloured vertices come first: they are quick to read.
+MESHES = ("house_segmentations/*.ply", "region_segmentations/region*.ply", "matterport_mesh/**/*.obj")
+
+OMNISCENES = "omniscenes"
+PANORAMAS = ("*_pano", "*/*_pano")  # change_handheld_pano, turtlebot_pano ...
+SEQUENCE = re.compile(r"[A-Za-z]+_([A-Za-z]+_\d+)_scene_\d+$")  # handheld_weddingHall_1_scene_2
+
+MPO = "mpo"
+
+
+def list_360loc(options: ConvertOptions) -> SceneList:
+    """Return the scenes that have 360-degree queries, and a cloud that the user put there."""
+    below = (options.folder, *sorted(options.folder.glob("*")))
+    specs = []
+    missing = []
+    for folder in (path for path in below if (path / QUERIES).is_dir()):
+        name = folder.resolve().name
+        if cloud := only_cloud_in(folder):
+            panoramas = _360loc_panoramas(options, folder)
+            specs.append(SceneSpec(LOC360, name, (CloudPart(cloud),), panoramas))
+        else:
+            missing.append(folder.name)
+    layout = f"scene with {QUERIES}/SEQUENCE/{CAMERA_POSES} and a coloured cloud beside {QUERIES}"
+    return scene_list(options.folder, specs, missing, layout)
+
+
+def _360loc_panoramas(options: ConvertOptions, folder: Path) -> Iterator[PosedPanorama]:
+    """Yield the panoramas of all sequences: camera-to-world matrices, axes as of COLMAP."""
+    for path in map(options.inside, sorted((folder / QUERIES).glob(f"*/{CAMERA_POSES}"))):
+        document = read_json(path, WANTED)
+        if not isinstance(document, dict):
+            raise InputError(f"{path}: found no object, {WANTED}")
+        for file, value in document.items():
+            where = f"{path}, {file!r}"
+            try:
+                matrix = np.array(value, dtype=np.float64)
+            except (OverflowError, TypeError, ValueError) as error:
+                raise InputError(f"{where}: found {error}, {WANTED}") from error
+            if matrix.shape not in ((4, 4), (3, 4)):
+                raise InputError(f"{where}: found the shape {matrix.shape}, {WANTED}")
+            picture = options.inside(path.parent / "image" / Path(file).name, where)
+            name = f"{path.parent.name}_{picture.name}"
+            pose = pose_of_transform(where, matrix, WORLD_FROM_CAM, "optical")
+            yield PosedPanorama(name, {name: picture}, path.parent.name, pose)
+
+
+def list_matterport(options: ConvertOptions) -> SceneList:
+    """Return the houses with skyboxes, six faces of a cube at each place, poses and a mesh."""
+    patterns = ["*/" * depth + SKYBOXES for depth in range(MAX_DEPTH)]
+    specs = []
+    notes = []
+    missing = []
+    for folder in [path.parent for pattern in patterns for path in sorted(options.folder.glob(pattern))]:
+        meshes = next((found for pattern in MESHES if (found := sorted(folder.glob(pattern)))), [])
+        if not meshes:
+            missing.append(str(folder))
+            continue
+        places: dict[str, dict[str, Path]] = defaultdict(dict)  # by name below the scene's images/
+        for path in sorted((folder / SKYBOXES).iterdir()):
+            if match := FACE.match(path.name):
+                places[match[1]][f"{match[1]}/{path.name}"] = path
+        posed = {
+            place: files
+            for place, files in places.items()
+            if len(files) == 6 and (folder / POSE_FILES.format(place, SKYBOX_YAW)).exists()
+        }
+        if len(posed) < len(places):
+            count = len(places) - len(posed)
+            notes.append(f"{folder}: {count} skyboxes without a pose or without six faces")
+        parts = tuple(map(CloudPart, meshes))
+        panoramas = _matterport_panoramas(options, folder, posed)
+        specs.append(SceneSpec(MATTERPORT, folder.resolve().name, parts, panoramas))
+    listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
+    return listed._replace(notes=(*listed.notes, *notes))
+
+
+def _matterport_panoramas(
+    options: ConvertOptions, folder: Path, places: dict[str, dict[str, Path]]
+) -> Iterator[PosedPanorama]:
+    """Yield the skyboxes: turned as the level camera at one of its stops, in the middle of all of them.
+
+    The camera's axes are right, down, forward; skybox 1 is what our cubes have in front.
+    """
+    for place, files in places.items():
+        paths = [folder / POSE_FILES.format(place, yaw) for yaw in range(6)]
+        matrices = {path: read_matrix(options.inside(path), 4) for path in paths if path.exists()}
+        T_world_from_skybox = matrices[paths[SKYBOX_YAW]].copy()
+        T_world_from_skybox[:3, 3] = np.mean([matrix[:3, 3] for matrix in matrices.values()], axis=0)
+        pose = pose_of_transform(str(paths[SKYBOX_YAW]), T_world_from_skybox, WORLD_FROM_CAM, "optical")
+        yield PosedPanorama(place, files, "skybox", pose)
+
+
+def list_omniscenes(options: ConvertOptions) -> SceneList:
+    """Return the rooms, each with the panoramas of all splits."""
+    pictures: dict[tuple[str, Path], list[Path]] = defaultdict(list)
+    for split in [path for pattern in PANORAMAS for path in sorted(options.folder.glob(pattern))]:
+        for sequence in sorted(split.iterdir()):
+            if match := SEQUENCE.match(sequence.name):
+                files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
+                pictures[match[1], split.parent / "pcd" / f"{match[1]}.txt"] += files
+    specs = [
+        SceneSpec(OMNISCENES, room, (CloudPart(cloud),), _omniscenes_panoramas(options, files))
+        for (room, cloud), files in sorted(pictures.items())
+        if cloud.exists()
+    ]
+    missing = sorted(str(cloud) for _, cloud in pictures if not cloud.exists())
+    layout = "SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt"
+    return scene_list(options.folder, specs, missing, layout)
+
+
+def _omniscenes_panoramas(options: ConvertOptions, pictures: list[Path]) -> Iterator[PosedPanorama]:
+    """Panoramas with the pose [R_cam_from_world | center_world] of a file of their own, in our own axes."""
+    for path in pictures:
+        split = path.parents[1]
+        variant = split.name.removesuffix("_pano")
+        pose_file = split.parent / f"{variant}_pose" / path.parent.name / f"{path.stem}.txt"
+        matrix = read_matrix(options.inside(pose_file), 3)
+        matrix[:, :3] = matrix[:, :3].T.copy()
+        pose = pose_of_transform(str(pose_file), matrix, WORLD_FROM_CAM, "piccolo")
+        name = f"{variant}_{path.parent.name}_{path.name}"
+        yield PosedPanorama(name, {name: path}, variant, pose)
+
+
+def list_mpo(options: ConvertOptions) -> SceneList:
+    """Each scan with a picture of the same name beside it.
+
+    All true poses are the identity, so each scan and its camera get a random rigid transform: a turn about z
+    by U(0, pi) and a shift by U(0, 3) m along each axis, by seed and name.
+    """
+    files: dict[Path, list[Path]] = defaultdict(list)
+    for path in sorted(options.folder.rglob("*")):
+        files[path.with_suffix("")].append(path)
+    specs = []
+    num_alone = 0
+    for stem, found in files.items():
+        clouds = [path for path in found if is_cloud(path)]
+        pictures = [path for path in found if path.suffix.lower() in SUFFIXES]
+        picture = min(pictures, key=lambda path: path.suffix.lower() not in (".jpg", ".jpeg"), default=None)
+        if not clouds or picture is None:
+            num_alone += len(clouds[:1])
+            continue
+        if len(clouds) > 1:
+            raise InputError(f"{clouds[0]}: found {clouds[1].name} beside it; leave one cloud of this name")
+        name = stem.relative_to(options.folder).as_posix()
+        rng = np.random.default_rng([options.seed, zlib.crc32(name.encode())])
+        turn = yaw_rotation(rng.uniform(0.0, math.pi)).T
+        transform = RigidTransform(turn, rng.uniform(0.0, 3.0, 3))
+        pose = Pose(np.eye(3), np.zeros(3))  # at the scanner's origin, with the scanner's axes
+        panorama = PosedPanorama(picture.name, {picture.name: picture}, "moved", pose)
+        source: dict[str, object] = {"seed": options.seed}
+        specs.append(SceneSpec(MPO, name, (CloudPart(clouds[0]),), iter([panorama]), transform, source))
+    if not specs:
+        raise InputError(f"{options.folder}: found no cloud with a picture of the same name")
+    return SceneList(tuple(specs), (f"{num_alone} clouds without a picture",) if num_alone else ())

@@ -1,0 +1,190 @@
+"""Results of queries with their errors against the true poses, and runs: files with one on each line."""
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from piccolo.batch.results_file import check_as_expected
+from piccolo.errors import InputError, printable
+from piccolo.files.json_file import document_of, parse_lines, read_bytes
+from piccolo.files.line_file import whole_size
+from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
+from piccolo.opened_scan import OpenedScan
+from piccolo.result import Result
+from piccolo.scene import Query, Scene
+
+FORMAT = "piccolo-evaluation/1"
+WANTED = "wanted a run of tools/evaluate.py"
+LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
+MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
+VIDEO_FRAME = re.compile(r"(.+)#t=(\d+\.\d+)")
+MAX_TIME_DIFFERENCE = 2e-3  # [s] of a video's frame from a walk's
+
+
+class Thresholds(NamedTuple):
+    """Errors below which a pose is correct."""
+
+    max_distance: float = MAX_DISTANCE  # [m]
+    max_angle: float = MAX_ANGLE  # [rad]
+
+    def __str__(self) -> str:
+        """In words."""
+        return f"under {self.max_distance:g} m and {np.degrees(self.max_angle):g} deg"
+
+
+PAPER_THRESHOLDS = Thresholds()
+
+
+@dataclass(frozen=True)
+class QueryResult:
+    """The result of one query of one scene, and its errors."""
+
+    scene: str
+    image: str  # as the scene's queries.json names it
+    variant: str
+    is_in_box: bool | None  # the true position lies in the box of the cloud's points; None if not known
+    position_error: float  # [m], inf without a pose, or of a photo that has no answer
+    rotation_error: float  # [rad], likewise
+    result: Result
+
+    @property
+    def key(self) -> tuple[str, str]:
+        """The query, unique in a run."""
+        return self.scene, self.image
+
+    @property
+    def has_errors(self) -> bool:
+        """True if there is a pose, and a true one."""
+        return bool(np.isfinite(self.position_error))
+
+    @property
+    def seconds(self) -> float:
+        """All stages but reading the photo."""
+        return sum(seconds for stage, seconds in self.result.seconds.items() if stage != "read")
+
+    def is_correct(self, thresholds: Thresholds = PAPER_THRESHOLDS) -> bool:
+        """Return True if both errors are below the thresholds."""
+        return self.position_error < thresholds.max_distance and self.rotation_error < thresholds.max_angle
+
+    def to_json(self) -> str:
+        """One line."""
+        names = "scene", "image", "variant", "is_in_box"
+        line: dict[str, object] = {"format": FORMAT, **{name: getattr(self, name) for name in names}}
+        line["position_error"] = self.position_error if self.has_errors else None
+        line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if self.has_errors else None
+        line["result"] = json.loads(self.result.to_json())
+        return json.dumps(line, allow_nan=False)
+
+    @classmethod
+    def from_json(cls, text: str) -> "QueryResult":
+        """Read back what `to_json` wrote; any other text is an InputError."""
+        with document_of(text, FORMAT, "evaluation") as row:
+            distance = row["position_error"]
+            angle_deg = row["rotation_error_deg"]
+            scene = str(row["scene"])
+            image = str(row["image"])
+            variant = str(row["variant"])
+            position_error = np.inf if distance is None else float(distance)
+            rotation_error = np.inf if angle_deg is None else float(np.radians(angle_deg))
+            result = Result.from_json(json.dumps(row["result"]))
+            return cls(scene, image, variant, row["is_in_box"], position_error, rotation_error, result)
+
+
+def make_query_result(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
+    """Return a query's result with its errors."""
+    pose = result.best_pose if query.is_answerable else None
+    errors = (np.inf, np.inf) if pose is None else pose_errors(pose, query.pose)
+    return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
+
+
+def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
+    """Return True if a pose lies in the bounding box of the scan's points (the paper's protocol)."""
+    points = scan.points
+    center: Array = scan.from_world(pose).center_world
+    axes = zip(center, (points.x, points.y, points.z), strict=True)
+    return all(bool(axis.min() <= value <= axis.max()) for value, axis in axes)
+
+
+def frames_of_video(pairs: Sequence[tuple[Scene, Query]], pano: str) -> list[tuple[Scene, Query]]:
+    """Return the queries that a frame of a video may be: of the walk of its name, at its time."""
+    found = VIDEO_FRAME.fullmatch(pano)
+    if found is None:
+        return []
+    walk = Path(found[1]).stem
+    time = float(found[2])
+    of_walk = [pair for pair in pairs if pair[1].walk == walk]
+    return [pair for pair in of_walk if abs((pair[1].time or 0.0) - time) < MAX_TIME_DIFFERENCE]
+
+
+def match_results(
+    scenes: Sequence[Scene], results: Sequence[Result], tell: Callable[[str], object]
+) -> Iterator[QueryResult]:
+    """Results of localize.py with their errors; each belongs to the query whose image it names.
+
+    The image is found by its path, or else by its file name if only one query has that. A frame of a video,
+    FOLDER/WALK.mp4#t=SECONDS, is the query of the walk of that name and time.
+
+    A result of no query, or of a name that several have, goes to `tell` and is left out. Raises
+    InputError for a second result of a query.
+    """
+    pairs = [(scene, query) for scene in scenes for query in scene.queries]
+    queries = [(*pair, path) for pair in pairs for path in (pair[1].image, pair[1].labels) if path]
+    by_path = {path.resolve(): (scene, query) for scene, query, path in queries}
+    done: set[tuple[str, str]] = set()
+    for result in results:
+        found = by_path.get(Path(printable(result.pano)).resolve())  # queries have printable names
+        named = [(scene, query) for scene, query, path in queries if path.name == Path(result.pano).name]
+        named += frames_of_video(pairs, result.pano)
+        if found is None and len(named) != 1:
+            names = sorted(path.name for _, _, path in queries)[:3]
+            text = f"{len(named)} queries of this name" if named else "a result without a true pose"
+            tell(f"{result.pano}: found {text}, wanted one of {names} ...")
+            continue
+        row = make_query_result(*(found or named[0]), result, None)
+        if row.key in done:
+            raise InputError(f"{result.pano}: found a second result of this panorama, wanted one")
+        done.add(row.key)
+        yield row
+
+
+def read_run(path: Path) -> tuple[list[QueryResult], int]:
+    """Return the queries of a run, and the size [byte] of the file up to its last whole line.
+
+    Raises InputError if a line is none of a run; an unfinished last line was being written, and is left out.
+    """
+    content = read_bytes(path, WANTED)
+    size = whole_size(path, LINE_BEGINS, "a run of tools/evaluate.py")
+    rows = parse_lines(path, content[:size], QueryResult.from_json)
+    return list({row.key: row for row in rows}.values()), size
+
+
+def check_run(
+    path: Path, rows: Sequence[QueryResult], scenes: Sequence[Scene], expected: Mapping[str, Any]
+) -> None:
+    """Refuse rows that were made with other settings than the expected, other true poses or other scenes."""
+    queries = {(s.name, s.name_of(query)): (s, query) for s in scenes for query in s.queries}
+    for row in rows:
+        found = {"line": path, "settings": row.result.settings}
+        check_as_expected(found, expected, "choose another file")
+        if row.key in queries and not _is_of(row, *queries[row.key]):
+            text = "made with another true pose or another scene of this name; choose another file"
+            raise InputError(f"{path}: found a result of {row.scene}, {row.image} {text}")
+
+
+def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:
+    """Return True if a result's errors are those of its pose against this query's true pose."""
+    again = make_query_result(scene, query, row.result, row.is_in_box)
+    pairs = (row.position_error, again.position_error), (row.rotation_error, again.rotation_error)
+    return all(a == b or abs(a - b) < MAX_DIFFERENCE for a, b in pairs)
+
+
+def check_variants(scenes: Sequence[Scene], variants: Sequence[str]) -> None:
+    """Refuse variants that no query of the scenes has."""
+    known = {query.variant for scene in scenes for query in scene.queries}
+    if missing := [variant for variant in variants if variant not in known]:
+        raise InputError(f"`variants`: found no {missing[0]}, wanted some of {', '.join(sorted(known))}")

@@ -1,0 +1,224 @@
+"""Statistics and tables of an evaluation, of one run or of two side by side, as Markdown and CSV."""
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from piccolo.confidence.confidence import LOCALIZED
+from piccolo.errors import printable
+from piccolo.export.formats import cell
+
+from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
+
+HUGE = 1e30  # stands for an error without a pose while quartiles are interpolated
+ACCURACY_DISTANCES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m]
+CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
+ALL = "all"
+
+
+class Counts(NamedTuple):
+    """Numbers of queries that are right, or called localized."""
+
+    num_correct: int
+    num_localized: int
+    num_wrong: int  # of the localized
+
+
+class Summary(NamedTuple):
+    """Statistics of some queries."""
+
+    num_queries: int
+    num_correct: int
+    num_localized: int
+    num_wrong: int  # of the localized
+    position_quartiles: NDArray[np.float64]  # (3,) [m] over all queries, inf where there is no pose
+    rotation_quartiles: NDArray[np.float64]  # (3,) [rad]
+    seconds: float  # median
+
+    @property
+    def accuracy(self) -> float:
+        """Fraction of correct poses, whatever their status."""
+        return self.num_correct / self.num_queries
+
+
+def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
+    """Return the 25th, 50th and 75th percentiles (3,) of values, some of which may be infinite."""
+    found = np.quantile(np.minimum(values, HUGE), [0.25, 0.5, 0.75])
+    return np.where(found > 1e-6 * HUGE, np.inf, found)
+
+
+def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Summary:
+    """Return the statistics of one or more queries."""
+    return Summary(
+        len(rows),
+        *count_rows(rows, thresholds),
+        position_quartiles=quartiles([row.position_error for row in rows]),
+        rotation_quartiles=quartiles([row.rotation_error for row in rows]),
+        seconds=float(np.median([row.seconds for row in rows])),
+    )
+
+
+def count_rows(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Counts:
+    """Return how many queries are correct, localized, and localized but wrong."""
+    is_correct = [row.is_correct(thresholds) for row in rows]
+    is_localized = [row.result.status == LOCALIZED for row in rows]
+    num_wrong = sum(a and not b for a, b in zip(is_localized, is_correct, strict=True))
+    return Counts(sum(is_correct), sum(is_localized), num_wrong)
+
+
+class Point(NamedTuple):
+    """One point of the curve of risk over coverage."""
+
+    confidence: float  # results from here on are accepted
+    coverage: float  # fraction that is accepted
+    risk: float  # fraction of these that is wrong
+    num_wrong: int
+
+
+def risk_and_coverage(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> list[Point]:
+    """Return the curve of risk over coverage, a point for each distinct confidence, from the highest down."""
+    points: dict[float, Point] = {}
+    num_wrong = 0
+    for k, row in enumerate(sorted(rows, key=lambda row: -row.result.confidence), 1):
+        num_wrong += not row.is_correct(thresholds)
+        confidence = row.result.confidence
+        points[confidence] = Point(confidence, k / len(rows), num_wrong / k, num_wrong)
+    return list(points.values())
+
+
+Pair = tuple[QueryResult, QueryResult]  # the same query in two runs
+
+
+class Table(NamedTuple):
+    """A table of text; the first `num_left` columns are words."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+    num_left: int = 1
+
+    def markdown(self) -> str:
+        """Title and table."""
+        marks = ["---"] * self.num_left + ["---:"] * (len(self.columns) - self.num_left)
+        lines = [" | ".join(cells) for cells in (self.columns, *self.rows)]
+        lines = [f"| {line} |" for line in lines]
+        head = [self.title, ""] if self.title else []
+        return "\n".join([*head, lines[0], f"|{'|'.join(marks)}|", *lines[1:], ""])
+
+
+def per_query(rows: Sequence[QueryResult]) -> Table:
+    """One line a query."""
+    columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
+    cells = []
+    for row in rows:
+        result = row.result
+        evidence = result.evidence
+        score = (f"{evidence.score:.2f}", f"{evidence.margin:.2f}") if evidence else ("-", "-")
+        errors = f"{row.position_error:.4f}", f"{np.degrees(row.rotation_error):.3f}"
+        loss = "-" if result.loss is None else f"{result.loss:.3f}"
+        words = row.scene, printable(row.image), result.status
+        cells.append((*words, *errors, f"{result.confidence:.3f}", *score, loss, f"{row.seconds:.2f}"))
+    return Table("", (*columns, "loss", "seconds"), tuple(cells), 3)
+
+
+def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]]]:
+    """Yield the queries of each variant, of each scene, and all; a grouping of one group is left out."""
+    for kind in ("variant", "scene"):
+        names = sorted({getattr(row, kind) for row in rows})
+        if len(names) > 1:
+            yield from ((name, [row for row in rows if getattr(row, kind) == name]) for name in names)
+    yield ALL, list(rows)
+
+
+def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: str) -> Table:
+    """Quartiles of the errors, accuracy and statuses of every group."""
+    words = f"{title}; correct: {thresholds}"
+    errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
+    columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
+    cells = []
+    for name, some in groups(rows):
+        s = summarize(some, thresholds)
+        meters = [f"{value:.4f}" for value in s.position_quartiles]
+        degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
+        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
+        ends = f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}"
+        cells.append((name, *counts, *meters, *degrees, *ends))
+    return Table(words, columns, tuple(cells))
+
+
+def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
+    """Accuracy at several distances."""
+    title = f"accuracy: fraction under the distance and {np.degrees(thresholds.max_angle):g} deg"
+    cells = []
+    for name, some in groups(rows):
+        levels = [Thresholds(distance, thresholds.max_angle) for distance in ACCURACY_DISTANCES]
+        fractions = [sum(row.is_correct(level) for row in some) / len(some) for level in levels]
+        cells.append((name, *(f"{fraction:.3f}" for fraction in fractions)))
+    return Table(title, ("queries", *(f"{line:g} m" for line in ACCURACY_DISTANCES)), tuple(cells))
+
+
+def risk_table(points: Sequence[Point]) -> Table:
+    """Return the fraction accepted, and wrong of these, at a few minimum confidences."""
+    cells = []
+    for line in CONFIDENCES:
+        if inside := [point for point in points if point.confidence >= line]:
+            p = inside[-1]
+            cells.append((f"{line}", f"{100 * p.coverage:.1f} %", f"{p.num_wrong}", f"{100 * p.risk:.2f} %"))
+    columns = "min confidence", "accepted", "wrong of these", "wrong fraction"
+    return Table("", columns, tuple(cells), 0)
+
+
+def csv_text(rows: Sequence[QueryResult]) -> str:
+    """One line a query, in base units, every digit; empty where there is no pose."""
+    file = io.StringIO()
+    columns = ("scene", "image", "variant", "is_in_box", "status", "confidence", "position_error_m")
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow((*columns, "rotation_error_deg", "loss", "seconds"))
+    for row in rows:
+        errors = (row.position_error, float(np.degrees(row.rotation_error))) if row.has_errors else ("", "")
+        box = "" if row.is_in_box is None else str(row.is_in_box).lower()
+        status = row.result.status, row.result.confidence
+        words = cell(row.scene), cell(printable(row.image)), cell(row.variant), box
+        writer.writerow((*words, *status, *errors, row.result.loss, round(row.seconds, 4)))
+    return file.getvalue()
+
+
+def pair_up(first: Sequence[QueryResult], second: Sequence[QueryResult]) -> list[Pair]:
+    """Return the queries that both runs have, in the order of their names."""
+    others = {row.key: row for row in second}
+    pairs = [(row, others[row.key]) for row in first if row.key in others]
+    return sorted(pairs, key=lambda pair: pair[0].key)
+
+
+def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thresholds) -> Table:
+    """Return the statistics of two runs over the queries that both have."""
+    columns = "run", "queries", "correct", "accuracy", "localized", "wrong of these"
+    rows = []
+    for k, name in enumerate(names):
+        s = summarize([pair[k] for pair in pairs], thresholds)
+        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}", f"{s.num_localized}"
+        medians = f"{s.position_quartiles[1]:.4f}", f"{np.degrees(s.rotation_quartiles[1]):.3f}"
+        rows.append((name, *counts, f"{s.num_wrong}", *medians, f"{s.seconds:.2f}"))
+    return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), tuple(rows))
+
+
+def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:
+    """Return the queries that one run alone gets right, or whose statuses differ."""
+    rows = []
+    for first, second in pairs:
+        was = first.is_correct(thresholds)
+        is_now = second.is_correct(thresholds)
+        if was != is_now or first.result.status != second.result.status:
+            kind = "same error" if was == is_now else "better" if is_now else "worse"
+            rows.append((first.scene, printable(first.image), kind, _outcome(first), _outcome(second)))
+    columns = "scene", "panorama", "second is", "first", "second"
+    return Table("queries that changed", columns, tuple(rows), 5)
+
+
+def _outcome(row: QueryResult) -> str:
+    error = f"{row.position_error:.3f} m, {np.degrees(row.rotation_error):.2f} deg"
+    return f"{row.result.status} {row.result.confidence:.2f}: {error}"

@@ -1,0 +1,1 @@
+"""Experiments: those of the paper, and the loss over a plan."""

@@ -1,0 +1,207 @@
+"""Fit the confidence to trials, and check it and the covariances on others."""
+
+import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.stats import chi2
+
+from piccolo.cli.command import option
+from piccolo.confidence.confidence import (
+    AMBIGUOUS,
+    FEATURES,
+    LOCALIZED,
+    MIN_CONFIDENCE,
+    NONE_FEATURES,
+    ChoiceModel,
+    Standing,
+    classify,
+    none_features,
+    pose_features,
+    posterior,
+)
+from piccolo.confidence.covariance import PoseCovariance
+from piccolo.files.json_file import parse_lines, read_bytes
+from piccolo.geometry.pose import Pose, is_correct, log_so3
+
+from ..evaluation.tables import Table
+
+EPILOG = """\
+example:
+  python tools/benchmark.py calibration --fit trials.jsonl --check others.jsonl bench.jsonl
+
+The files are those of tools/benchmark.py confidence. Prints the fitted weights, to be copied to
+piccolo/confidence/confidence.py, and tables for each set of trials: how reliable the probabilities of the
+fitted model are (without --fit, of the model in use), and the fraction of true poses inside the confidence
+regions of the covariance.
+"""
+PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
+Array = NDArray[np.float64]
+Case = tuple[str, str, bool]  # what was tried, the status, and whether the best pose is right
+
+
+class Outcome(NamedTuple):
+    """One trial's poses, and which of them was right."""
+
+    case: str
+    standings: list[Standing]  # the best first
+    covariance: PoseCovariance | None
+    std_of_fit: float | None  # [m] of the best pose, as of Localization
+    right: int  # of the poses, or their number if none is
+    is_refused: bool  # as mirrored: no choice was made
+    error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
+
+    @property
+    def kind(self) -> str:
+        """Key in MODELS: what the photo was compared with."""
+        return self.standings[0].kind
+
+    @property
+    def std(self) -> float | None:
+        """Largest deviation of the best pose [m]; None where it is not known."""
+        return None if self.covariance is None else self.covariance.largest_std
+
+    def probabilities(self, model: ChoiceModel | None) -> Array:
+        """Return the probability of each pose, and of none (K + 1,); by default with the model in use."""
+        if self.is_refused:
+            return np.append(np.zeros(len(self.standings)), 1.0)
+        return posterior(self.standings, self.std, self.std_of_fit, model)
+
+
+def pose_error(pose: Pose, true_pose: Pose) -> Array:
+    """Return the error (6,) of a pose as PoseCovariance has it: rotation [rad], then position [m]."""
+    turn = log_so3(true_pose.R_cam_from_world @ pose.R_cam_from_world.T)
+    return np.concatenate([turn, true_pose.center_world - pose.center_world])
+
+
+def read_outcome(line: str) -> Outcome | None:
+    """Read a line of tools/benchmark.py confidence; None if no pose was found."""
+    trial = json.loads(line)
+    poses = [read_pose(pose) for pose in trial["poses"]]
+    if not poses:
+        return None
+    standings = [Standing(*standing) for standing in trial["standings"]]
+    matrix = trial["covariance"]
+    covariance = None if matrix is None else PoseCovariance(np.array(matrix), "")
+    error = np.full(6, np.nan)
+    right = len(poses)
+    if trial["truth"] is not None:
+        true_pose = read_pose(trial["truth"])
+        error = pose_error(poses[0], true_pose)
+        right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
+    is_refused = trial["probabilities"][-1] == 1.0
+    return Outcome(str(trial["case"]), standings, covariance, trial["std_of_fit"], right, is_refused, error)
+
+
+def read_pose(document: dict[str, list[float]]) -> Pose:
+    """Read a pose that tools/benchmark.py confidence wrote."""
+    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
+
+
+def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
+    """Return the weights of the greatest penalised likelihood."""
+    poses = [np.array([pose_features(s) for s in o.standings]) for o in outcomes]
+    nones = np.array([none_features(o.std if o.std_of_fit is None else o.std_of_fit) for o in outcomes])
+    deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
+
+    def loss(w: Array) -> tuple[float, Array]:
+        total = 0.5 * PENALTY * w @ w
+        gradient = PENALTY * w
+        v = w / deviations
+        for features, none, o in zip(poses, nones, outcomes, strict=True):
+            logits = np.append(features @ v[:-2], none @ v[-2:])
+            p = np.exp(logits - logits.max())
+            p /= p.sum()
+            total -= np.log(max(p[o.right], 1e-300))
+            p[o.right] -= 1.0
+            gradient = gradient + np.append(p[:-1] @ features, p[-1] * none) / deviations
+        return float(total), gradient
+
+    bounds = [(0.0, None)] * poses[0].shape[1] + [(None, None), (0.0, None)]
+    v = minimize(loss, np.zeros(len(bounds)), jac=True, method="L-BFGS-B", bounds=bounds).x / deviations
+    return ChoiceModel(tuple(v[:-2].tolist()), (float(v[-2]), float(v[-1])))
+
+
+def print_cases(title: str, rows: Sequence[Case]) -> int:
+    """Print the statuses of each case; returns the number of false answers."""
+    table = []
+    num_false = 0
+    for case in dict.fromkeys(case for case, _, _ in rows):
+        own = [(status, is_right) for other, status, is_right in rows if other == case]
+        statuses = [status for status, _ in own]
+        false = own.count((LOCALIZED, False))
+        right = sum(is_right for _, is_right in own)
+        counts = (len(own), right, statuses.count(LOCALIZED), statuses.count(AMBIGUOUS), false)
+        table.append((case, *map(str, counts)))
+        num_false += false
+    print(Table("", (title, "trials", "right", "localized", "ambiguous", "false"), tuple(table)).markdown())
+    return num_false
+
+
+def print_reliability(title: str, stated: Array, right: NDArray[np.bool_]) -> None:
+    """Print how many poses, and answers none, were right in each tenth of the probability."""
+    rows = []
+    for low in np.arange(10) / 10:
+        some = (stated >= low) & ((stated < low + 0.1) | (low == 0.9))
+        if some.any():
+            means = (f"{stated[some].mean():.3f}", f"{right[some].mean():.3f}")
+            rows.append((f"{low:.1f} to {low + 0.1:.1f}", str(some.sum()), *means))
+    print(Table("", (title, "answers", "mean stated", "right"), tuple(rows)).markdown())
+
+
+def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
+    """Print the fraction of right poses whose error lies in the covariance's regions."""
+    known = [(o.error, o.covariance.matrix) for o in outcomes if o.right == 0 and o.covariance is not None]
+    if not known:
+        return
+    errors, matrices = (np.array(values) for values in zip(*known, strict=True))
+    rows = []
+    parts = {"rotation and position": slice(6), "rotation": slice(3), "position": slice(3, 6)}
+    for part, own in parts.items():
+        e = errors[:, own, None]
+        squares = np.sum(e * np.linalg.solve(matrices[:, own, own], e), axis=(1, 2))
+        fractions = [f"{np.mean(squares < chi2.ppf(p, e.shape[1])):.3f}" for p in (0.95, 0.5)]
+        rows.append((part, str(len(known)), *fractions))
+    columns = (title, "right poses", "in the 95 % region", "in the 50 % region")
+    print(Table("", columns, tuple(rows)).markdown())
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add all options."""
+    option(parser, "--fit FILE ...", "trials to which the weights are fitted", default=[])
+    option(parser, "--check FILE ...", "other trials, on which they are checked", default=[])
+    option(parser, "--without CASE ...", "leave these cases out", default=[])
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Fit the weights, print the tables."""
+
+    def read(paths: Sequence[Path]) -> list[Outcome]:
+        wanted = "wanted a file of tools/benchmark.py confidence"
+        found = [o for path in paths for o in parse_lines(path, read_bytes(path, wanted), read_outcome)]
+        return [o for o in found if o is not None and o.case not in arguments.without]
+
+    learnt = read(arguments.fit)
+    sets = {"learnt from": learnt, "others": read(arguments.check)}
+    models: dict[str, ChoiceModel] = {}
+    for kind in sorted({o.kind for o in learnt}):
+        models[kind] = model = fit([o for o in learnt if o.kind == kind])
+        print(f"{kind}:")
+        for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
+            print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=False)))
+    for name, outcomes in sets.items():
+        if not outcomes:
+            continue
+        stated = [o.probabilities(models.get(o.kind)) for o in outcomes]
+        right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
+        called = [classify(p, MIN_CONFIDENCE) for p in stated]
+        rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
+        print_cases(f"case, {name}", rows)
+        print_reliability(f"probability, {name}", np.concatenate(stated), np.concatenate(right))
+        print_coverage(f"covariance, {name}", outcomes)
+    return 0

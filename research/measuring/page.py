@@ -1,0 +1,386 @@
+"""Measure accuracy, damage, phone photos, time and memory, and write them as one page of Markdown."""
+
+import argparse
+import datetime
+import platform
+import subprocess
+import tempfile
+from collections.abc import Iterator, Sequence
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numba
+import numpy as np
+from scipy.stats import chi2
+
+import piccolo
+from piccolo.cli.command import check_least, option
+from piccolo.cli.errors import print_note
+from piccolo.cloud import read_cloud
+from piccolo.confidence.confidence import LOCALIZED
+from piccolo.errors import InputError
+from piccolo.files.atomic import write_atomically
+from piccolo.geometry.pose import Array, Pose, is_correct
+from piccolo.jobs.threads import Workers, num_cores
+from piccolo.panorama import read_panorama
+from piccolo.paper.settings import PaperSettings
+from piccolo.result import Result
+from piccolo.scene import Query, Scene, read_scene
+
+from ..evaluation.tables import Table
+from ..synthetic.world import make_query, make_world
+from .calibration import pose_error
+from .confidence import Points
+from .damage import DAMAGED_SCANS, damage_panorama
+from .kernels import kernel_table
+from .photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
+from .scaling import clean_queries, size_table
+
+EPILOG = """\
+examples:
+  python tools/benchmark.py all --scenes BENCH/house BENCH/hall --out BENCHMARK.md
+  python tools/benchmark.py all --scenes BENCH/house --only kernels
+
+A folder has cloud.ply, images, and queries.json with true poses. If it has cameras/, its pictures are photos,
+each with a calibration cameras/NAME.camera.json; else they are panoramas. Damaged pictures and phone photos
+are made from the panoramas of the variant clean, or of all if there is none.
+"""
+ROOT = Path(__file__).resolve().parents[2]
+PAPER_SETTINGS = PaperSettings()
+NUM_BY_PAPER = 2  # panoramas of each scene
+CONFIDENCES = (0.0, 0.5, 0.9, 0.99, 1.0)
+MAX_WRONG = 20  # lines
+COLUMNS = ("queries", "right", "localized", "wrong of these", "outside", "mm", "deg", "s")
+
+PANORAMAS = "Panoramas as they are"
+DAMAGE = "Damaged panoramas and scans"
+PHOTOS = "Phone photos"
+PAPER = "Against the preset `paper`"
+SIZE = "Time and memory by the size of the scan"
+KERNELS = "Kernels against `cv2.remap`"
+TEXTS = {
+    PANORAMAS: """\
+All panoramas of each scene. clean: as the scan was made; tilt: the camera in any rotation; photo: other
+exposure and colours, noise, blur; change: furniture moved, people and things added.""",
+    DAMAGE: """\
+Seeded damage to panoramas of all scenes. Panoramas that are mirrored or of another place have no right pose:
+each one that is localized is wrong.""",
+    PHOTOS: f"""\
+Pinhole photos of {PHOTO_FOV_DEG:g} degrees, cut out of the panoramas in random directions, so they are soft.
+EXIF has the focal length in whole millimetres. Photos of a scene's own come with their calibrations.
+The corridor's true poses are ARKit's, good to about 2 cm and 0.5 degrees, so `outside` says little there.""",
+    PAPER: """\
+The same panoramas by both methods, gravity known. The preset is Algorithm 1 of the paper.""",
+    SIZE: """\
+Each row is measured in a process of its own, gravity known and unknown. A scene is resampled; rooms are those
+of `tools/make_room.py`, 50,000 points each. The peak of memory is that of the whole process.""",
+    KERNELS: "The reference is `cv2.remap`, one thread: 8 bits, 3 channels, bilinear, a pixel a point.",
+}
+PARTS = {
+    "panoramas": PANORAMAS,
+    "damage": DAMAGE,
+    "photos": PHOTOS,
+    "paper": PAPER,
+    "size": SIZE,
+    "kernels": KERNELS,
+}
+HEAD = """\
+# Benchmark
+
+    python tools/benchmark.py {words}
+
+Measured on {date} at commit {commit}, Python {python}, NumPy {numpy}, Numba {numba}, OpenCV {opencv};
+{processor}, {cores} cores.
+
+Right: under 0.1 m and 5 degrees. Wrong of these: localized, but not right. Outside: localized, and the true
+pose is not in the 95 % region of the covariance. mm, deg: median errors of the right poses. s: median seconds
+of a photo, without reading it. Gravity is `auto` where nothing else is said.
+"""
+
+
+class Row(NamedTuple):
+    """The result of one query."""
+
+    part: str
+    label: str  # of the table's line
+    query: str
+    true_pose: Pose | None  # None if there is no right answer
+    result: Result
+
+    @property
+    def is_right(self) -> bool:
+        """True if the best pose is correct, whatever its status."""
+        return self.true_pose is not None and is_correct(self.result.best_pose, self.true_pose)
+
+    @property
+    def is_localized(self) -> bool:
+        """True if the method is sure."""
+        return self.result.status == LOCALIZED
+
+    @property
+    def error(self) -> Array:
+        """Error (6,) of the best pose, rotation [rad] and position [m]; infinite without a right answer."""
+        pose = self.result.best_pose
+        if pose is None or self.true_pose is None:
+            return np.full(6, np.inf)
+        return pose_error(pose, self.true_pose)
+
+    @property
+    def is_outside(self) -> bool:
+        """True if the true pose lies outside of the 95 % region of the covariance."""
+        covariance = self.result.covariance
+        if covariance is None or not np.isfinite(self.error).all():
+            return False
+        return bool(self.error @ np.linalg.solve(covariance.matrix, self.error) > chi2.ppf(0.95, 6))
+
+    @property
+    def seconds(self) -> float:
+        """All stages but reading the photo."""
+        return sum(value for stage, value in self.result.seconds.items() if stage != "read")
+
+
+def row_cells(rows: Sequence[Row]) -> tuple[str, ...]:
+    """Return the statistics of some queries, as COLUMNS."""
+    right = [row.error for row in rows if row.is_right]
+    localized = [row for row in rows if row.is_localized]
+    counts = (len(rows), len(right), len(localized), sum(not row.is_right for row in localized))
+    outside = sum(row.is_outside for row in localized)
+    mm = f"{1000.0 * np.median([np.linalg.norm(e[3:]) for e in right]):.1f}" if right else "-"
+    deg = f"{np.degrees(np.median([np.linalg.norm(e[:3]) for e in right])):.3f}" if right else "-"
+    return (*map(str, (*counts, outside)), mm, deg, f"{np.median([row.seconds for row in rows]):.2f}")
+
+
+def accuracy_table(rows: Sequence[Row]) -> Table:
+    """Return the statistics of each label."""
+    labels = dict.fromkeys(row.label for row in rows)
+    lines = [(label, *row_cells([row for row in rows if row.label == label])) for label in labels]
+    return Table("", ("", *COLUMNS), tuple(lines))
+
+
+def confidence_table(rows: Sequence[Row]) -> Table:
+    """Return how many poses were right, by the confidence that was stated."""
+    lines = []
+    for low, high in pairwise(CONFIDENCES):
+        is_last = high == CONFIDENCES[-1]
+        own = [row for row in rows if low <= row.result.confidence < high + is_last]
+        if own:
+            stated = np.mean([row.result.confidence for row in own])
+            right = np.mean([row.is_right for row in own])
+            lines.append((f"{low:g} to {high:g}", str(len(own)), f"{stated:.3f}", f"{right:.3f}"))
+    return Table("", ("confidence", "queries", "mean stated", "fraction right"), tuple(lines))
+
+
+def camera_path(scene: Scene, query: Query) -> Path:
+    """Return where the calibration of a photo would be."""
+    return scene.folder / "cameras" / f"{query.image.stem}.camera.json"
+
+
+class Bench:
+    """Measurements of one run of the command."""
+
+    def __init__(self, arguments: argparse.Namespace) -> None:
+        self.arguments = arguments
+        scenes = [read_scene(folder) for folder in arguments.scenes]
+        if empty := [scene for scene in scenes if not scene.queries]:
+            raise InputError(f"{empty[0].folder}: found no queries, wanted pictures with true poses")
+        self.of_photos = [scene for scene in scenes if camera_path(scene, scene.queries[0]).exists()]
+        self.of_panoramas = [scene for scene in scenes if scene not in self.of_photos]
+        self.rows: list[Row] = []
+
+    def is_wanted(self, part: str) -> bool:
+        """Return True if a part is measured."""
+        return part in {PARTS[name] for name in self.arguments.only}
+
+    def add(self, part: str, label: str, query: str, true_pose: Pose | None, result: Result) -> None:
+        """Keep the result of a query."""
+        row = Row(part, label, query, true_pose, result)
+        self.rows.append(row)
+        end = "" if true_pose is None else ", right" if row.is_right else ", not right"
+        self.note(f"{part}: {label}: {query}: {result.status}{end}")
+
+    def measure(self) -> None:
+        """Localize all queries."""
+        for number, scene in enumerate(self.of_panoramas):
+            others = [*self.of_panoramas[number + 1 :], *self.of_panoramas[:number]]
+            self.measure_panoramas(scene, others)
+        for scene in self.of_photos if self.is_wanted(PHOTOS) else []:
+            scan = piccolo.open_scan(scene.cloud, cache=False)
+            for query in scene.queries:
+                result = scan.localize(query.image, camera=camera_path(scene, query))
+                self.add(PHOTOS, f"{scene.name}, own photos", query.image.name, query.pose, result)
+
+    def measure_panoramas(self, scene: Scene, others: Sequence[Scene]) -> None:
+        """Localize the panoramas of a scene, and what is made of them."""
+        scan = piccolo.open_scan(scene.cloud, cache=False)
+        if self.is_wanted(PANORAMAS):
+            for query in scene.queries:
+                label = f"{scene.name}, {query.variant}"
+                self.add(PANORAMAS, label, query.image.name, query.pose, scan.localize(query.image))
+        if self.is_wanted(DAMAGE):
+            self.measure_damage(scene, scan, read_foreign(others))
+        if self.is_wanted(PHOTOS):
+            self.measure_photos(scene, scan)
+        if self.is_wanted(PAPER):
+            self.measure_paper(scene, scan)
+
+    def measure_damage(self, scene: Scene, scan: piccolo.Scan, others: Sequence[Image]) -> None:
+        """Localize damaged panoramas, and panoramas in damaged scans."""
+        queries = clean_queries(scene, self.arguments.damaged)
+        panoramas = [read_panorama(query.image).rgb for query in queries]
+        for number, (query, rgb) in enumerate(zip(queries, panoramas, strict=True)):
+            rng = np.random.default_rng([number, len(scene.queries), 60])
+            for damaged in damage_panorama(rgb, others[number % len(others)], rng):
+                options: dict[str, Any] = {} if damaged.is_masked is None else {"mask": damaged.is_masked}
+                true_pose = query.pose if damaged.has_answer else None
+                name = f"{scene.name}/{query.image.name}"
+                self.add(DAMAGE, damaged.name, name, true_pose, scan.localize(damaged.rgb, **options))
+        cloud = read_cloud(scene.cloud)
+        points: Points = (cloud.points + cloud.origin_world, cloud.colors)
+        for label, change in DAMAGED_SCANS.items():
+            damaged_scan = piccolo.open_scan(*change(points, np.random.default_rng(61)))
+            for query in queries:
+                name = f"{scene.name}/{query.image.name}"
+                self.add(DAMAGE, label, name, query.pose, damaged_scan.localize(query.image))
+
+    def measure_photos(self, scene: Scene, scan: piccolo.Scan) -> None:
+        """Localize photos that are cut out of panoramas, with exact and with rounded focal lengths."""
+        rng = np.random.default_rng([len(scene.queries), 62])
+        queries = clean_queries(scene, self.arguments.photos)
+        with tempfile.TemporaryDirectory() as folder:
+            for number in range(self.arguments.photos if queries else 0):
+                query = queries[number % len(queries)]
+                path = Path(folder) / f"{scene.name}_{number}.jpg"
+                photo = cut_photo(read_panorama(query.image).rgb, query.pose, PHOTO_FOV_DEG, rng)
+                write_photo(photo, path)
+                exact = scan.localize(path, focal_px=photo.focal_px)
+                self.add(PHOTOS, f"{scene.name}, exact focal length", path.name, photo.pose, exact)
+                rounded = scan.localize(path)
+                self.add(PHOTOS, f"{scene.name}, focal length by EXIF", path.name, photo.pose, rounded)
+
+    def measure_paper(self, scene: Scene, scan: piccolo.Scan) -> None:
+        """Localize the same panoramas by both methods."""
+        by_paper = piccolo.open_scan(scene.cloud, cache=False, settings=PAPER_SETTINGS)
+        for query in clean_queries(scene, NUM_BY_PAPER):
+            name = f"{scene.name}/{query.image.name}"
+            for label, one in {"preset paper": by_paper, "default method": scan}.items():
+                self.add(PAPER, label, name, query.pose, one.localize(query.image, gravity="known"))
+
+    def sections(self) -> Iterator[str]:
+        """Yield the parts of the page after its head, measured by now or as they come."""
+        for part in (PANORAMAS, DAMAGE, PHOTOS, PAPER):
+            rows = [row for row in self.rows if row.part == part]
+            if rows:
+                yield f"## {part}\n{TEXTS[part]}\n\n{accuracy_table(rows).markdown()}"
+            if rows and part == PAPER:
+                yield f"The preset takes {time_ratio(rows):.1f} times as long.\n"
+        rows = [row for row in self.rows if row.part != PAPER]
+        if rows:
+            table = confidence_table(rows).markdown()
+            text = "All queries above but those of the preset comparison."
+            yield f"## Confidences\n{text}\n\n{table}\n{wrong_lines(rows)}"
+        if self.of_panoramas and self.is_wanted(SIZE):
+            scene = self.of_panoramas[0]
+            sizes = size_table(scene, self.arguments.points, self.arguments.rooms, self.note)
+            yield f"## {SIZE}\n{TEXTS[SIZE]}\n\n{sizes.markdown()}"
+        if self.of_panoramas and self.is_wanted(KERNELS):
+            scene = self.of_panoramas[0]
+            rgb = read_panorama(scene.queries[0].image).rgb
+            speeds = kernel_table(read_cloud(scene.cloud), rgb)
+            yield f"## {KERNELS}\n{TEXTS[KERNELS]}\n{speeds.markdown()}"
+
+    def note(self, text: str) -> None:
+        """Print progress."""
+        print_note(self.arguments, text)
+
+
+def read_foreign(scenes: Sequence[Scene]) -> list[Image]:
+    """Return panoramas of other places: of the first other scene, or of a made room."""
+    if scenes:
+        return [read_panorama(query.image).rgb for query in clean_queries(scenes[0], 4)]
+    world = make_world(63, np.array([5.0, 4.0, 2.6]))
+    return [make_query(world, 0, "clean", 1024, Workers(num_cores())).rgb]
+
+
+def time_ratio(rows: Sequence[Row]) -> float:
+    """Return the median seconds of the first label divided by those of the last."""
+    first, last = (
+        np.median([row.seconds for row in rows if row.label == label])
+        for label in (rows[0].label, rows[-1].label)
+    )
+    return float(first / last)
+
+
+def wrong_lines(rows: Sequence[Row]) -> str:
+    """Return a line for each query that is localized and not right."""
+    wrong = [row for row in rows if row.is_localized and not row.is_right]
+    lines = [f"{len(wrong)} of {len(rows)} were localized and are not right."]
+    for row in wrong[:MAX_WRONG]:
+        distance = np.linalg.norm(row.error[3:])
+        error = f"{distance:.2f} m off" if np.isfinite(distance) else "no right answer"
+        lines.append(f"- {row.label}, {row.query}: {error}; confidence {row.result.confidence:.3f}")
+    if len(wrong) > MAX_WRONG:
+        lines.append(f"- and {len(wrong) - MAX_WRONG} more")
+    return "\n".join([*lines, ""])
+
+
+def git_commit() -> str:
+    """Return the commit of the checkout, with "-dirty" if files differ from it."""
+    command = ["git", "describe", "--always", "--dirty", "--abbrev=12"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    return done.stdout.strip() or "unknown"
+
+
+def processor_name() -> str:
+    """Return the name of the processor, as far as the system knows it."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def page_head(arguments: argparse.Namespace) -> str:
+    """Return title, date, commit, options, versions and machine."""
+    words = ["all", "--scenes", *(folder.resolve().name for folder in arguments.scenes)]
+    for name in ("only", "damaged", "photos", "points", "rooms"):
+        words += [f"--{name}", *map(str, np.atleast_1d(getattr(arguments, name)))]
+    return HEAD.format(
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        commit=git_commit(),
+        words=" ".join(words),
+        python=platform.python_version(),
+        numpy=np.__version__,
+        numba=numba.__version__,
+        opencv=cv2.__version__,
+        processor=processor_name(),
+        cores=num_cores(),
+    )
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add all options."""
+    option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
+    option(parser, "--only PART ...", "measure only these parts", choices=PARTS, default=list(PARTS))
+    option(parser, "--damaged N", "number of panoramas of each scene to damage", default=4)
+    text = "number of phone photos to cut out of the panoramas of each scene"
+    option(parser, "--photos N", text, default=12)
+    sizes = [10_000, 100_000, 1_000_000]
+    option(parser, "--points N ...", "sizes to which the first scene is resampled", nargs="*", default=sizes)
+    text = "sizes of synthetic scenes, 1 to 256 rooms"
+    option(parser, "--rooms N ...", text, nargs="*", default=[1, 16, 64])
+    option(parser, "--out FILE", "write the page here (default: print it)")
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, and write the page."""
+    check_least(arguments, damaged=0, photos=0)
+    head = page_head(arguments)
+    bench = Bench(arguments)
+    bench.measure()
+    page = "\n".join(chain([head], bench.sections())).rstrip("\n") + "\n"
+    if arguments.out is None:
+        print(page, end="")
+    else:
+        write_atomically(arguments.out, page.encode())
+    return 0
