@@ -34,8 +34,8 @@ from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .photo import Photo
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
-from .scan_map.named_scans import add_places, check_within
 from .scan_map.gps import GpsPrior, gps_prior
+from .scan_map.named_scans import add_places, check_within
 from .scan_map.scan_map import ScanMap
 
 OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
@@ -195,8 +195,8 @@ class OpenedScan:
         found = localize_bundle(prepared, pictures, poses, settings, self.workers, watch, errors)
         seconds = {stage: spent / len(found) for stage, spent in watch.seconds.items()}
         return [
-            self.add_localization(self.make_blank(*of_photo, settings, seconds), one)
-            for *of_photo, one in zip(photos, pictures, facts, found, strict=True)
+            self.add_localization(self.make_blank(photo, picture, about, settings, seconds), one)
+            for photo, picture, about, one in zip(photos, pictures, facts, found, strict=True)
         ]
 
     def make_blank(

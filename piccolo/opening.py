@@ -85,6 +85,7 @@ class Cloud:
                 raise InputError("`source`: found no file, wanted a scan's path")
         elif self.units != "m":
             raise InputError(f"`units`: found {self.units!r} for arrays, wanted points in metres")
+        self.settings  # noqa: B018  refuses what does not go together
 
     @property
     def paths(self) -> list[Path]:

@@ -110,7 +110,7 @@ class Photo:
 
     @property
     def instant(self) -> Calibration | None:
-        """Calibration of the rig whose pictures of one instant are in the folder; None for a single picture."""
+        """Calibration of the rig whose pictures of one instant are in the folder; None of one picture."""
         assert self.rig is None or isinstance(self.rig, Calibration)
         return self.rig
 
@@ -187,7 +187,9 @@ class Photo:
             needing = "`fov_deg` of a sphere, `cube_order`, `mask_nadir_deg`, `rig` and a path as `mask`"
             raise InputError(f"{needing}: found an array as picture, wanted a file")
         size = picture.shape[:2]
-        if isinstance(self.mask, np.ndarray) and (self.mask.shape, self.mask.dtype) != (size, np.bool_):
+        if isinstance(self.mask, np.ndarray) and not (
+            self.mask.shape == size and self.mask.dtype == np.bool_
+        ):
             found = f"{self.mask.dtype} of shape {self.mask.shape}"
             raise InputError(f"`mask`: found {found}, wanted bool of shape {size}, as the picture's")
 

@@ -1,9 +1,8 @@
 """Prior knowledge of the user on a camera's pose."""
 
 import math
-from dataclasses import KW_ONLY, dataclass, replace
-
 from collections.abc import Sequence
+from dataclasses import KW_ONLY, dataclass, replace
 
 from .arguments import check_fields
 from .errors import InputError
@@ -22,7 +21,7 @@ class Prior:
     height
         Least and greatest height of the camera above the floor [m].
     heading_deg, heading_tolerance_deg
-        Heading [deg] of the image centre, clockwise from the scan's +y, and its largest error (by default 20).
+        Heading [deg] of the image centre, clockwise from the scan's +y, and its largest error (20).
     within
         Names of the scans in the map that the camera may be in, by default all.
     use_gps

@@ -124,7 +124,8 @@ class Scan:
         `prior` is one of all photos, or a list with one of each. The status of a photo that can't be read is
         "unreadable", or "failed" if another try may succeed; `error` says why.
         """
-        check_kind("photos", photos, Iterable[Any])
+        check_kind("photos", photos, Iterable[Picture])
+        check_kind("prior", prior, Prior | Sequence[Prior | None] | None)
         priors: Iterable[Prior | None] = repeat(prior) if prior is None or isinstance(prior, Prior) else prior
         if isinstance(prior, Sequence):
             photos = list(photos)
@@ -158,7 +159,8 @@ class Scan:
         The scale of their positions is fitted: within 1 % of metres, or freely if `relative_scale` is
         "unknown", as of COLMAP. Raises InputError for a photo that can't be read.
         """
-        check_kind("photos", photos, Iterable[Any])
+        check_kind("photos", photos, Iterable[Picture])
+        check_kind("relative_poses", relative_poses, Sequence[Pose])
         check_kind("relative_scale", relative_scale, RelativeScale)
         given = [as_photo(photo) for photo in photos]
         check_one_each("relative_poses", relative_poses, len(given), "photo")
@@ -227,7 +229,7 @@ class Scan:
         ['localized', 'localized']
         """
         walk = self.track(motion=motion, prior=prior, gravity=gravity)
-        check_kind("frames", frames, Iterable[Any])
+        check_kind("frames", frames, Iterable[Picture])
         check_kind("times", times, Sequence[float] | NDArray[np.floating[Any]] | None)
         check_kind("odometry", odometry, Sequence[Pose | None] | None)
         taken = [as_photo(frame) for frame in frames]

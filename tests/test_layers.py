@@ -38,6 +38,7 @@ LAYERS = [
     "confidence",
     "views",
     "panorama",
+    "photo",
     "camera",
     "cloud",
     "geometry",
@@ -45,6 +46,7 @@ LAYERS = [
     "files",
     "jobs",
     "optional",
+    "prior",
     "arguments",
     "errors",
 ]

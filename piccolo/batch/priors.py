@@ -76,7 +76,8 @@ def _row_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior)
         changes["heading_tolerance_deg"] = row.get("tolerance", general.heading_tolerance_deg)
     gravity_vector = None
     if "gravity_x" in row:
-        gravity_vector = Photo(Path(), gravity_vector=tuple(row[column] for column in GRAVITY)).gravity_vector
+        x, y, z = (row[column] for column in GRAVITY)
+        gravity_vector = Photo(Path(), gravity_vector=(x, y, z)).gravity_vector
     return Row(replace(general, **changes), gravity_vector)
 
 

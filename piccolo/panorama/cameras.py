@@ -77,7 +77,9 @@ def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
         return Cameras()
     found = read_focal_length(picture.exif, picture.size)
     if found is None and lens == "pinhole":
-        raise InputError(f"{photo.path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`")
+        raise InputError(
+            f"{photo.path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`"
+        )
     if found is None or (is_two_to_one and lens is None):
         return Cameras(notes=(f"{AS_SPHERE}{found.source}",) if found else ())
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))

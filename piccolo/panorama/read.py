@@ -74,13 +74,18 @@ def _read(photo: Photo, labels: Labels | None) -> Panorama:
     check_labels(photo, labels)
     if isinstance(photo.picture, np.ndarray):
         return _read_array(photo, photo.picture)
-    path = photo.path
     if labels:
         return _read_labelled(photo, labels)
     if photo.instant is not None:
         return _read_rig(photo, photo.instant)
-    if path.is_dir():
-        return _embed_and_mask(photo, read_cube_folder(path), CropRegion(), None)
+    if photo.path.is_dir():
+        return _embed_and_mask(photo, read_cube_folder(photo.path), CropRegion(), None)
+    return _read_picture(photo)
+
+
+def _read_picture(photo: Photo) -> Panorama:
+    """Read the photo in one file."""
+    path = photo.path
     picture = read_picture(path)
     if cube := cube_of_cells(path, picture, photo.cube_order):
         return _embed_and_mask(photo, cube, CropRegion(), None)
@@ -91,7 +96,6 @@ def _read(photo: Photo, labels: Labels | None) -> Panorama:
     if cameras.mounts:
         if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
             gpano = GPano(elevation)
-        picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
         return _on_sphere(photo, [(path, picture, cameras.mounts)], gpano, cameras)
     region, more = _region_of(photo, picture, fields)
     picture = replace(picture, warnings=(*picture.warnings, *more))
@@ -186,15 +190,11 @@ def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
     return _mask(photo, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts)
 
 
-def _region_of(
-    photo: Photo, picture: Picture, fields: dict[str, str]
-) -> tuple[CropRegion, list[str]]:
+def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[CropRegion, list[str]]:
     """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
     width, height = picture.size
     if photo.fov_deg is not None:
-        notes = (
-            [LIKE_A_PHOTO] if photo.projection is None and not fields and _is_like_photo(picture) else []
-        )
+        notes = [LIKE_A_PHOTO] if photo.projection is None and not fields and _is_like_photo(picture) else []
         return region_of_fov(photo.fov_deg, width, height), notes
     name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
@@ -222,9 +222,7 @@ def _is_like_photo(picture: Picture) -> bool:
     return any(abs(ratio / camera_ratio - 1.0) <= ASPECT_TOLERANCE for camera_ratio in CAMERA_RATIOS)
 
 
-def _embed_and_mask(
-    photo: Photo, picture: Picture, region: CropRegion, gpano: GPano | None
-) -> Panorama:
+def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, gpano: GPano | None) -> Panorama:
     """Embed the picture in the full sphere, and mask all pixels that do not count."""
     path = photo.path
     size = full_size(path, region, picture.size)

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator, Sequence
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 import numba
@@ -208,7 +208,7 @@ class Bench:
         for scene in self.of_photos if self.is_wanted(PHOTOS) else []:
             scan = piccolo.open_scan(scene.cloud, cache=False)
             for query in scene.queries:
-                result = scan.localize(query.image, camera=camera_path(scene, query))
+                result = scan.localize(piccolo.Photo(query.image, camera=camera_path(scene, query)))
                 self.add(PHOTOS, f"{scene.name}, own photos", query.image.name, query.pose, result)
 
     def measure_panoramas(self, scene: Scene, others: Sequence[Scene]) -> None:
@@ -232,14 +232,15 @@ class Bench:
         for number, (query, rgb) in enumerate(zip(queries, panoramas, strict=True)):
             rng = np.random.default_rng([number, len(scene.queries), 60])
             for damaged in damage_panorama(rgb, others[number % len(others)], rng):
-                options: dict[str, Any] = {} if damaged.is_masked is None else {"mask": damaged.is_masked}
+                photo = piccolo.Photo(damaged.rgb, mask=damaged.is_masked)
                 true_pose = query.pose if damaged.has_answer else None
                 name = f"{scene.name}/{query.image.name}"
-                self.add(DAMAGE, damaged.name, name, true_pose, scan.localize(damaged.rgb, **options))
+                self.add(DAMAGE, damaged.name, name, true_pose, scan.localize(photo))
         cloud = read_cloud(scene.cloud)
         points: Points = (cloud.points + cloud.origin_world, cloud.colors)
         for label, change in DAMAGED_SCANS.items():
-            damaged_scan = piccolo.open_scan(*change(points, np.random.default_rng(61)))
+            damaged_points, colors = change(points, np.random.default_rng(61))
+            damaged_scan = piccolo.open_scan(piccolo.Cloud(damaged_points, colors=colors))
             for query in queries:
                 name = f"{scene.name}/{query.image.name}"
                 self.add(DAMAGE, label, name, query.pose, damaged_scan.localize(query.image))
@@ -254,7 +255,7 @@ class Bench:
                 path = Path(folder) / f"{scene.name}_{number}.jpg"
                 photo = cut_photo(read_panorama(query.image).rgb, query.pose, PHOTO_FOV_DEG, rng)
                 write_photo(photo, path)
-                exact = scan.localize(path, focal_px=photo.focal_px)
+                exact = scan.localize(piccolo.Photo(path, focal_px=photo.focal_px))
                 self.add(PHOTOS, f"{scene.name}, exact focal length", path.name, photo.pose, exact)
                 rounded = scan.localize(path)
                 self.add(PHOTOS, f"{scene.name}, focal length by EXIF", path.name, photo.pose, rounded)
