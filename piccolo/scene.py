@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from .geometry.sphere import CONVENTION
 QUERIES_NAME = "queries.json"
 CLOUD_NAME = "cloud.ply"
 WANTED = "wanted a queries.json with true poses"
+POSE_FIELDS = ("R_cam_from_world", "center_world")
 MAX_SKEW = 1e-4  # of R R^T from the identity
 
 
@@ -106,20 +107,28 @@ def input_files(scenes: Sequence[Scene]) -> list[Path]:
     return of_all + [path for query in queries for path in (query.image, query.labels) if path]
 
 
+def document_of_pose(pose: Pose) -> dict[str, list[Any]]:
+    """Return a pose as JSON has it."""
+    return {name: getattr(pose, name).tolist() for name in POSE_FIELDS}
+
+
+def pose_of(document: Mapping[str, Any]) -> Pose:
+    """Return the pose in a JSON object; what it lacks, or what is no array, raises as it comes."""
+    return Pose(*(np.array(document[name], float) for name in POSE_FIELDS))
+
+
 def _query(folder: Path, number: int, entry: dict[str, Any]) -> Query:
     """One entry; ValueError if it lacks something, or its numbers are no pose."""
-    fields = ("image", "variant", "R_cam_from_world", "center_world")
+    fields = ("image", "variant", *POSE_FIELDS)
     if not isinstance(entry, dict) or not all(name in entry for name in fields):
         raise ValueError(f"queries[{number}] without one of {', '.join(fields)}")
     names = [entry["image"], entry.get("labels") or ""]
     is_plain = isinstance(entry["variant"], str) and entry["variant"].isprintable()
     if not is_plain or not all(isinstance(name, str) and "\0" not in name for name in names):
         raise ValueError(f"queries[{number}] with an image, a variant or labels that are no plain text")
-    R_cam_from_world = np.array(entry["R_cam_from_world"], float)
-    center_world = np.array(entry["center_world"], float)
     labels = folder / entry["labels"] if entry.get("labels") else None
     cameras = read_mounts(entry["camera"]) if entry.get("camera") else ()
-    pose = check_pose(Pose(R_cam_from_world, center_world), entry["image"], MAX_SKEW)
+    pose = check_pose(pose_of(entry), entry["image"], MAX_SKEW)
     return Query(folder / entry["image"], entry["variant"], pose, labels, cameras, *_walk_of(entry))
 
 
@@ -150,13 +159,12 @@ def write_queries(folder: Path, queries: Iterable[Query], **more: object) -> Non
     """Write the queries.json of a folder that holds the cloud and the images; `more` goes in beside them."""
     entries = []
     for query in queries:
-        pose = {name: getattr(query.pose, name).tolist() for name in ("R_cam_from_world", "center_world")}
         labels = {"labels": _relative(query.labels, folder)} if query.labels else {}
         image = _relative(query.image, folder)
         camera = {"camera": document_of(query.cameras)} if query.cameras else {}
         walk = {"walk": query.walk, "time": query.time} if query.walk is not None else {}
         refused = {} if query.is_answerable else {"answerable": False}
         own = {**labels, **camera, **walk, **refused}
-        entries.append({"image": image, "variant": query.variant, **pose, **own})
+        entries.append({"image": image, "variant": query.variant, **document_of_pose(query.pose), **own})
     document = {"cloud": CLOUD_NAME, "convention": CONVENTION, **more, "queries": entries}
     write_atomically(folder / QUERIES_NAME, json.dumps(document, indent=1).encode())

@@ -19,7 +19,7 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
 from piccolo.scene import read_scene
 from piccolo.views.zbuffer import visible_points
-from research.commands import convert_dataset
+from research.datasets import convert_dataset
 from research.synthetic.raycast import cast_rays
 
 SEED = 5

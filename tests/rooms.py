@@ -13,7 +13,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import average_view, normalize_view
-from research.commands import make_room
+from research.synthetic import make_room
 from research.synthetic.world import make_query, make_world, scan_world
 
 SIZE = (4.5, 3.5, 2.5)

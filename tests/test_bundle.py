@@ -28,7 +28,7 @@ from piccolo.localization.localize import localize
 from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
-from research.measuring.confidence import mask_outside_field
+from research.synthetic.photos import mask_outside_field
 from research.synthetic.world import photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])

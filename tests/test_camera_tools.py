@@ -18,7 +18,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
 from piccolo.scene import read_scene
 from piccolo.views.pictures import cut, sphere_width_for
-from research.commands import evaluate, make_room
+from research.evaluation import evaluate
+from research.synthetic import make_room
 from research.synthetic.world import make_world, photograph, pose_of_query, render_picture
 
 WIDE = Camera("OPENCV", 480, 400, (150.0, 152.0, 245.0, 198.0, -0.02, 0.001, 1e-3, -1e-3))

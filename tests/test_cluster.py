@@ -12,7 +12,7 @@ from batches import PAPER, ROOT, start_localize, untimed, wait_for_lines, worker
 
 from piccolo.cli import localize
 from piccolo.jobs import cluster
-from research.commands import evaluate
+from research.evaluation import evaluate
 
 PANOS = [f"images/clean_{k % 3}.jpg" for k in range(12)]
 

@@ -136,7 +136,7 @@ def test_skyboxes_without_a_pose_are_left_out_and_damage_is_refused_of_matterpor
     code, (line,), _ = made.run(capsys, "matterport3d", matterport, tmp_path / "out")
     assert (code, line["queries"]) == (0, 1)
     second.write_text("1 0 0")
-    refuse(f"{second}: found 3 numbers, wanted 4 x 4 numbers")
+    refuse(f"{second}: found the shape (3,), wanted 4 x 4 numbers")
     folder = matterport / "v1" / "scans" / HOUSE / HOUSE
     shutil.copytree(folder, matterport / HOUSE)
     refuse(f"the scene {HOUSE} twice")
@@ -228,7 +228,7 @@ def test_poses_fit_and_splits_are_variants_of_omniscenes(omniscenes, tmp_path, c
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("1 0 0 0\n0 1 0 0\n", "found 8 numbers, wanted 3 x 4 numbers"),
+        ("1 0 0 0\n0 1 0 0\n", "found the shape (8,), wanted 3 x 4 numbers"),
         ("1 0 0 0\n0 1 0 0\n0 0 1 x\n", "could not convert"),
         ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n", "found a matrix that is no rotation"),
     ],

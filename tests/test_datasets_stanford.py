@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from piccolo.scene import find_scenes
-from research.commands import convert_dataset
+from research.datasets import convert_dataset
 
 LABELS = ["<UNK>_0_<UNK>_0_0", "chair_1_office_1_1", "wall_1_office_1_1", "clutter_7_office_1_1"]
 CHAIR, WALL, CLUTTER = 9, 3, 13
@@ -137,7 +137,7 @@ def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
     for text, message in (
         (
             '{"camera_location": [1, 2], "final_camera_rotation": [0, 0, 0]}',
-            "camera_location has the shape (2,)",
+            "camera_location: found the shape (2,)",
         ),
         ('{"camera_location": [0, 0, "x"], "final_camera_rotation": [0, 0, 0]}', "found ValueError"),
         ("[]", "wanted JSON with camera_location"),

@@ -17,7 +17,7 @@ from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
 from piccolo.scene import Query, read_scene, write_queries
-from research.commands import evaluate
+from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]

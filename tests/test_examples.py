@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import piccolo
-from research.commands import make_room
+from research.synthetic import make_room
 
 ROOT = Path(__file__).resolve().parents[1]
 SCAN, PHOTO = "room/cloud.ply", "room/images/clean_0.jpg"

@@ -13,7 +13,6 @@ import piccolo
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
-from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.stopwatch import Stopwatch
@@ -298,32 +297,3 @@ def test_pictures_of_a_result_are_made_with_the_camera_found():
     assert given.with_refined_camera(found).calibration.mounts == (turned.with_camera(found[0].camera),)
     plain = Photo("a.jpg")
     assert plain.with_refined_camera(()) is plain
-
-
-def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
-    """One in fifty is wrong; a sharp picture confirms or contradicts it, a blurred one says little."""
-    assert Opinion(0.0, 0.004**2).doubt(0.003) < 0.005
-    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(SLIPS, abs=0.015)
-    assert Opinion(0.05, 0.02**2).doubt(0.003) > 0.05
-    assert Opinion(-0.05, 0.009**2).doubt(0.003) > 0.99
-    rising = [Opinion(off, 0.02**2).doubt(0.003) for off in (0.0, 0.02, 0.04, 0.06, 1.0)]
-    assert rising == sorted(rising)
-    assert Opinion(9.0, 0.01**2).doubt(0.003) <= 1.0
-
-
-def test_photos_of_one_camera_agree_on_its_focal_length_whatever_some_say():
-    """Each is right to its deviation, but for those at a wrong place; the mean has the deviation it says."""
-    rng = np.random.default_rng(5)
-    misses = []
-    for _ in range(200):
-        stds = rng.uniform(0.005, 0.03, 12)
-        offs = rng.normal(0.05, stds)
-        offs[:3] = rng.uniform(-0.3, 0.3, 3)
-        opinions = [Opinion(off, std**2) for off, std in zip(offs, stds, strict=True)]
-        consensus = Consensus([None, *opinions]).opinion()
-        misses.append((consensus.off - 0.05) / math.sqrt(consensus.variance))
-    assert 0.5 < np.std(misses) < 1.4
-    one_less = Consensus(opinions).opinion(without=4)
-    assert one_less.variance > consensus.variance
-    assert Consensus([Opinion(0.0, 1e-4), None, Opinion(0.0, 1e-4)]).opinion() is None
-    assert Consensus([None]).opinion() is None

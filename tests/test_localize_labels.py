@@ -9,7 +9,7 @@ from rooms import errors, write_room
 from piccolo.cli import localize, prepare_map
 from piccolo.result import Result
 from piccolo.scene import read_scene
-from research.commands import evaluate
+from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
 from research.synthetic.room import LABEL_NAMES
 

@@ -17,7 +17,7 @@ from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
 from piccolo.scene import read_scene
 from piccolo.views.zbuffer import visible_points
-from research.commands import loss_surface as tool
+from research.experiments import loss_surface as tool
 from research.experiments.loss_surface import LossSurface, PoseGrid, loss_surface
 
 STEP = 0.3

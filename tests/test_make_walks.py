@@ -11,7 +11,7 @@ import pytest
 from piccolo.geometry.pose import rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.scene import read_scene
-from research.commands import make_room as tool
+from research.synthetic import make_room as tool
 from research.synthetic.walk_frames import BAD_KINDS
 
 

@@ -19,8 +19,8 @@ from piccolo.panorama.texels import pack_texels
 from piccolo.paper.settings import PaperSettings
 from piccolo.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
-from research.commands import reproduce_paper
 from research.evaluation.query_result import read_run
+from research.experiments import reproduce_paper
 from research.experiments.reproduce_paper import EXPERIMENTS, flip, identity, thin, with_random_rotation
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]

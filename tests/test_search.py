@@ -21,7 +21,7 @@ from piccolo.panorama.local_normalization import normalize_panorama, sample_chan
 from piccolo.panorama.model import resize
 from piccolo.photo import Photo
 from piccolo.prior import Prior
-from research.measuring.confidence import mask_outside_field
+from research.synthetic.photos import mask_outside_field
 
 AREA = make_grid(24).solid_angle
 

@@ -10,7 +10,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.scene import read_scene
-from research.commands import make_room as tool
+from research.synthetic import make_room as tool
 from research.synthetic.raycast import cast_rays
 from research.synthetic.room import make_room
 from research.synthetic.world import (

@@ -16,8 +16,9 @@ from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, read_scene, write_queries
-from research.commands import benchmark
-from research.measuring import confidence, damage, page, photos, scaling
+from research.evaluation.query_result import QueryResult
+from research.measuring import benchmark, confidence, page, scaling, trials
+from research.synthetic import photos
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +56,7 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
     for name in ("mirrored", "another place"):
         assert [damaged[name][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
-    assert set(damage.DAMAGED_SCANS) < set(damaged)
+    assert set(trials.DAMAGED_SCANS) < set(damaged)
     photos = table_of(text, page.PHOTOS)
     assert [row["queries"] for row in photos.values()] == ["1", "1"]
     paper = table_of(text, page.PAPER)
@@ -63,7 +64,7 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     stated = float(re.search(r"The preset takes (\d+\.\d) times as long", text)[1])
     assert stated == pytest.approx(ratio, abs=0.1)
     confidences = table_of(text, "Confidences")
-    assert sum(int(row["queries"]) for row in confidences.values()) == 1 + len(damaged) + 2
+    assert sum(int(row["answers"]) for row in confidences.values()) == 1 + len(damaged) + 2
     assert f"0 of {1 + len(damaged) + 2} were localized and are not right." in text
     sizes = table_of(text, page.SIZE)
     assert [row["points"] for row in sizes.values()] == ["20,000"]
@@ -116,7 +117,7 @@ def test_wrong_answers_are_listed():
     pose = Pose(np.eye(3), np.zeros(3))
     found = Pose(np.eye(3), np.array([0.5, 0.0, 0.0]))
     result = Result("localized", 0.95, "a.ply", "a.jpg", found, None, None, (), None, {"search": 1.0}, {})
-    rows = [page.Row("", "night", "a.jpg", pose, result)] * 25
+    rows = [QueryResult("", "a.jpg", "night", None, pose, result)] * 25
     assert page.row_cells(rows) == ("25", "0", "25", "25", "0", "-", "-", "1.00")
     first, second, *_, last = page.wrong_lines(rows).splitlines()
     assert first == "25 of 25 were localized and are not right."
@@ -138,7 +139,7 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
     text = capsys.readouterr().out
     assert re.search(r"ratio \d+\.\d+, log of the score \d+\.\d+", text)
     assert re.search(r"constant -?\d+\.\d+, log10 of the largest deviation", text)
-    assert "| probability, learnt from | answers | mean stated | right |" in text
+    assert "| probability, learnt from | answers | mean stated | fraction right |" in text
     assert "| covariance, others | right poses |" in text
     assert benchmark.main(["calibration", "--fit", str(tmp_path / "none.jsonl")]) == 3
     (tmp_path / "odd.jsonl").write_text("{}")

@@ -35,7 +35,7 @@ from piccolo.localization.verification import (
 )
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
-from research.measuring.confidence import mask_outside_field
+from research.synthetic.photos import mask_outside_field
 from research.synthetic.world import change_light, photograph, scan_world
 
 NUM_POINTS = 200_000

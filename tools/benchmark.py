@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "research.commands.benchmark")
+run(__name__, "research.measuring.benchmark")

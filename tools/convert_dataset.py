@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "research.commands.convert_dataset")
+run(__name__, "research.datasets.convert_dataset")

@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "research.commands.evaluate")
+run(__name__, "research.evaluation.evaluate")

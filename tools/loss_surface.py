@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "research.commands.loss_surface")
+run(__name__, "research.experiments.loss_surface")

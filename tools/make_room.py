@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "research.commands.make_room")
+run(__name__, "research.synthetic.make_room")

@@ -1,4 +1,4 @@
 #!/usr/bin/env python3
 from _checkout import run
 
-run(__name__, "research.commands.reproduce_paper")
+run(__name__, "research.experiments.reproduce_paper")

@@ -140,7 +140,7 @@ def group_by_camera(lines: Sequence[Line]) -> list[list[tuple[int, FocalLength]]
     known = [
         (line.image_size, line.focal.source, line.focal.given_px, k, line.focal)
         for k, line in enumerate(lines)
-        if line.focal is not None and line.focal.given_deviation <= WIDE
+        if line.focal is not None and line.focal.prior_deviation <= WIDE
     ]
     groups: list[list[tuple[int, FocalLength]]] = []
     camera: tuple[object, ...] = ()

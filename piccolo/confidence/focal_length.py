@@ -22,29 +22,29 @@ class Opinion(NamedTuple):
     off: float  # its logarithm, less that of the focal length given
     variance: float
 
-    def conflict(self, given_deviation: float) -> float:
+    def conflict(self, prior_deviation: float) -> float:
         """Return how many deviations it is from what was given."""
-        return abs(self.off) / math.sqrt(self.variance + given_deviation**2)
+        return abs(self.off) / math.sqrt(self.variance + prior_deviation**2)
 
-    def doubt(self, given_deviation: float) -> float:
+    def doubt(self, prior_deviation: float) -> float:
         """Return the probability that the focal length given is wrong.
 
         Some are: of another picture, a crop, a slip. Then they are off by a tenth; else by no more than the
         variance of the difference says. Both are normal distributions of the logarithm.
         """
-        spread = self.variance + given_deviation**2
+        spread = self.variance + prior_deviation**2
         wide = spread + SLIP**2
         odds = SLIPS / (1.0 - SLIPS) * math.sqrt(spread / wide)
         odds *= math.exp(min(0.5 * self.off**2 * (1.0 / spread - 1.0 / wide), MOST_LOG))
         return odds / (1.0 + odds)
 
-    def share_of_given(self, given_deviation: float) -> float:
+    def share_of_given(self, prior_deviation: float) -> float:
         """Return the share of what was given in the mean of both."""
-        return self.variance / (self.variance + given_deviation**2)
+        return self.variance / (self.variance + prior_deviation**2)
 
 
 class Consensus:
-    """What photos of one camera say of its focal length together.
+    """The focal length of one camera by all of its photos together.
 
     Photos at a wrong place find any focal length: weights are those of Geman and McClure's loss, from the
     median on. None stands for a photo that says nothing.

@@ -54,7 +54,7 @@ class FocalLength:
     others_std_px: float | None = None
 
     @property
-    def given_deviation(self) -> float:
+    def prior_deviation(self) -> float:
         """Standard deviation of the logarithm of what was given."""
         return self.given_std_px / self.given_px
 

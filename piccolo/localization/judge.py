@@ -169,9 +169,9 @@ def follow_consensus(found: Localization, consensus: Opinion, min_confidence: fl
     assert focal is not None
     doubt = focal.doubt
     if focal.others_px is None:
-        share = focal.opinion.share_of_given(focal.given_deviation) if focal.opinion else 1.0
-        doubt = share * consensus.doubt(focal.given_deviation)
-    is_contradicted = consensus.conflict(focal.given_deviation) > MOST_CONFLICT
+        share = focal.opinion.share_of_given(focal.prior_deviation) if focal.opinion else 1.0
+        doubt = share * consensus.doubt(focal.prior_deviation)
+    is_contradicted = consensus.conflict(focal.prior_deviation) > MOST_CONFLICT
     factor = (1.0 - doubt) / (1.0 - focal.doubt)
     told = replace(found, focal_length=replace(focal, doubt=doubt), is_ruled_out=is_contradicted)
     if is_contradicted:

@@ -41,13 +41,18 @@ def read_matrix(path: Path, num_rows: int) -> Array:
     """Return the matrix (num_rows, 4) that is all of a text file."""
     wanted = f"wanted {num_rows} x 4 numbers"
     words = read_text(path, wanted, max_size=1 << 16).split()
+    return array_of(str(path), words, wanted, (4 * num_rows,)).reshape(num_rows, 4)
+
+
+def array_of(where: str, value: object, wanted: str, *shapes: tuple[int, ...]) -> Array:
+    """Return numbers, which may be text, as an array of one of the shapes; InputError naming the place."""
     try:
-        numbers = np.array([float(word) for word in words[: 4 * num_rows + 1]])
-    except ValueError as error:
-        raise InputError(f"{path}: found {error}, {wanted}") from error
-    if len(numbers) != 4 * num_rows:
-        raise InputError(f"{path}: found {len(words)} numbers, {wanted}")
-    return numbers.reshape(num_rows, 4)
+        array = np.array(value, np.float64)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise InputError(f"{where}: found {error!r}, {wanted}") from error
+    if array.shape not in shapes:
+        raise InputError(f"{where}: found the shape {array.shape}, {wanted}")
+    return array
 
 
 def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:

@@ -13,7 +13,7 @@ from piccolo.files.json_file import read_json, read_text
 from piccolo.geometry.pose import Pose, rotation_from_quaternion_wxyz
 from piccolo.panorama.cube import SUFFIXES
 
-from .files import AXES, DIRECTIONS, WORLD_FROM_CAM, only_cloud_in, pose_of_transform
+from .files import AXES, DIRECTIONS, WORLD_FROM_CAM, array_of, only_cloud_in, pose_of_transform
 from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
 
 NAME = "generic"
@@ -125,10 +125,7 @@ def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
         if value not in known:
             wanted = f"wanted one of {', '.join(known)} in the list, or as `{name}`"
             raise InputError(f"{where}: found the {name} {value}, {wanted}")
-    try:
-        numbers = np.array([float(row[name]) for name in NUMBERS])
-    except ValueError as error:
-        raise InputError(f"{where}: found {error}, wanted numbers") from error
+    numbers = array_of(where, [row[name] for name in NUMBERS], "wanted numbers", (len(NUMBERS),))
     length = float(np.linalg.norm(numbers[3:]))
     if not abs(length - 1.0) < 1e-2:
         raise InputError(f"{where}: found a quaternion of length {length:.3g}, wanted 1")

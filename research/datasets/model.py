@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Array, Pose, rotate_points
+from piccolo.geometry.pose import Array, Pose
 
 Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
 
@@ -70,22 +70,6 @@ class PosedPanorama(NamedTuple):
     read_labels: Callable[[], Labels] | None = None
 
 
-class RigidTransform(NamedTuple):
-    """x_written = R_written_from_dataset @ x_dataset + shift."""
-
-    R_written_from_dataset: Array  # (3, 3)
-    shift: Array  # (3,) [m]
-
-    def of_points(self, points: Array) -> Array:
-        """Points (N, 3) transformed."""
-        return rotate_points(points, self.R_written_from_dataset) + self.shift
-
-    def of_pose(self, pose: Pose) -> Pose:
-        """Return a camera transformed with the points."""
-        center_world = self.R_written_from_dataset @ pose.center_world + self.shift
-        return Pose(pose.R_cam_from_world @ self.R_written_from_dataset.T, center_world)
-
-
 class SceneSpec(NamedTuple):
     """A scene to be written; its files are opened only then."""
 
@@ -93,7 +77,7 @@ class SceneSpec(NamedTuple):
     name: str  # its folder below the output: a room, or area/room
     cloud: tuple[CloudPart, ...]
     panoramas: Iterable[PosedPanorama]  # read as they come: InputError naming the file of a damaged pose
-    transform: RigidTransform | None = None
+    T_written_from_dataset: Array | None = None  # (4, 4) [m], rigid
     settings: Mapping[str, object] = {}  # how it was made
 
     @property

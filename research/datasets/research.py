@@ -14,8 +14,8 @@ from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.panorama.cube import SUFFIXES
 
-from .files import WORLD_FROM_CAM, is_cloud, only_cloud_in, pose_of_transform, read_matrix
-from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
+from .files import WORLD_FROM_CAM, array_of, is_cloud, only_cloud_in, pose_of_transform, read_matrix
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 
 LOC360 = "360loc"
 QUERIES = "query_360"
@@ -62,12 +62,7 @@ def _360loc_panoramas(options: ConvertOptions, folder: Path) -> Iterator[PosedPa
             raise InputError(f"{path}: found no object, {WANTED}")
         for file, value in document.items():
             where = f"{path}, {file!r}"
-            try:
-                matrix = np.array(value, dtype=np.float64)
-            except (OverflowError, TypeError, ValueError) as error:
-                raise InputError(f"{where}: found {error}, {WANTED}") from error
-            if matrix.shape not in ((4, 4), (3, 4)):
-                raise InputError(f"{where}: found the shape {matrix.shape}, {WANTED}")
+            matrix = array_of(where, value, WANTED, (4, 4), (3, 4))
             picture = options.inside(path.parent / "image" / Path(file).name, where)
             name = f"{path.parent.name}_{picture.name}"
             pose = pose_of_transform(where, matrix, WORLD_FROM_CAM, "optical")
@@ -173,12 +168,13 @@ def list_mpo(options: ConvertOptions) -> SceneList:
             raise InputError(f"{clouds[0]}: found {clouds[1].name} beside it; leave one cloud of this name")
         name = stem.relative_to(options.folder).as_posix()
         rng = np.random.default_rng([options.seed, zlib.crc32(name.encode())])
-        turn = yaw_rotation(rng.uniform(0.0, math.pi)).T
-        transform = RigidTransform(turn, rng.uniform(0.0, 3.0, 3))
+        T = np.eye(4)
+        T[:3, :3] = yaw_rotation(rng.uniform(0.0, math.pi)).T
+        T[:3, 3] = rng.uniform(0.0, 3.0, 3)
         pose = Pose(np.eye(3), np.zeros(3))  # at the scanner's origin, with the scanner's axes
         panorama = PosedPanorama(picture.name, {picture.name: picture}, "moved", pose)
         source: dict[str, object] = {"seed": options.seed}
-        specs.append(SceneSpec(MPO, name, (CloudPart(clouds[0]),), iter([panorama]), transform, source))
+        specs.append(SceneSpec(MPO, name, (CloudPart(clouds[0]),), iter([panorama]), T, source))
     if not specs:
         raise InputError(f"{options.folder}: found no cloud with a picture of the same name")
     return SceneList(tuple(specs), (f"{num_alone} clouds without a picture",) if num_alone else ())

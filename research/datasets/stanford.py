@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,10 +14,10 @@ from scipy.spatial.transform import Rotation
 
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_json
-from piccolo.geometry.pose import Array, Pose
+from piccolo.geometry.pose import Pose, move
 
-from .files import WORLD_FROM_CAM, labels_by_index, pose_of_transform
-from .model import CloudPart, ConvertOptions, PosedPanorama, RigidTransform, SceneList, SceneSpec, scene_list
+from .files import WORLD_FROM_CAM, array_of, labels_by_index, pose_of_transform
+from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
 
 NAME = "stanford2d3ds"
 # As most users of S3DIS number them, less one: theirs begin at 0. Other names, <UNK> among them, are 0.
@@ -40,9 +40,7 @@ AREA = re.compile(r"area_(\d)([ab]?)$")
 PICTURE = re.compile(r"camera_[0-9a-zA-Z]+_([A-Za-z]+_\d+)_frame_equirectangular_domain_rgb\.png$")
 # The poses of area 5b are in a frame of their own. Nobody gives the transform to the frame of the clouds but
 # DeepViewAgg (Robert et al., CVPR 2022), calibrated by hand: good to a centimetre or so.
-AREA_5B = RigidTransform(
-    np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.array([-4.10, 6.25, 0.0])
-)
+T_SCAN_FROM_5B = np.array([[0.0, 1.0, 0.0, -4.10], [-1.0, 0.0, 0.0, 6.25], [0.0, 0.0, 1.0, 0.0]])
 WANTED_POSE = "wanted JSON with camera_location and final_camera_rotation"
 
 
@@ -136,22 +134,16 @@ def _read_pose(picture: Picture) -> Pose:
     R_world_from_opengl = R_z(c) R_y(b) R_x(a) with final_camera_rotation = (a, b, c) [rad].
     """
     document = read_json(picture.pose, WANTED_POSE)
-    angles = _three(picture.pose, document, "final_camera_rotation")
-    center_world = _three(picture.pose, document, "camera_location")
+    names = ("final_camera_rotation", "camera_location")
+    if not isinstance(document, dict) or not all(name in document for name in names):
+        raise InputError(f"{picture.pose}: found no {' and '.join(names)}, {WANTED_POSE}")
+    angles, center_world = (
+        array_of(f"{picture.pose}, {name}", document[name], "wanted three numbers", (3,)) for name in names
+    )
     R_world_from_opengl = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, x first
     T = np.column_stack([R_world_from_opengl, center_world])
     pose = pose_of_transform(str(picture.pose), T, WORLD_FROM_CAM, "opengl")
-    return AREA_5B.of_pose(pose) if picture.part == "5b" else pose
-
-
-def _three(path: Path, document: Any, name: str) -> Array:
-    try:
-        values = np.array(document[name], dtype=np.float64)
-    except (KeyError, OverflowError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: found {error!r}, {WANTED_POSE}") from error
-    if values.shape != (3,):
-        raise InputError(f"{path}: {name} has the shape {values.shape}, wanted three numbers")
-    return values
+    return move(pose, T_SCAN_FROM_5B, 1.0) if picture.part == "5b" else pose
 
 
 def _read_table(options: ConvertOptions) -> NDArray[np.uint16]:

@@ -16,6 +16,7 @@ from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import PointValidator
 from piccolo.errors import InputError, unreadable
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
+from piccolo.geometry.pose import move, transform_points
 from piccolo.jobs.threads import Progress, no_progress
 from piccolo.scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from piccolo.views.pictures import encode_image
@@ -60,6 +61,7 @@ def write_scene(spec: SceneSpec, out: Path, copies: bool = False, show: Progress
 
 def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list[str]]:
     """Stream the finite points of the cloud's files into one PLY; returns how many it has, and warnings."""
+    T = spec.T_written_from_dataset
     validator = PointValidator(spec.cloud[0].path, 1.0)  # one for all files, as an object may be small
     warnings: list[str] = []
     has_labels = spec.cloud[0].label is not None
@@ -74,7 +76,7 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
             try:
                 for raw in show(source.read_chunks(), total, f"{spec.name}: {part.path.name}"):
                     points, colors = validator.filter(raw)
-                    moved = points if spec.transform is None else spec.transform.of_points(points)
+                    moved = points if T is None else transform_points(points, T)
                     labels = None if part.label is None else np.full(len(points), part.label, np.int32)
                     writer.add(vertex_rows(moved, colors, label=labels))
             except OSError as error:
@@ -98,5 +100,6 @@ def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, copi
         labels = (folder / "labels" / panorama.name).with_suffix(".png")
         labels.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(labels, encode_image(panorama.read_labels(), ".png"))  # 16 bits, one channel
-    pose = panorama.pose if spec.transform is None else spec.transform.of_pose(panorama.pose)
+    T = spec.T_written_from_dataset
+    pose = panorama.pose if T is None else move(panorama.pose, T, 1.0)
     return Query(folder / "images" / panorama.name, panorama.variant, pose, labels)

@@ -4,24 +4,26 @@ import json
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from piccolo.batch.results_file import check_as_expected
+from piccolo.confidence.confidence import LOCALIZED
 from piccolo.errors import InputError, printable
 from piccolo.files.json_file import document_of, parse_lines, read_bytes
 from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
 from piccolo.opened_scan import OpenedScan
 from piccolo.result import Result
-from piccolo.scene import Query, Scene
+from piccolo.scene import Query, Scene, document_of_pose, pose_of
 
-FORMAT = "piccolo-evaluation/1"
+FORMAT = "piccolo-evaluation/2"
 WANTED = "wanted a run of tools/evaluate.py"
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
-MAX_DIFFERENCE = 1e-6  # [m], [rad] between errors of the same poses
+MAX_DIFFERENCE = 1e-6  # [m], [rad] between the same poses
 VIDEO_FRAME = re.compile(r"(.+)#t=(\d+\.\d+)")
 MAX_TIME_DIFFERENCE = 2e-3  # [s] of a video's frame from a walk's
 
@@ -48,8 +50,7 @@ class QueryResult:
     image: str  # as the scene's queries.json names it
     variant: str
     is_in_box: bool | None  # the true position lies in the box of the cloud's points; None if not known
-    position_error: float  # [m], inf without a pose, or of a photo that has no answer
-    rotation_error: float  # [rad], likewise
+    true_pose: Pose | None  # None of a photo that has no answer
     result: Result
 
     @property
@@ -60,7 +61,29 @@ class QueryResult:
     @property
     def has_errors(self) -> bool:
         """True if there is a pose, and a true one."""
-        return bool(np.isfinite(self.position_error))
+        return self.result.best_pose is not None and self.true_pose is not None
+
+    @cached_property
+    def errors(self) -> tuple[float, float]:
+        """Errors of the best pose [m], [rad]; infinite without one, or without a true one."""
+        if self.result.best_pose is None or self.true_pose is None:
+            return np.inf, np.inf
+        return pose_errors(self.result.best_pose, self.true_pose)
+
+    @property
+    def position_error(self) -> float:
+        """Of the best pose [m]."""
+        return self.errors[0]
+
+    @property
+    def rotation_error(self) -> float:
+        """Of the best pose [rad]."""
+        return self.errors[1]
+
+    @property
+    def is_localized(self) -> bool:
+        """True if the method is sure."""
+        return self.result.status == LOCALIZED
 
     @property
     def seconds(self) -> float:
@@ -77,6 +100,7 @@ class QueryResult:
         line: dict[str, object] = {"format": FORMAT, **{name: getattr(self, name) for name in names}}
         line["position_error"] = self.position_error if self.has_errors else None
         line["rotation_error_deg"] = float(np.degrees(self.rotation_error)) if self.has_errors else None
+        line["true_pose"] = self.true_pose and document_of_pose(self.true_pose)
         line["result"] = json.loads(self.result.to_json())
         return json.dumps(line, allow_nan=False)
 
@@ -84,22 +108,18 @@ class QueryResult:
     def from_json(cls, text: str) -> "QueryResult":
         """Read back what `to_json` wrote; any other text is an InputError."""
         with document_of(text, FORMAT, "evaluation") as row:
-            distance = row["position_error"]
-            angle_deg = row["rotation_error_deg"]
+            true_pose = None if row["true_pose"] is None else pose_of(row["true_pose"])
             scene = str(row["scene"])
             image = str(row["image"])
             variant = str(row["variant"])
-            position_error = np.inf if distance is None else float(distance)
-            rotation_error = np.inf if angle_deg is None else float(np.radians(angle_deg))
             result = Result.from_json(json.dumps(row["result"]))
-            return cls(scene, image, variant, row["is_in_box"], position_error, rotation_error, result)
+            return cls(scene, image, variant, row["is_in_box"], true_pose, result)
 
 
 def make_query_result(scene: Scene, query: Query, result: Result, is_in_box: bool | None) -> QueryResult:
-    """Return a query's result with its errors."""
-    pose = result.best_pose if query.is_answerable else None
-    errors = (np.inf, np.inf) if pose is None else pose_errors(pose, query.pose)
-    return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, *errors, result)
+    """Return a query's result, with its true pose if it has one."""
+    true_pose = query.pose if query.is_answerable else None
+    return QueryResult(scene.name, scene.name_of(query), query.variant, is_in_box, true_pose, result)
 
 
 def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
@@ -167,20 +187,21 @@ def check_run(
     path: Path, rows: Sequence[QueryResult], scenes: Sequence[Scene], expected: Mapping[str, Any]
 ) -> None:
     """Refuse rows that were made with other settings than the expected, other true poses or other scenes."""
-    queries = {(s.name, s.name_of(query)): (s, query) for s in scenes for query in s.queries}
+    queries = {(s.name, s.name_of(query)): query for s in scenes for query in s.queries}
     for row in rows:
         found = {"line": path, "settings": row.result.settings}
         check_as_expected(found, expected, "choose another file")
-        if row.key in queries and not _is_of(row, *queries[row.key]):
+        if row.key in queries and not _is_of(row, queries[row.key]):
             text = "made with another true pose or another scene of this name; choose another file"
             raise InputError(f"{path}: found a result of {row.scene}, {row.image} {text}")
 
 
-def _is_of(row: QueryResult, scene: Scene, query: Query) -> bool:
-    """Return True if a result's errors are those of its pose against this query's true pose."""
-    again = make_query_result(scene, query, row.result, row.is_in_box)
-    pairs = (row.position_error, again.position_error), (row.rotation_error, again.rotation_error)
-    return all(a == b or abs(a - b) < MAX_DIFFERENCE for a, b in pairs)
+def _is_of(row: QueryResult, query: Query) -> bool:
+    """Return True if a result's true pose is that of this query."""
+    expected = query.pose if query.is_answerable else None
+    if row.true_pose is None or expected is None:
+        return row.true_pose is expected
+    return max(pose_errors(row.true_pose, expected)) < MAX_DIFFERENCE
 
 
 def check_variants(scenes: Sequence[Scene], variants: Sequence[str]) -> None:

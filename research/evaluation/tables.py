@@ -3,12 +3,12 @@
 import csv
 import io
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.confidence.confidence import LOCALIZED
 from piccolo.errors import printable
 from piccolo.export.formats import cell
 
@@ -65,9 +65,8 @@ def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESH
 def count_rows(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Counts:
     """Return how many queries are correct, localized, and localized but wrong."""
     is_correct = [row.is_correct(thresholds) for row in rows]
-    is_localized = [row.result.status == LOCALIZED for row in rows]
-    num_wrong = sum(a and not b for a, b in zip(is_localized, is_correct, strict=True))
-    return Counts(sum(is_correct), sum(is_localized), num_wrong)
+    num_wrong = sum(row.is_localized and not right for row, right in zip(rows, is_correct, strict=True))
+    return Counts(sum(is_correct), sum(row.is_localized for row in rows), num_wrong)
 
 
 class Point(NamedTuple):
@@ -170,6 +169,19 @@ def risk_table(points: Sequence[Point]) -> Table:
             cells.append((f"{line}", f"{100 * p.coverage:.1f} %", f"{p.num_wrong}", f"{100 * p.risk:.2f} %"))
     columns = "min confidence", "accepted", "wrong of these", "wrong fraction"
     return Table("", columns, tuple(cells), 0)
+
+
+def reliability_table(
+    title: str, stated: Sequence[float], are_right: Sequence[bool], ends: Sequence[float]
+) -> Table:
+    """Return how many answers were right, by the probability that was stated, between consecutive `ends`."""
+    rows = []
+    for low, high in pairwise(ends):
+        own = [k for k, p in enumerate(stated) if low <= p < high or p == high == ends[-1]]
+        if own:
+            means = [f"{np.mean([values[k] for k in own]):.3f}" for values in (stated, are_right)]
+            rows.append((f"{low:g} to {high:g}", str(len(own)), *means))
+    return Table("", (title, "answers", "mean stated", "fraction right"), tuple(rows))
 
 
 def csv_text(rows: Sequence[QueryResult]) -> str:

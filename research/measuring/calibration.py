@@ -27,9 +27,11 @@ from piccolo.confidence.confidence import (
 )
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
-from piccolo.geometry.pose import Pose, is_correct, log_so3
+from piccolo.geometry.pose import is_correct
+from piccolo.geometry.pose_gaussian import subtract
+from piccolo.scene import pose_of
 
-from ..evaluation.tables import Table
+from ..evaluation.tables import Table, reliability_table
 
 EPILOG = """\
 example:
@@ -41,6 +43,7 @@ fitted model are (without --fit, of the model in use), and the fraction of true 
 regions of the covariance.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
+TENTHS = [k / 10 for k in range(11)]
 Array = NDArray[np.float64]
 Case = tuple[str, str, bool]  # what was tried, the status, and whether the best pose is right
 
@@ -73,16 +76,10 @@ class Outcome(NamedTuple):
         return posterior(self.standings, self.std, self.std_of_fit, model)
 
 
-def pose_error(pose: Pose, true_pose: Pose) -> Array:
-    """Return the error (6,) of a pose as PoseCovariance has it: rotation [rad], then position [m]."""
-    turn = log_so3(true_pose.R_cam_from_world @ pose.R_cam_from_world.T)
-    return np.concatenate([turn, true_pose.center_world - pose.center_world])
-
-
 def read_outcome(line: str) -> Outcome | None:
     """Read a line of tools/benchmark.py confidence; None if no pose was found."""
     trial = json.loads(line)
-    poses = [read_pose(pose) for pose in trial["poses"]]
+    poses = [pose_of(pose) for pose in trial["poses"]]
     if not poses:
         return None
     standings = [Standing(*standing) for standing in trial["standings"]]
@@ -91,16 +88,11 @@ def read_outcome(line: str) -> Outcome | None:
     error = np.full(6, np.nan)
     right = len(poses)
     if trial["truth"] is not None:
-        true_pose = read_pose(trial["truth"])
-        error = pose_error(poses[0], true_pose)
+        true_pose = pose_of(trial["truth"])
+        error = subtract(true_pose, poses[0])
         right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
     is_refused = trial["probabilities"][-1] == 1.0
     return Outcome(str(trial["case"]), standings, covariance, trial["std_of_fit"], right, is_refused, error)
-
-
-def read_pose(document: dict[str, list[float]]) -> Pose:
-    """Read a pose that tools/benchmark.py confidence wrote."""
-    return Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
 
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
@@ -141,17 +133,6 @@ def print_cases(title: str, rows: Sequence[Case]) -> int:
         num_false += false
     print(Table("", (title, "trials", "right", "localized", "ambiguous", "false"), tuple(table)).markdown())
     return num_false
-
-
-def print_reliability(title: str, stated: Array, right: NDArray[np.bool_]) -> None:
-    """Print how many poses, and answers none, were right in each tenth of the probability."""
-    rows = []
-    for low in np.arange(10) / 10:
-        some = (stated >= low) & ((stated < low + 0.1) | (low == 0.9))
-        if some.any():
-            means = (f"{stated[some].mean():.3f}", f"{right[some].mean():.3f}")
-            rows.append((f"{low:.1f} to {low + 0.1:.1f}", str(some.sum()), *means))
-    print(Table("", (title, "answers", "mean stated", "right"), tuple(rows)).markdown())
 
 
 def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
@@ -202,6 +183,8 @@ def run(arguments: argparse.Namespace) -> int:
         called = [classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
         print_cases(f"case, {name}", rows)
-        print_reliability(f"probability, {name}", np.concatenate(stated), np.concatenate(right))
+        all_stated = np.concatenate(stated).tolist()
+        table = reliability_table(f"probability, {name}", all_stated, np.concatenate(right).tolist(), TENTHS)
+        print(table.markdown())
         print_coverage(f"covariance, {name}", outcomes)
     return 0

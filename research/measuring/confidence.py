@@ -2,22 +2,17 @@
 
 import argparse
 import json
-import math
 from collections.abc import Iterator, Sequence
 from itertools import chain
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from piccolo.cli.command import option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization
-from piccolo.geometry.pose import Pose, is_correct
-from piccolo.geometry.rotations import Gravity
-from piccolo.geometry.sphere import pixel_rays, solid_angles
+from piccolo.geometry.pose import is_correct
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.localize import localize
@@ -25,14 +20,14 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from piccolo.scan_map.scan_map import prepare_map
-from piccolo.scene import Scene, read_scene
+from piccolo.scene import Scene, document_of_pose, read_scene
 
-from ..experiments.reproduce_paper import UPSIDE_DOWN
+from ..synthetic.photos import change_sensor, cut_photo, occlude
+from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
 from ..synthetic.room import PLAIN
-from ..synthetic.world import VARIANTS, World, blur, make_query, make_world, scan_world
+from ..synthetic.world import VARIANTS, World, make_query, make_world, scan_world
 from .calibration import Case, print_cases
-from .photos import Image, change_sensor, cut_photo
-from .places import ALIKE_KINDS, CHANGED, REPEATED_KINDS, make_alike, make_repeated
+from .trials import Points, Trial, damage_trial, make_sceneless, thin_points, turn_over
 
 EPILOG = """\
 example:
@@ -46,56 +41,7 @@ for tools/benchmark.py calibration, and prints a table.
 """
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
-LEAST_RADIUS = math.radians(8.0)  # of an occluder
-MOST_RADIUS = math.radians(28.0)
-ASPECT = 0.75  # height by width of a narrow photo
 PHOTO_FOVS_DEG = 55.0, 90.0  # of phone photos
-Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
-
-
-class Trial(NamedTuple):
-    """One panorama to be localized in a cloud."""
-
-    case: str
-    rgb: Image  # (H, W, 3)
-    true_pose: Pose | None  # None where the panorama was not taken in this cloud
-    gravity: Gravity = "auto"
-    is_masked: NDArray[np.bool_] | None = None  # (H, W) what the photo does not show
-    focal_px: float | None = None  # of a pinhole photo; None for a sphere
-
-
-def occlude(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
-    """Hide a fraction of the sphere of a photo (H, W, 3) behind round pieces of another."""
-    height, width = rgb.shape[:2]
-    rays = pixel_rays(width)
-    areas = solid_angles(width)[:, None] / (4.0 * math.pi)
-    is_hidden = np.zeros((height, width), np.bool_)
-    shown = rgb.copy()
-    while float((is_hidden * areas).sum()) < fraction:
-        direction = rng.normal(size=3) * [1.0, 1.0, 0.4]  # people and things stand around the camera
-        radius = rng.uniform(LEAST_RADIUS, MOST_RADIUS)
-        is_new = (rays @ (direction / np.linalg.norm(direction)) > math.cos(radius)) & ~is_hidden
-        moved = np.roll(other, rng.integers(width), axis=1)[:: int(rng.choice([-1, 1]))]
-        shown[is_new] = moved[is_new]
-        is_hidden |= is_new
-    return shown
-
-
-def light_unevenly(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
-    """Put a photo (H, W, 3) under patches of light that differ by some stops."""
-    noise = blur(rng.normal(size=rgb.shape[:2])[..., None], 0.08 * rgb.shape[1])
-    gain = 2.0 ** (0.5 * stops * noise / noise.std())
-    linear = (rgb / 255.0) ** 2.2 * gain
-    return np.asarray(255.0 * linear.clip(0.0, 1.0) ** (1.0 / 2.2), np.uint8)
-
-
-def mask_outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
-    """Return the mask (H, W) of a sphere outside a level pinhole photo that looks along azimuth `yaw`."""
-    x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
-    forward = math.cos(yaw) * x + math.sin(yaw) * y
-    left = math.cos(yaw) * y - math.sin(yaw) * x
-    reach = math.tan(math.radians(fov_deg / 2.0)) * forward
-    return np.asarray((forward <= 0.0) | (np.abs(left) > reach) | (np.abs(z) > ASPECT * reach))
 
 
 def remove_texture(world: World) -> World:
@@ -106,66 +52,10 @@ def remove_texture(world: World) -> World:
     return world._replace(rooms=tuple(room._replace(materials=m) for room, m in plain))
 
 
-def damage_trial(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
-    """Yield a photo half hidden, in uneven light, narrow, and mirrored."""
-    for fraction in (0.2, 0.4, 0.6):
-        hidden = occlude(trial.rgb, other, fraction, rng)
-        yield trial._replace(case=f"{trial.case}, hidden {fraction:.0%}", rgb=hidden)
-    lit = occlude(light_unevenly(trial.rgb, 2.0, rng), other, 0.3, rng)
-    yield trial._replace(case=f"{trial.case}, uneven light, hidden 30%", rgb=lit)
-    for fov_deg in (120.0, 90.0, 65.0):
-        outside = mask_outside_field(trial.rgb.shape[1], fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
-        for gravity in ("known", "unknown"):
-            case = f"{trial.case}, {fov_deg:.0f} deg, gravity {gravity}"
-            yield Trial(case, trial.rgb, trial.true_pose, gravity, outside)
-    mirrored = np.ascontiguousarray(trial.rgb[:, ::-1])
-    yield Trial(f"{trial.case}, mirrored", mirrored, None, "unknown")
-
-
-def make_sceneless(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
-    """Yield images that show no place, and the photo blurred, which keeps its true pose."""
-    rgb = trial.rgb
-    yield Trial("black", np.zeros_like(rgb), None)
-    yield Trial("white", np.full_like(rgb, 255), None)
-    yield Trial("noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8), None)
-    yield Trial("cloudy", draw_fractal_noise(rgb.shape, rng), None)
-    blurred = np.asarray(blur(rgb.astype(float), 0.02 * rgb.shape[1]), np.uint8)
-    yield Trial("blurred", blurred, trial.true_pose)
-
-
-def draw_fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
-    """Draw smooth noise of several scales (H, W, 3), with the contrast of a photo."""
-    total = np.zeros(shape)
-    for scale in (0.004, 0.015, 0.06):
-        noise = blur(rng.normal(size=shape), scale * shape[1])
-        total += noise / noise.std()
-    return np.asarray((127.0 + 40.0 * total).clip(0, 255), np.uint8)
-
-
-def turn_over(trial: Trial) -> Trial:
-    """Turn the camera over, and search for it as if it were upright."""
-    pose = trial.true_pose
-    if pose is not None:
-        pose = Pose(UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
-    return Trial("upside down", np.ascontiguousarray(trial.rgb[::-1, ::-1]), pose, "known")
-
-
-def thin_points(points: Points, rng: np.random.Generator) -> Points:
-    """Draw one of twenty points, in order."""
-    count = len(points[0])
-    chosen = np.sort(rng.choice(count, int(0.05 * count), replace=False))
-    return points[0][chosen], points[1][chosen]
-
-
-def draw_size(rng: np.random.Generator) -> NDArray[np.float64]:
-    """Draw the size (3,) of a room [m], from a box room to a hall."""
-    return rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])
-
-
 def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
     """Yield clouds of one to three rooms, whole, thinned and cut down, each with its trials."""
     rng = np.random.default_rng([seed, 50])
-    size = draw_size(rng)
+    size = rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])  # [m] from a box room to a hall
     world = make_world(seed, size, int(rng.integers(1, 4)))
     other = make_world(seed + 100_000, size, 1)  # of the same shape
     if seed % 3 == 2:  # a third of the rooms
@@ -179,21 +69,13 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     trials.append(turn_over(right[0]))
     another = _make_trial(other, "another place", "clean", workers, 1)._replace(true_pose=None)
     for trial in (right[0], another):
-        trials += damage_trial(trial, _make_trial(other, "", "clean", workers, 2).rgb, rng)
+        damaged = damage_trial(trial, _make_trial(other, "", "clean", workers, 2).rgb, rng)
+        trials += [one._replace(case=f"{trial.case}, {one.case}") for one in damaged]
     yield cloud, trials
     thin = [right[0]._replace(case="sparse"), trials[4]._replace(case="sparse, elsewhere")]
     yield thin_points(cloud, rng), thin
     wall = np.flatnonzero(cloud[0][:, 0] < cloud[0][:, 0].min() + 0.15)
     yield (cloud[0][wall], cloud[1][wall]), [r._replace(case="one wall") for r in right[:2]]
-
-
-def repeat_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
-    """Yield a place of each kind that looks the same from several positions, with its trials."""
-    rng = np.random.default_rng([seed, 51])
-    for kind in REPEATED_KINDS:
-        world = World(seed, make_repeated(kind, seed, draw_size(rng)))
-        cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
-        yield cloud, [_make_trial(world, kind, "clean", workers, index) for index in range(2)]
 
 
 def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[tuple[Points, list[Trial]]]:
@@ -252,7 +134,7 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
-        for points, trials in chain(room_trials(seed, workers), repeat_trials(seed, workers), alike):
+        for points, trials in chain(room_trials(seed, workers), alike):
             yield f"seed {seed}", points, trials
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
@@ -271,19 +153,14 @@ def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, objec
     return {
         "case": trial.case,
         "scene": scene,
-        "truth": trial.true_pose and pose_json(trial.true_pose),
+        "truth": trial.true_pose and document_of_pose(trial.true_pose),
         "status": found.status,
         "probabilities": probabilities,
-        "poses": [pose_json(pose) for pose in poses],
+        "poses": list(map(document_of_pose, poses)),
         "standings": [list(standing) for standing in found.standings],
         "covariance": found.covariance and found.covariance.matrix.tolist(),
         "std_of_fit": found.std_of_fit,
     }
-
-
-def pose_json(pose: Pose) -> dict[str, object]:
-    """Return a pose as JSON has it."""
-    return {name: array.tolist() for name, array in vars(pose).items()}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

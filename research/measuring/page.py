@@ -6,9 +6,8 @@ import platform
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
-from itertools import chain, pairwise
+from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numba
@@ -19,24 +18,23 @@ import piccolo
 from piccolo.cli.command import check_least, option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
-from piccolo.confidence.confidence import LOCALIZED
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Array, Pose, is_correct
+from piccolo.geometry.pose import Pose
+from piccolo.geometry.pose_gaussian import subtract
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, Scene, read_scene
 
-from ..evaluation.tables import Table
+from ..evaluation.query_result import QueryResult
+from ..evaluation.tables import Table, count_rows, reliability_table
+from ..synthetic.photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
-from .calibration import pose_error
-from .confidence import Points
-from .damage import DAMAGED_SCANS, damage_panorama
 from .kernels import kernel_table
-from .photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
 from .scaling import clean_queries, size_table
+from .trials import DAMAGED_SCANS, Points, Trial, damage_trial
 
 EPILOG = """\
 examples:
@@ -100,76 +98,32 @@ of a photo, without reading it. Gravity is `auto` where nothing else is said.
 """
 
 
-class Row(NamedTuple):
-    """The result of one query."""
-
-    part: str
-    label: str  # of the table's line
-    query: str
-    true_pose: Pose | None  # None if there is no right answer
-    result: Result
-
-    @property
-    def is_right(self) -> bool:
-        """True if the best pose is correct, whatever its status."""
-        return self.true_pose is not None and is_correct(self.result.best_pose, self.true_pose)
-
-    @property
-    def is_localized(self) -> bool:
-        """True if the method is sure."""
-        return self.result.status == LOCALIZED
-
-    @property
-    def error(self) -> Array:
-        """Error (6,) of the best pose, rotation [rad] and position [m]; infinite without a right answer."""
-        pose = self.result.best_pose
-        if pose is None or self.true_pose is None:
-            return np.full(6, np.inf)
-        return pose_error(pose, self.true_pose)
-
-    @property
-    def is_outside(self) -> bool:
-        """True if the true pose lies outside of the 95 % region of the covariance."""
-        covariance = self.result.covariance
-        if covariance is None or not np.isfinite(self.error).all():
-            return False
-        return bool(self.error @ np.linalg.solve(covariance.matrix, self.error) > chi2.ppf(0.95, 6))
-
-    @property
-    def seconds(self) -> float:
-        """All stages but reading the photo."""
-        return sum(value for stage, value in self.result.seconds.items() if stage != "read")
+def is_outside(row: QueryResult) -> bool:
+    """Return True if the true pose lies outside of the 95 % region of the covariance."""
+    pose = row.result.best_pose
+    covariance = row.result.covariance
+    if covariance is None or pose is None or row.true_pose is None:
+        return False
+    error = subtract(row.true_pose, pose)
+    return bool(error @ np.linalg.solve(covariance.matrix, error) > chi2.ppf(0.95, 6))
 
 
-def row_cells(rows: Sequence[Row]) -> tuple[str, ...]:
+def row_cells(rows: Sequence[QueryResult]) -> tuple[str, ...]:
     """Return the statistics of some queries, as COLUMNS."""
-    right = [row.error for row in rows if row.is_right]
-    localized = [row for row in rows if row.is_localized]
-    counts = (len(rows), len(right), len(localized), sum(not row.is_right for row in localized))
-    outside = sum(row.is_outside for row in localized)
-    mm = f"{1000.0 * np.median([np.linalg.norm(e[3:]) for e in right]):.1f}" if right else "-"
-    deg = f"{np.degrees(np.median([np.linalg.norm(e[:3]) for e in right])):.3f}" if right else "-"
-    return (*map(str, (*counts, outside)), mm, deg, f"{np.median([row.seconds for row in rows]):.2f}")
+    right = [row for row in rows if row.is_correct()]
+    counts = count_rows(rows)
+    outside = sum(is_outside(row) for row in rows if row.is_localized)
+    mm = f"{1000.0 * np.median([row.position_error for row in right]):.1f}" if right else "-"
+    deg = f"{np.degrees(np.median([row.rotation_error for row in right])):.3f}" if right else "-"
+    seconds = np.median([row.seconds for row in rows])
+    return (str(len(rows)), *map(str, counts), str(outside), mm, deg, f"{seconds:.2f}")
 
 
-def accuracy_table(rows: Sequence[Row]) -> Table:
+def accuracy_table(rows: Sequence[QueryResult]) -> Table:
     """Return the statistics of each label."""
-    labels = dict.fromkeys(row.label for row in rows)
-    lines = [(label, *row_cells([row for row in rows if row.label == label])) for label in labels]
+    labels = dict.fromkeys(row.variant for row in rows)
+    lines = [(label, *row_cells([row for row in rows if row.variant == label])) for label in labels]
     return Table("", ("", *COLUMNS), tuple(lines))
-
-
-def confidence_table(rows: Sequence[Row]) -> Table:
-    """Return how many poses were right, by the confidence that was stated."""
-    lines = []
-    for low, high in pairwise(CONFIDENCES):
-        is_last = high == CONFIDENCES[-1]
-        own = [row for row in rows if low <= row.result.confidence < high + is_last]
-        if own:
-            stated = np.mean([row.result.confidence for row in own])
-            right = np.mean([row.is_right for row in own])
-            lines.append((f"{low:g} to {high:g}", str(len(own)), f"{stated:.3f}", f"{right:.3f}"))
-    return Table("", ("confidence", "queries", "mean stated", "fraction right"), tuple(lines))
 
 
 def camera_path(scene: Scene, query: Query) -> Path:
@@ -187,17 +141,17 @@ class Bench:
             raise InputError(f"{empty[0].folder}: found no queries, wanted pictures with true poses")
         self.of_photos = [scene for scene in scenes if camera_path(scene, scene.queries[0]).exists()]
         self.of_panoramas = [scene for scene in scenes if scene not in self.of_photos]
-        self.rows: list[Row] = []
+        self.rows: dict[str, list[QueryResult]] = {part: [] for part in TEXTS}
 
     def is_wanted(self, part: str) -> bool:
         """Return True if a part is measured."""
         return part in {PARTS[name] for name in self.arguments.only}
 
     def add(self, part: str, label: str, query: str, true_pose: Pose | None, result: Result) -> None:
-        """Keep the result of a query."""
-        row = Row(part, label, query, true_pose, result)
-        self.rows.append(row)
-        end = "" if true_pose is None else ", right" if row.is_right else ", not right"
+        """Keep the result of a query, the label of the table's line as its variant."""
+        row = QueryResult(part, query, label, None, true_pose, result)
+        self.rows[part].append(row)
+        end = "" if true_pose is None else ", right" if row.is_correct() else ", not right"
         self.note(f"{part}: {label}: {query}: {result.status}{end}")
 
     def measure(self) -> None:
@@ -231,11 +185,13 @@ class Bench:
         panoramas = [read_panorama(query.image).rgb for query in queries]
         for number, (query, rgb) in enumerate(zip(queries, panoramas, strict=True)):
             rng = np.random.default_rng([number, len(scene.queries), 60])
-            for damaged in damage_panorama(rgb, others[number % len(others)], rng):
-                photo = piccolo.Photo(damaged.rgb, mask=damaged.is_masked)
-                true_pose = query.pose if damaged.has_answer else None
+            other = np.asarray(cv2.resize(others[number % len(others)], rgb.shape[1::-1]), np.uint8)
+            taken = Trial("as taken", rgb, query.pose)
+            elsewhere = Trial("another place", other, None)
+            for trial in (taken, *damage_trial(taken, other, rng), elsewhere):
                 name = f"{scene.name}/{query.image.name}"
-                self.add(DAMAGE, damaged.name, name, true_pose, scan.localize(photo))
+                result = scan.localize(piccolo.Photo(trial.rgb, mask=trial.is_masked))
+                self.add(DAMAGE, trial.case, name, trial.true_pose, result)
         cloud = read_cloud(scene.cloud)
         points: Points = (cloud.points + cloud.origin_world, cloud.colors)
         for label, change in DAMAGED_SCANS.items():
@@ -270,17 +226,17 @@ class Bench:
 
     def sections(self) -> Iterator[str]:
         """Yield the parts of the page after its head, measured by now or as they come."""
-        for part in (PANORAMAS, DAMAGE, PHOTOS, PAPER):
-            rows = [row for row in self.rows if row.part == part]
+        for part, rows in self.rows.items():
             if rows:
                 yield f"## {part}\n{TEXTS[part]}\n\n{accuracy_table(rows).markdown()}"
             if rows and part == PAPER:
                 yield f"The preset takes {time_ratio(rows):.1f} times as long.\n"
-        rows = [row for row in self.rows if row.part != PAPER]
+        rows = [row for part, own in self.rows.items() if part != PAPER for row in own]
         if rows:
-            table = confidence_table(rows).markdown()
+            stated = [row.result.confidence for row in rows]
+            table = reliability_table("confidence", stated, [row.is_correct() for row in rows], CONFIDENCES)
             text = "All queries above but those of the preset comparison."
-            yield f"## Confidences\n{text}\n\n{table}\n{wrong_lines(rows)}"
+            yield f"## Confidences\n{text}\n\n{table.markdown()}\n{wrong_lines(rows)}"
         if self.of_panoramas and self.is_wanted(SIZE):
             scene = self.of_panoramas[0]
             sizes = size_table(scene, self.arguments.points, self.arguments.rooms, self.note)
@@ -304,23 +260,22 @@ def read_foreign(scenes: Sequence[Scene]) -> list[Image]:
     return [make_query(world, 0, "clean", 1024, Workers(num_cores())).rgb]
 
 
-def time_ratio(rows: Sequence[Row]) -> float:
+def time_ratio(rows: Sequence[QueryResult]) -> float:
     """Return the median seconds of the first label divided by those of the last."""
     first, last = (
-        np.median([row.seconds for row in rows if row.label == label])
-        for label in (rows[0].label, rows[-1].label)
+        np.median([row.seconds for row in rows if row.variant == label])
+        for label in (rows[0].variant, rows[-1].variant)
     )
     return float(first / last)
 
 
-def wrong_lines(rows: Sequence[Row]) -> str:
+def wrong_lines(rows: Sequence[QueryResult]) -> str:
     """Return a line for each query that is localized and not right."""
-    wrong = [row for row in rows if row.is_localized and not row.is_right]
+    wrong = [row for row in rows if row.is_localized and not row.is_correct()]
     lines = [f"{len(wrong)} of {len(rows)} were localized and are not right."]
     for row in wrong[:MAX_WRONG]:
-        distance = np.linalg.norm(row.error[3:])
-        error = f"{distance:.2f} m off" if np.isfinite(distance) else "no right answer"
-        lines.append(f"- {row.label}, {row.query}: {error}; confidence {row.result.confidence:.3f}")
+        error = f"{row.position_error:.2f} m off" if row.has_errors else "no right answer"
+        lines.append(f"- {row.variant}, {row.image}: {error}; confidence {row.result.confidence:.3f}")
     if len(wrong) > MAX_WRONG:
         lines.append(f"- and {len(wrong) - MAX_WRONG} more")
     return "\n".join([*lines, ""])

@@ -9,7 +9,7 @@ from piccolo.geometry.pose import Array
 from piccolo.jobs.threads import Workers
 from piccolo.kernels.jit import inline_kernel, kernel
 
-from .room import Room
+from .room import Room, box_distances
 
 AMBIENT = 0.55  # of a surface's colour
 LAMP = 0.9  # of it, head on and near
@@ -158,41 +158,6 @@ def shade(
             rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
 
-@kernel
-def ranges_ahead(origin: Array, axis: Array, cone_width: float, boxes: Array, least: Array) -> None:
-    """Write the distance [m] of each box (B, 7), inf where its bounding sphere is outside a cone of rays.
-
-    The cone is around the unit `axis` (3,), its half width [rad].
-    """
-    cone_cos = math.cos(cone_width)
-    cone_sin = math.sin(cone_width)
-    for b in range(len(boxes)):
-        ox = boxes[b, 0] - origin[0]
-        oy = boxes[b, 1] - origin[1]
-        oz = boxes[b, 2] - origin[2]
-        half_x = boxes[b, 3]
-        half_y = boxes[b, 4]
-        half_z = boxes[b, 5]
-        radius = math.sqrt(half_x * half_x + half_y * half_y + half_z * half_z)
-        distance = math.sqrt(ox * ox + oy * oy + oz * oz)
-        if distance > radius:
-            sine = radius / distance
-            cosine = math.sqrt(1.0 - sine * sine)
-            ahead = ox * axis[0] + oy * axis[1] + oz * axis[2]
-            # the angle of cone and sphere together is below pi, and that to the sphere's middle is above it
-            if cone_sin * cosine + cone_cos * sine > 0.0 and ahead < distance * (
-                cone_cos * cosine - cone_sin * sine
-            ):
-                least[b] = np.inf
-                continue
-        c = math.cos(boxes[b, 6])
-        s = math.sin(boxes[b, 6])
-        x = max(abs(c * ox + s * oy) - half_x, 0.0)
-        y = max(abs(c * oy - s * ox) - half_y, 0.0)
-        z = max(abs(oz) - half_z, 0.0)
-        least[b] = math.sqrt(x * x + y * y + z * z)
-
-
 def boxes_ahead(
     origin: Array, directions: NDArray[np.float64], boxes: NDArray[np.float64]
 ) -> tuple[NDArray[np.intp], Array]:
@@ -200,10 +165,13 @@ def boxes_ahead(
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
     width = math.acos(np.clip((directions @ axis).min(), -1.0, 1.0)) + MARGIN
-    least = np.empty(len(boxes))
-    ranges_ahead(origin, axis, width, boxes, least)
-    ahead = np.flatnonzero(least < np.inf)
-    return ahead, least[ahead]
+    offset = boxes[:, :3] - origin
+    distance = np.linalg.norm(offset, axis=1)
+    radius = np.linalg.norm(boxes[:, 3:6], axis=1)  # of the sphere around a box, which is seen as a cone too
+    reach = width + np.arcsin(np.minimum(radius / np.maximum(distance, radius), 1.0))
+    is_ahead = offset @ axis >= distance * np.cos(np.minimum(reach, np.pi))
+    ahead = np.flatnonzero(is_ahead | (distance <= radius))
+    return ahead, np.maximum(box_distances(boxes[ahead], origin), 0.0)
 
 
 def cast_rays(

@@ -112,15 +112,19 @@ class Room(NamedTuple):
 
     def clearance(self, position: Array) -> float:
         """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
-        offset = position - self.boxes[:, :3]
-        c = np.cos(self.boxes[:, 6])
-        s = np.sin(self.boxes[:, 6])
-        along = c * offset[:, 0] + s * offset[:, 1]
-        across = c * offset[:, 1] - s * offset[:, 0]
-        beyond = np.abs(np.stack([along, across, offset[:, 2]], axis=1)) - self.boxes[:, 3:6]
-        outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
-        inside = np.minimum(beyond.max(axis=1), 0.0)
-        return float((outside + inside).min())
+        return float(box_distances(self.boxes, position).min())
+
+
+def box_distances(boxes: NDArray[np.float64], position: Array) -> Array:
+    """Return the distance (B,) [m] from `position` (3,) to each box (B, 7); negative inside of it."""
+    offset = position - boxes[:, :3]
+    c = np.cos(boxes[:, 6])
+    s = np.sin(boxes[:, 6])
+    along = c * offset[:, 0] + s * offset[:, 1]
+    across = c * offset[:, 1] - s * offset[:, 0]
+    beyond = np.abs(np.stack([along, across, offset[:, 2]], axis=1)) - boxes[:, 3:6]
+    outside = np.linalg.norm(np.maximum(beyond, 0.0), axis=1)
+    return np.asarray(outside + np.minimum(beyond.max(axis=1), 0.0))
 
 
 def put_shell(b: RoomBuilder, size: Array, doors: Sequence[Door] = ()) -> None:

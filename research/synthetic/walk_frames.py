@@ -12,9 +12,10 @@ from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
 
 from .office import Office
+from .photos import change_light
 from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .walking import Walk
-from .world import change_light, make_query, make_world, photograph
+from .world import make_query, make_world, photograph
 
 BAD_KINDS = ("black", "mirrored", "elsewhere")
 WALK_VARIANTS = ("clean", "photo")

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import gaussian_filter
 
 from piccolo.camera import Calibration, Mount
 from piccolo.camera.rig import compute_extent
@@ -21,6 +20,7 @@ from piccolo.geometry.rotations import uniform_rotations
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 
+from .photos import change_light
 from .raycast import cast_rays
 from .room import Room, make_room
 
@@ -123,24 +123,6 @@ def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Wor
         picture = render_picture(mount, room, pose, workers)
         rgb[top : top + camera.height, left : left + camera.width] = picture
     return rgb
-
-
-def blur(image: Array, sigma: float) -> Array:
-    """Blur an equirectangular image (H, W, 3) by a Gaussian [px]."""
-    return np.asarray(gaussian_filter(image, (sigma, sigma, 0.0), mode=("nearest", "wrap", "nearest")))
-
-
-def change_light(
-    rgb: NDArray[np.uint8], rng: np.random.Generator, noise: np.random.Generator
-) -> NDArray[np.uint8]:
-    """Return the image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy.
-
-    `noise` may be `rng`; photos of one light have the same `rng` each, and other noise.
-    """
-    gain = rng.uniform(0.7, 1.3) * rng.uniform(0.85, 1.15, 3)
-    linear = (rgb / 255.0) ** rng.uniform(0.8, 1.25)
-    noisy = blur(linear * gain, 0.8) + noise.normal(0.0, 0.02, rgb.shape)
-    return np.asarray(np.round(noisy.clip(0.0, 1.0) * 255.0).astype(np.uint8))
 
 
 class World(NamedTuple):

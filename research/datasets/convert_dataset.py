@@ -13,11 +13,11 @@ from piccolo.errors import InputError
 from piccolo.jobs.threads import Progress, Workers, num_cores
 from piccolo.scene import read_scene
 
-from ..datasets import DATASETS
-from ..datasets.checking import check_scene
-from ..datasets.files import AXES, DIRECTIONS
-from ..datasets.model import ConvertOptions, SceneSpec
-from ..datasets.writing import write_scene
+from . import DATASETS
+from .checking import check_scene
+from .files import AXES, DIRECTIONS
+from .model import ConvertOptions, SceneSpec
+from .writing import write_scene
 
 EXIT_BAD_FIT = 1
 _DATASETS = "\n".join(f"  {name:<14} {dataset.description}" for name, dataset in DATASETS.items())

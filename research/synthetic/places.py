@@ -1,13 +1,11 @@
-"""Made-up places that look alike: twin rooms, a symmetric hall, hotel rooms, doors, cubicles, racks."""
+"""Made-up places that look alike: hotel rooms, doors, cubicles, racks, both halves of a hall."""
 
 from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
-from piccolo.geometry.pose import Array
-
-from ..synthetic.office import CORRIDOR_WIDTH, place
-from ..synthetic.room import (
+from .office import place
+from .room import (
     CHECKS,
     PICTURE,
     PLAIN,
@@ -24,71 +22,18 @@ from ..synthetic.room import (
     put_sofa,
     put_table,
 )
-from ..synthetic.world import GAP
+from .world import GAP
 
-REPEATED_KINDS = ("twins", "hall", "corridor")  # the same from several poses
-ALIKE_KINDS = ("hotel", "doors", "cubicles", "racks")  # some of whose things are changed
+ALIKE_KINDS = ("hotel", "doors", "cubicles", "racks", "hall")  # some of whose things are changed
 CHANGED = (0.0, 0.05, 0.1, 0.2, 0.5)  # fractions of a unit's things
 PIECES = (put_table, put_shelf, put_sofa, put_crate, put_crate)
-NUM_DOORS = 6
 
 Thing = tuple[Sequence[float], Sequence[float], tuple[int, ...]]  # centre (3,), size (3,) [m], patterns
 
 
-def make_repeated(kind: str, seed: int, size: Array) -> tuple[Room, ...]:
-    """Make rooms of one of REPEATED_KINDS; a corridor has a length and a width of its own."""
-    if kind == "twins":
-        room = make_room(seed, size, np.zeros(3))
-        return room, place(room, np.array([room.size[0] + GAP, 0.0, 0.0]), is_turned=False)
-    return (symmetric_hall(seed, size) if kind == "hall" else corridor(seed, float(size[2])),)
-
-
-def symmetric_hall(seed: int, size: Array) -> Room:
-    """Make a room that half a turn about its middle takes to itself."""
-    room = make_room(seed, size, np.zeros(3))
-    x, y, _ = room.size
-    is_long = room.boxes[:, 3] > 0.45 * x  # floor, ceiling and two of the walls: their half
-    boxes = room.boxes.copy()
-    boxes[is_long, 0] = 0.25 * x - 0.5 * WALL_THICKNESS
-    boxes[is_long, 3] = 0.25 * x + 0.5 * WALL_THICKNESS
-    is_kept = boxes[:, 0] < 0.5 * x
-    half = room._replace(boxes=boxes[is_kept])
-    return room._replace(
-        boxes=np.vstack([half.boxes, place(half, np.zeros(3), is_turned=True).boxes]),
-        materials=np.tile(room.materials[is_kept], (2, 1)),
-        light=np.array([0.5 * x, 0.5 * y, room.light[2]]),
-        labels=np.tile(room.labels[is_kept], 2),
-    )
-
-
-def corridor(seed: int, height: float) -> Room:
-    """Make a corridor whose doors and pictures repeat; both ends are alike."""
-    b = RoomBuilder(np.random.default_rng([seed, 3]), np.zeros(3))
-    length = 3.0  # from door to door [m]
-    width = CORRIDOR_WIDTH
-    d = WALL_THICKNESS
-    floor = b.paint((PLANKS, TILES), 0.3, 0.7)
-    ceiling = b.paint((PLAIN,), 0.75, 0.95)
-    walls = [b.paint((PLAIN,), 0.5, 0.9) for _ in range(2)]
-    door = b.paint((PLANKS,), 0.2, 0.6)
-    picture = b.paint((PICTURE,), 0.1, 1.0)
-    for k in range(NUM_DOORS):
-        x = (k + 0.5) * length
-        b.put([x, width / 2, -d / 2], [length, width + 2 * d, d], floor)
-        b.put([x, width / 2, height + d / 2], [length, width + 2 * d, d], ceiling)
-        b.put([x, -d / 2, height / 2], [length, d, height], walls[0])
-        b.put([x, width + d / 2, height / 2], [length, d, height], walls[1])
-        b.put([x, 0.0, 1.0], [0.9, 0.06, 2.0], door)
-        b.put([x, width, 1.5], [0.8, 0.06, 0.6], picture)
-    for x in (-d / 2, NUM_DOORS * length + d / 2):
-        b.put([x, width / 2, height / 2], [d, width, height], walls[0])
-    size = np.array([NUM_DOORS * length, width, height])
-    return b.room(size, size * [0.5, 0.5, 0.93])
-
-
 def make_alike(kind: str, seed: int, changed: float) -> tuple[Room, ...]:
     """Make rooms of one of ALIKE_KINDS, in each of whose units a fraction of the things is changed."""
-    makers = {"hotel": hotel, "doors": doors, "cubicles": cubicles, "racks": racks}
+    makers = {"hotel": hotel, "doors": doors, "cubicles": cubicles, "racks": racks, "hall": hall}
     return makers[kind](seed, changed)
 
 
@@ -203,3 +148,27 @@ def racks(seed: int, changed: float) -> tuple[Room, ...]:
             at = [x + 0.4 + 0.75 * (number % 2), y, z]
             b.put(at, extent, b.paint((PLAIN, PLANKS, PICTURE, STRIPES), 0.15, 0.9))
     return (b.room(size, size * [0.5, 0.5, 0.95]),)
+
+
+def hall(seed: int, changed: float) -> tuple[Room, ...]:
+    """Make a room that half a turn about its middle takes to itself."""
+    rng = np.random.default_rng([seed, 47])
+    room = make_room(seed, rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4]), np.zeros(3))
+    x, y, _ = room.size
+    is_long = room.boxes[:, 3] > 0.45 * x  # floor, ceiling and two of the walls: their half
+    boxes = room.boxes.copy()
+    boxes[is_long, 0] = 0.25 * x - 0.5 * WALL_THICKNESS
+    boxes[is_long, 3] = 0.25 * x + 0.5 * WALL_THICKNESS
+    is_kept = boxes[:, 0] < 0.5 * x
+    half = room._replace(boxes=boxes[is_kept])
+    own = room.materials[is_kept]
+    other = own.copy()
+    is_changed = rng.random(len(own)) < changed
+    other[is_changed, 2:] = rng.permutation(own)[is_changed, 2:]  # in the colours of others
+    symmetric = room._replace(
+        boxes=np.vstack([half.boxes, place(half, np.zeros(3), is_turned=True).boxes]),
+        materials=np.vstack([own, other]),
+        light=np.array([0.5 * x, 0.5 * y, room.light[2]]),
+        labels=np.tile(room.labels[is_kept], 2),
+    )
+    return (symmetric,)

@@ -23,11 +23,11 @@ from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optional import import_optional
 from piccolo.views.pictures import encode_image
 
-from ..synthetic import world as worlds
-from ..synthetic.office import Office, make_office
-from ..synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
-from ..synthetic.walking import Walker
-from ..synthetic.world import World
+from . import world as worlds
+from .office import Office, make_office
+from .walk_frames import BAD_KINDS, WalkOptions, frames_of
+from .walking import Walker
+from .world import World
 
 QUALITY = {"photo": 70}  # of a variant's JPEGs; else 95
 WALK_QUALITY = 95

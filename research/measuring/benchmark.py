@@ -4,7 +4,7 @@ import argparse
 
 from piccolo.cli.command import HelpFormatter, add_run_options, command
 
-from ..measuring import calibration, confidence, page
+from . import calibration, confidence, page
 
 EPILOG = """\
 example:

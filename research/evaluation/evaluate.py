@@ -43,10 +43,10 @@ from piccolo.result import UNREADABLE, Result, check_scan, describe_failure, rea
 from piccolo.scan_map.open_map import scan_sha256_of
 from piccolo.scene import Query, Scene, find_scenes, input_files
 
-from ..evaluation import query_result, tables
-from ..evaluation.plots import errors_figure, figure_png, risk_figure
-from ..evaluation.query_result import QueryResult, Thresholds
-from ..evaluation.walks import alone_table, group_walks, walk_table
+from . import query_result, tables
+from .plots import errors_figure, figure_png, risk_figure
+from .query_result import QueryResult, Thresholds
+from .walks import alone_table, group_walks, walk_table
 
 EPILOG = """\
 examples:

@@ -1,1 +1,0 @@
-"""The commands, a module each: scripts of the same names in tools/."""

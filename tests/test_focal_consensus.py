@@ -1,0 +1,142 @@
+"""What the photos of one camera say of its focal length together, and what a batch makes of it."""
+
+import json
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rooms
+from pictures import encoded, write
+from test_focal_length import TRUE
+from test_localize_cameras import SEED, place
+
+from piccolo.batch.second_look import list_changed_by_consensus, list_looks_by_focal
+from piccolo.camera import Mount
+from piccolo.camera.model import pinhole
+from piccolo.cli.localize import main
+from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
+from piccolo.confidence.localization import FocalLength
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.jobs.threads import Workers
+from piccolo.result import Result, Source, read_results
+from research.synthetic.world import render_picture
+
+GIVEN = 700.0
+
+
+def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **more):
+    """A photo's line; the picture's focal length over that given, and the deviations of both."""
+    pose = Pose(np.eye(3), np.zeros(3))
+    told = {"picture_px": GIVEN * picture, "picture_std_px": GIVEN * picture * std} if picture else {}
+    used = GIVEN * picture if picture and std < given_std else GIVEN
+    about = {"doubt": SLIPS, "source": "`camera`", **told, **more}
+    focal = FocalLength(used, GIVEN * min(std, given_std), GIVEN, GIVEN * given_std, **about)
+    camera = (Mount(pinhole(1024, 768, GIVEN)),)
+    source = Source(None, None, (1024, 768), None)
+    result = Result(status, confidence, "a.ply", "a.jpg", pose, cameras=camera, source=source)
+    return replace(result, focal_length=focal, probability_none=1.0 - confidence).to_json()
+
+
+def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
+    """One in fifty is wrong; a sharp picture confirms or contradicts it, a blurred one says little."""
+    assert Opinion(0.0, 0.004**2).doubt(0.003) < 0.005
+    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(SLIPS, abs=0.015)
+    assert Opinion(0.05, 0.02**2).doubt(0.003) > 0.05
+    assert Opinion(-0.05, 0.009**2).doubt(0.003) > 0.99
+    rising = [Opinion(off, 0.02**2).doubt(0.003) for off in (0.0, 0.02, 0.04, 0.06, 1.0)]
+    assert rising == sorted(rising)
+    assert Opinion(9.0, 0.01**2).doubt(0.003) < 1.0
+
+
+def test_photos_of_one_camera_agree_on_its_focal_length_whatever_some_say():
+    """Each is right to its deviation, but for those at a wrong place; the mean has the deviation it says."""
+    rng = np.random.default_rng(5)
+    misses = []
+    for _ in range(200):
+        stds = rng.uniform(0.005, 0.03, 12)
+        offs = rng.normal(0.05, stds)
+        offs[:3] = rng.uniform(-0.3, 0.3, 3)
+        opinions = [Opinion(off, std**2) for off, std in zip(offs, stds, strict=True)]
+        consensus = Consensus([None, *opinions]).opinion()
+        misses.append((consensus.off - 0.05) / math.sqrt(consensus.variance))
+    assert 0.5 < np.std(misses) < 1.4
+    one_less = Consensus(opinions).opinion(without=4)
+    assert one_less.variance > consensus.variance
+    assert Consensus([Opinion(0.0, 1e-4), None, Opinion(0.0, 1e-4)]).opinion() is None
+    assert Consensus([None]).opinion() is None
+
+
+def test_photos_that_contradict_a_calibration_together_rule_out_all_of_its_poses():
+    """None of them contradicts it alone, and one says nothing; it is said once, however often it is asked."""
+    texts = [_text(1.05, 0.02) for _ in range(6)] + [_text(None, 1.0)]
+    changed = list_changed_by_consensus(texts, 0.9)
+    assert [(number, status) for number, status, _ in changed] == [(k, "localized") for k in range(7)]
+    for _, _, result in changed:
+        assert (result.status, result.confidence) == ("not_localized", 0.0)
+        (warning,) = result.warnings
+        assert warning == "the pictures of this camera have a focal length of 735 px, not 700: check `camera`"
+    again = [result.to_json() for *_, result in changed]
+    assert list_changed_by_consensus(again, 0.9) == []
+
+
+def test_photos_that_confirm_a_calibration_make_all_of_its_poses_surer():
+    texts = [_text(1.0, 0.005, status="ambiguous", confidence=0.89) for _ in range(6)]
+    changed = list_changed_by_consensus(texts, 0.9)
+    assert [result.status for *_, result in changed] == ["localized"] * 6
+    assert all(0.9 < result.confidence < 0.91 for *_, result in changed)
+    assert list_changed_by_consensus([result.to_json() for *_, result in changed], 0.9) == []
+
+
+def test_other_cameras_have_their_own_say():
+    """Those of another size or focal length, and guesses, are no photos of this camera."""
+    texts = [_text(1.05, 0.02) for _ in range(2)]
+    other = json.loads(texts[0])
+    texts += [json.dumps(other | {"image_size": [768, 1024]})]
+    longer = {name: 1.1 * other["focal_length"][name] for name in ("px", "given_px", "picture_px")}
+    texts += [json.dumps(other | {"focal_length": other["focal_length"] | longer})]
+    texts += [_text(1.05, 0.02, given_std=0.2)] * 3
+    assert list_changed_by_consensus(texts, 0.9) == []
+    assert list_looks_by_focal(texts) == []
+
+
+def test_a_photo_is_looked_at_again_with_the_focal_length_of_the_others():
+    """One that is sure and agrees is not; nor one for the second time."""
+    by_exif = {"given_std": 0.015, "source": "EXIF"}
+    sure = [_text(1.03, 0.004, **by_exif) for _ in range(4)]
+    weak = _text(1.2, 0.2, status="not_localized", confidence=0.2, **by_exif)
+    (look,) = list_looks_by_focal([*sure, weak])
+    assert (look.number, look.first, look.beside) == (4, "", ())
+    assert look.focal.others_px == pytest.approx(1.03 * GIVEN, rel=1e-3)
+    assert 0.002 < look.focal.others_std_px / look.focal.others_px < 0.006
+    assert look.focal.picture_px == pytest.approx(1.2 * GIVEN)
+    done = replace(Result.from_json(weak), focal_length=look.focal).to_json()
+    assert list_looks_by_focal([*sure, done]) == []
+
+
+def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
+    """The whole thing by the command line, with a focal length that is 3 % too long."""
+    room, pose = place(1)
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    poses = []
+    for k in range(4):
+        turned = yaw_rotation(0.5 * k) @ pose.R_cam_from_world
+        poses.append(Pose(turned, pose.center_world + np.array([0.05 * k, 0.03, 0.0])))
+        picture = render_picture(Mount(pinhole(320, 240, 0.5 * TRUE)), room, poses[k], Workers(2))
+        write(photos / f"{k}.png", encoded(picture, ".png"))
+    cloud = rooms.room(SEED)[1]
+    write_ply(tmp_path / "scan.ply", vertex_rows(cloud.points + cloud.origin_world, cloud.colors))
+    words = ["--cloud", str(tmp_path / "scan.ply"), "--pano", str(photos), "--focal", str(0.515 * TRUE)]
+    out = tmp_path / "poses.jsonl"
+    main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
+    results = read_results([out])
+    told = [r.focal_length.others_px for r in results if r.focal_length.others_px]
+    assert told
+    assert told == pytest.approx([0.5 * TRUE] * len(told), rel=0.01)
+    for result, true in zip(results, poses, strict=True):
+        if result.status == "localized":
+            assert result.pose.distance(true) < 0.05
+    main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
+    assert read_results([out]) == results
