@@ -33,7 +33,7 @@ class Row(NamedTuple):
 
 @dataclass(frozen=True)
 class PriorTable:
-    """What is known of each photo named, in place of what is of all."""
+    """Prior knowledge of single photos, by name; it goes before that of all."""
 
     path: Path
     by_name: Mapping[str, Row]

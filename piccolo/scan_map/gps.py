@@ -1,4 +1,4 @@
-"""Where a photo's GPS position lies in a scan; it may be wrong indoors."""
+"""Positions of photos by GPS in a scan; they may be wrong indoors."""
 
 from dataclasses import dataclass, replace
 
