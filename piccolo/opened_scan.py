@@ -33,6 +33,7 @@ from .paper.localize import PaperMap
 from .paper.localize import localize as localize_by_paper
 from .paper.settings import PaperSettings
 from .photo import Photo
+from .prior import Prior
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
 from .scan_map.gps import GpsPrior, gps_prior
 from .scan_map.named_scans import add_places, check_within
@@ -88,15 +89,15 @@ class OpenedScan:
             facts = read_photo_facts(photo)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
-            attempts: list[tuple[CoarseToFineSettings, GpsPrior | None]] = [(settings, None)]
-            if settings.prior.use_gps and (gps := self.make_gps_prior(facts, settings)):
-                near = replace(settings, prior=gps.apply_to(settings.prior))
-                attempts = [(near, gps), (settings, replace(gps, is_used=False))]
+            gps = self.make_gps_prior(facts, settings.prior)
             run = localize_guessed if has_guessed_focal(picture) else localize
-            for tried, gps in attempts:  # noqa: B007  near the GPS position, or else anywhere
-                found = run(self.prepared, picture, tried, self.workers, watch)
-                if found.status == LOCALIZED:
-                    break
+            found = Localization()
+            if gps is not None:
+                near = replace(settings, prior=gps.apply_to(settings.prior))
+                found = run(self.prepared, picture, near, self.workers, watch)
+            if found.status != LOCALIZED:
+                gps = gps and replace(gps, is_used=False)
+                found = run(self.prepared, picture, settings, self.workers, watch)
         elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
             found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
         else:
@@ -237,10 +238,10 @@ class OpenedScan:
         elif given := [name for name in ONLY_DEFAULT if getattr(photo, name)]:
             raise InputError(f"`{given[0]}`: not an option of the preset paper")
 
-    def make_gps_prior(self, photo: PhotoFacts, settings: CoarseToFineSettings) -> GpsPrior | None:
-        """Return the photo's GPS position in the scan; None if either is unknown or a place is given."""
+    def make_gps_prior(self, photo: PhotoFacts, prior: Prior) -> GpsPrior | None:
+        """Return the photo's GPS position in the scan; None if it is unknown or not wanted."""
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
-        if photo.gps is None or not crs or settings.prior.near is not None:
+        if photo.gps is None or not crs or not prior.use_gps or prior.near is not None:
             return None
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
 

@@ -12,7 +12,7 @@ from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import last_descent, selection
 from piccolo.localization.comparison import Comparison
-from piccolo.localization.query import Cache, Features, Query, Seen
+from piccolo.localization.query import Cache, Features, Query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
 
@@ -23,16 +23,17 @@ TILTED_PARTIAL = SimpleNamespace(is_partial=True, has_tilt=True)
 VIEWS = SimpleNamespace(averages=lambda *_: None, points=lambda *_: None, surroundings=lambda *_: None)
 NO_FEATURES = Once(lambda: Features(join_keypoints([]), NO_MATCHES))
 QUERY = Query(
+    source=None,
+    given=None,
     photo=WHOLE,
+    colors=lambda: None,
     scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose, has_shape=False),
     settings=CoarseToFineSettings(),
     workers=Workers(1),
     method=METHOD,
     features=(NO_FEATURES, NO_FEATURES),
-    seen=Once(lambda: Seen([], join_keypoints([]))),
+    evidence="map features",
     cache=Cache(VIEWS),
-    num_parts=2,
-    rotations=np.empty((0, 3, 3)),
 )
 
 

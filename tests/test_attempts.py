@@ -12,8 +12,9 @@ from piccolo.geometry.pose import exp_so3, is_correct
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import attempts, brief, query
+from piccolo.localization import attempts, beam, query
 from piccolo.localization import localize as method
+from piccolo.localization.photo import ACROSS
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
@@ -72,7 +73,7 @@ def test_features_are_asked_of_what_is_not_clear(how):
 )
 def test_clear_are_score_and_margin(monkeypatch, score, margin, expected):
     other = score * (1.0 - margin)
-    asked = replace(compared(monkeypatch, {0.0: score, 3.0: other}, {}), num_parts=0)
+    asked = compared(monkeypatch, {0.0: score, 3.0: other}, {}).by_views()
     assert is_clear(asked, [at(0.0, score), at(3.0, other)]) == expected
 
 
@@ -86,7 +87,7 @@ def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(
     """It is searched only where the photo is clear."""
     asked = []
     monkeypatch.setattr(attempts, "search_poses", lambda query, gravity: None)
-    monkeypatch.setattr(attempts, "refine", lambda query, starts, beam: [at(3.0, 0.5)])
+    monkeypatch.setattr(attempts, "refine_starts", lambda query, starts, beam: [at(3.0, 0.5)])
     monkeypatch.setattr(attempts, "is_clear", lambda query, found: is_clear)
     monkeypatch.setattr(attempts, "score_starts", lambda query, starts: own)
     monkeypatch.setattr(attempts, "score_mirror", lambda query: asked.append(query) or 0.5)
@@ -101,7 +102,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
-    mirror = brief.mirror_query(tilted)
+    mirror = tilted.mirror()
     other = _query(_turned_over(panorama))
     for own, expected in zip(mirror.photo.images, other.photo.images, strict=True):
         levels = (image().rgbx.view(np.uint8).astype(int) for image in (own, expected))
@@ -109,8 +110,8 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     np.testing.assert_array_equal(mirror.photo.small.rgbx, other.photo.small.rgbx)
     np.testing.assert_array_equal(mirror.photo.panorama.is_valid, other.photo.panorama.is_valid)
     R = exp_so3(np.array([0.1, -0.2, 0.3]))
-    (turned,) = brief.mirror_query(replace(tilted, rotations=R[None])).rotations
-    np.testing.assert_allclose(turned, brief.ACROSS @ R @ brief.ACROSS)
+    (turned,) = tilted.with_rotations(R[None]).mirror().rotations
+    np.testing.assert_allclose(turned, ACROSS @ R @ ACROSS)
     assert mirror.settings.prior == Prior()
     d = np.array([0.6, -0.2, 0.77])
     across = np.array([1.0, -1.0, 1.0])
@@ -128,8 +129,8 @@ def test_gravity_and_gps_alone_exclude_no_pose_that_is_searched_for(monkeypatch)
 
 def test_the_first_score_tells_a_photo_from_its_mirror():
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    mirror = brief.mirror_query(asked)
-    own, other = (brief.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
+    mirror = asked.mirror()
+    own, other = (beam.score_starts(q, search_poses(q, "known")) for q in (asked, mirror))
     assert own > 1.5 * other > 0.0
 
 
@@ -164,7 +165,7 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
 
 
 LOOK = (0, "look_first")
-HALF = (1, "search_matches")
+HALF = (1, "search_part")
 ALL = (2, "search_matches")
 UPRIGHT = (2, {"gravity": "known"})
 ABOUT_LEVEL = (2, {"gravity": "level"})
@@ -195,7 +196,8 @@ def test_attempts_are_made_in_this_order(photo, gravity, parts, expected):
     settings = CoarseToFineSettings(gravity=gravity)
     query = replace(QUERY, photo=photo, method=METHOD._replace(**parts), settings=settings)
     found = attempts.plan_attempts(query)
-    assert [(num, getattr(run, "__name__", None) or run.keywords) for num, run in found] == expected
+    named = [(len(by.features), getattr(run, "__name__", None) or run.keywords) for by, run in found]
+    assert named == expected
 
 
 @pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])
@@ -203,12 +205,15 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     """What is found adds up, and as many features are asked in the end as in the last attempt."""
 
     def run(query, hypotheses, watch):
-        return [*hypotheses, at(query.num_parts, 0.5)], query.num_parts == sure
+        num = len(query.features)
+        return [*hypotheses, at(num, 0.5)], num == sure
 
-    made = [(k, run) for k in (1, 2, 0)]
-    monkeypatch.setattr(method, "plan_attempts", lambda query: made)
-    monkeypatch.setattr(method, "refine_to_the_end", lambda query, found: found)
-    monkeypatch.setattr(method, "judge", lambda query, found, fit: (query.num_parts, found))
+    def plan(query):
+        return [(replace(query, features=query.features[:k]), run) for k in (1, 2, 0)]
+
+    monkeypatch.setattr(method, "plan_attempts", plan)
+    monkeypatch.setattr(method, "refine_best", lambda query, found: found)
+    monkeypatch.setattr(method, "judge", lambda query, found, fit: (len(query.features), found))
     how = CoarseToFineSettings(), Workers(1), Stopwatch()
     num_parts, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
     assert places(found) == [1, 2, 0][:num_made]
@@ -234,9 +239,9 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
     monkeypatch.setattr(attempts, "match_poses", lambda query: [] if num_matches is None else ["pose"])
     monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
     monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
-    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(query.num_parts, 0.5)])
-    query = replace(QUERY, num_parts=num_parts)
-    found, is_enough = attempts.search_matches(query, [looked], Stopwatch())
+    monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(num_parts, 0.5)])
+    search = attempts.search_part if num_parts == 1 else attempts.search_matches
+    found, is_enough = search(QUERY, [looked], Stopwatch())
     assert places(found) == kept
     assert is_enough == (is_sure and len(kept) == 2)
 

@@ -146,10 +146,10 @@ def test_views_and_points_count_from_their_place():
     place = points_around.round_position(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, FINE_CELLS)
     points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), 30_000)
-    for found, wanted in ((query.view_at(pose, FINE), expected), (query.points_at(pose), points)):
+    for found, wanted in ((query.view_at(pose, "fine"), expected), (query.view_at(pose, "points"), points)):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)
-    assert query.points_at(pose) is query.points_at(_pose(0.3135, 0.1875, 0.302))
+    assert query.view_at(pose, "points") is query.view_at(_pose(0.3135, 0.1875, 0.302), "points")
     moved = expected.around(pose.center_world)
     at, there = (cells.center_map[:, None] + cells.offsets for cells in (expected, moved))
     np.testing.assert_allclose(at, there, atol=1e-6)
@@ -160,8 +160,9 @@ def test_views_and_points_count_from_their_place():
 def test_points_depend_on_what_the_photo_shows(shift):
     query, pose = _query(), _pose(0.3 + shift, 0.2, 0.3)
     height, width = query.photo.panorama.is_valid.shape
-    half = query.mask_pixels(np.arange(width)[None] < np.full((height, 1), width // 2))
+    half = query.mask(np.arange(width)[None] < np.full((height, 1), width // 2))
     assert half.cache.views is query.cache.views
-    assert 0.3 < len(half.points_at(pose).weights) / len(query.points_at(pose).weights) <= 1.01
-    azimuth = np.arctan2(*(pose.R_cam_from_world @ half.points_at(pose).offsets)[1::-1])
+    some, every = (asked.view_at(pose, "points") for asked in (half, query))
+    assert 0.3 < len(some.weights) / len(every.weights) <= 1.01
+    azimuth = np.arctan2(*(pose.R_cam_from_world @ some.offsets)[1::-1])
     assert (azimuth < 0.1).mean() > 0.98

@@ -17,14 +17,15 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 
 SURE = 0.002  # [m] largest deviation
-RIGHT, WRONG = Standing(1.0, 0.8, 60), Standing(1.0, 0.03, 3)
-ELSEWHERE = Standing(0.1, 0.05, 3)
+RIGHT, WRONG = Standing(1.0, 0.8, 60, "map features"), Standing(1.0, 0.03, 3, "map features")
+ELSEWHERE = Standing(0.1, 0.05, 3, "map features")
 MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
 
 
 def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
-    p = posterior([Standing(1.0, 0.5, 12), Standing(0.5, 0.1, 2)], 0.01, model=MODEL)
+    standings = [Standing(*values, "map features") for values in ((1.0, 0.5, 12), (0.5, 0.1, 2))]
+    p = posterior(standings, 0.01, model=MODEL)
     e = math.exp
     odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
     doubt = math.erf(0.1 / (0.01 * math.sqrt(2.0)))
@@ -46,19 +47,20 @@ def test_right_and_wrong_evidence():
 
 def test_each_kind_of_evidence_has_a_model_of_its_own():
     """Shape and whole views alone have two features; local features count once asked, even if none agrees."""
-    views = Standing(0.5, 0.2, None)
+    views = Standing(0.5, 0.2, None, "views")
     np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
-    asked = views._replace(num_matches=0)
-    standings = [views._replace(is_shape=True), views, asked, asked._replace(is_drawn=True)]
-    assert [standing.kind for standing in standings] == list(rule.MODELS)
+    asked = views._replace(num_matches=0, evidence="map features")
+    standings = [views._replace(evidence="shape"), views, asked, asked._replace(evidence="drawn scan")]
+    assert [standing.evidence for standing in standings] == list(rule.MODELS)
     assert [len(model.weights) for model in rule.MODELS.values()] == [2, 2, 3, 3]
     for standing in standings:
-        model = rule.MODELS[standing.kind]
+        model = rule.MODELS[standing.evidence]
         expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0
         assert rule.log_odds(standing._replace(log_prior=-2.0)) == pytest.approx(expected)
         np.testing.assert_array_equal(posterior([standing], SURE), posterior([standing], SURE, model=model))
-    assert classify(posterior([RIGHT._replace(num_matches=None)], SURE), 0.9) == rule.LOCALIZED
-    p = posterior([WRONG._replace(num_matches=None)], None)
+    right, wrong = (one._replace(num_matches=None, evidence="views") for one in (RIGHT, WRONG))
+    assert classify(posterior([right], SURE), 0.9) == rule.LOCALIZED
+    p = posterior([wrong], None)
     assert classify(p, 0.9) == rule.NOT_LOCALIZED
 
 
@@ -72,7 +74,7 @@ def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies
 
 @pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5), ("ratio", 0.1)])
 def test_more_evidence_is_more_probability(name, more):
-    middling = Standing(1.0, 0.15, 8)
+    middling = Standing(1.0, 0.15, 8, "map features")
     stronger = middling._replace(**{name: getattr(middling, name) + more})
     assert posterior([middling], SURE)[0] < posterior([stronger], SURE)[0]
     assert posterior([middling], None)[0] < posterior([middling], SURE)[0]
@@ -92,7 +94,7 @@ def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(st
 def test_numbers_beyond_reason_change_nothing_more(a, b):
     np.testing.assert_array_equal(*(rule.none_features(std) for std in (a, b)))
     assert (rule.none_features(None) == rule.none_features(0.3)).all()
-    least, less = Standing(0.0, 0.02, 0), Standing(-0.5, -0.3, 0)
+    least, less = (Standing(*values, 0, "map features") for values in ((0.0, 0.02), (-0.5, -0.3)))
     faint, nothing = (rule.pose_features(standing) for standing in (least, less))
     np.testing.assert_array_equal(faint, nothing)
     np.testing.assert_array_equal(faint, np.log([0.1, 0.02, 8.0]))

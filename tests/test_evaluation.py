@@ -101,10 +101,10 @@ def test_summary_accuracies_and_quartiles_of_errors_some_of_which_are_infinite()
     assert tables.quartiles([1.0, 2.0, 3.0, 4.0, np.inf]).tolist() == [2.0, 3.0, 4.0]
     assert tables.quartiles([1.0, np.inf]).tolist() == [np.inf] * 3
     assert tables.quartiles([1.0, 1.0, 1.0, np.inf]).tolist() == [1.0, 1.0, np.inf]
-    summary = tables.summarize(ROWS)
-    assert (summary.num_queries, summary.num_correct, summary.num_localized) == (4, 2, 2)
-    assert (summary.num_wrong, summary.accuracy) == (1, 0.5)
-    assert summary.position_quartiles[1] == pytest.approx(0.06)
+    found = tables.statistics(ROWS)
+    assert [found[name] for name in ("number", "correct", "localized")] == ["4", "2", "2"]
+    assert (found["wrong of these"], found["accuracy"]) == ("1", "0.500")
+    assert found["t 50 % [m]"] == "0.0600"
 
 
 def test_risk_over_coverage():
@@ -170,9 +170,13 @@ def test_two_runs_side_by_side():
     second = [_row("a.jpg", 0.01, 0.2), _row("b.jpg", 0.5, 0.4, variant="photo"), ROWS[2]]
     pairs = tables.pair_up(ROWS, second)
     assert [first.image for first, _ in pairs] == ["c.jpg", "a.jpg", "b.jpg"]
-    text = tables.side_by_side(pairs, ("old", "new"), PAPER_THRESHOLDS).markdown()
-    assert "| old | 3 | 2 | 0.667 | 2 | 1 |" in text
-    assert "| new | 3 | 1 | 0.333 | 3 | 2 |" in text
+    table = tables.side_by_side(pairs, ("old", "new"), PAPER_THRESHOLDS)
+    columns = ("run", "number", "correct", "accuracy", "localized", "wrong of these")
+    lines = [dict(zip(table.columns, row, strict=True)) for row in table.rows]
+    assert [[line[name] for name in columns] for line in lines] == [
+        ["old", "3", "2", "0.667", "2", "1"],
+        ["new", "3", "1", "0.333", "3", "2"],
+    ]
     changed = tables.changes(pairs, PAPER_THRESHOLDS).markdown().splitlines()[4:]
     change = "ambiguous 0.50: 0.030 m, 0.40 deg | localized 0.95: 0.500 m, 0.40 deg"
     assert changed == [f"| room | b.jpg | worse | {change} |"]

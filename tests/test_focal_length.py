@@ -218,7 +218,7 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     )
     found = Selection(score_pose(query, scan().from_world(pose)), ())
     query, found = focal.follow_matches(query, found)
-    assert query.photo.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
+    assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert found.best.pose.distance(scan().from_world(pose)) < 0.15
     change, information, _ = focal.fit_matches(query, found.best.pose)
     assert abs(change) < 2.5 / math.sqrt(information)

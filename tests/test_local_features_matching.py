@@ -155,9 +155,9 @@ def test_matches_of_halves_are_those_of_the_whole_numbered_on():
     for values, others in zip(joined, own, strict=True):
         assert values.dtype == others.dtype
         np.testing.assert_array_equal(values, others)
-    half = dataclasses.replace(query, num_parts=1)
+    half = dataclasses.replace(query, features=query.features[:1])
     assert half.matches.query.tolist() == halves[0].matches.query.tolist()
-    none = dataclasses.replace(query, num_parts=0)
+    none = query.by_views()
     assert len(none.matches.query) == len(none.keypoints.rays) == 0
 
 

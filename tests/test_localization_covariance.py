@@ -17,6 +17,7 @@ from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization import covariance
+from piccolo.localization.comparison import compare
 from piccolo.localization.localize import localize
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
@@ -45,7 +46,7 @@ def found():
 
 
 def _points(prepared, pose):
-    return prepared.points_at(pose).around(pose.center_world)
+    return prepared.view_at(pose, "points").around(pose.center_world)
 
 
 def _gradients(problem, poses, center):
@@ -116,7 +117,9 @@ def test_covariance_is_in_the_worlds_axes(found):
     prepared, pose, result = found
     R = exp_so3(np.array([0.2, -0.5, 1.1]))
     own = result.covariance.matrix
-    other = describe_errors(covariance.estimate_covariance(prepared, pose).gaussian, R.T).matrix
+    other = describe_errors(
+        covariance.estimate_covariance(prepared, pose, compare(prepared, pose)).gaussian, R.T
+    ).matrix
     np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
 
@@ -150,7 +153,10 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     monkeypatch.setattr(covariance, "compute_hessian", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
     matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose, False)
-    assert sorted(asked, key=lambda each: each[1].scale) == ways[: 2 if num_rough == 1 else 3]
+    assert (
+        sorted(asked, key=lambda each: ("full", "fine", "middle").index(each[1].image))
+        == ways[: 2 if num_rough == 1 else 3]
+    )
     if num_rough == 3:
         assert matrix is None
     else:
@@ -252,21 +258,20 @@ def test_points_that_occluders_hide_are_removed():
 
 def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(found, monkeypatch):
     prepared, pose, _ = found
-    own = covariance.estimate_covariance(prepared, pose)
-    assert (
-        covariance.estimate_covariance(prepared, pose, seen_from=pose).gaussian.covariance.tobytes()
-        == own.gaussian.covariance.tobytes()
-    )
+    clear = compare(prepared, pose)
+    own, near = (covariance.estimate_covariance(prepared, pose, clear, place) for place in (None, pose))
+    assert near.gaussian.covariance.tobytes() == own.gaussian.covariance.tobytes()
     rgb = query(2).rgb.copy()
     rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
     hidden = prepare_query(as_panorama(rgb), prepared.scan_map, SETTINGS, Workers(2))
-    shown = covariance.mask_occluders(hidden, pose)
+    seen = compare(hidden, pose)
+    shown = covariance.mask_occluders(hidden, seen)
     assert shown is not hidden
-    masked = covariance.estimate_covariance(hidden, pose)
+    masked = covariance.estimate_covariance(hidden, pose, seen)
     monkeypatch.setattr(
         covariance, "mask_occluders", lambda *_: replace(shown, photo=Photo(shown.photo.panorama))
     )
-    left_out = covariance.estimate_covariance(hidden, pose, seen_from=pose)  # by the images that are there
+    left_out = covariance.estimate_covariance(hidden, pose, seen, pose)  # by the images that are there
     variances = [np.diag(found.gaussian.covariance)[3:] for found in (left_out, masked)]
     np.testing.assert_allclose(*np.sqrt(variances), rtol=0.1)
 
@@ -289,7 +294,7 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
 def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
     """Its pixels are so narrow that it would outweigh all others."""
     prepared, pose, result = found
-    taken = prepared.points_at(pose).around(pose.center_world)
+    taken = prepared.view_at(pose, "points").around(pose.center_world)
     down = -pose.R_cam_from_world[2] + 0.002 * pose.R_cam_from_world[0]
     away = -pose.R_cam_from_world[2] + 0.1 * pose.R_cam_from_world[0]
     wrong = np.array([2.0, -2.0, 2.0], np.float32)
@@ -301,6 +306,7 @@ def test_a_point_at_a_pole_of_the_photo_tells_nothing(found, monkeypatch):
 
     kept = [len(covariance.remove_poles(with_one_at(d), pose).weights) for d in (down, away)]
     assert kept[1] == kept[0] + 1
-    monkeypatch.setattr(type(prepared), "points_at", lambda query, pose: with_one_at(down))
-    told = covariance.estimate_covariance(prepared, pose).gaussian.covariance
+    seen = compare(prepared, pose)
+    monkeypatch.setattr(type(prepared), "view_at", lambda query, pose, name: with_one_at(down))
+    told = covariance.estimate_covariance(prepared, pose, seen).gaussian.covariance
     np.testing.assert_allclose(told, result.covariance.matrix, rtol=0.02)

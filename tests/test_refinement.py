@@ -13,11 +13,13 @@ from made_up import QUERY, VIEWS, at, place
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
-from piccolo.jobs.threads import Once, Workers
-from piccolo.localization import last_descent, refinement
+from piccolo.jobs.threads import Workers
+from piccolo.localization import beam, ladder
 from piccolo.localization import query as query_module
-from piccolo.localization.query import Cache, Images, prepare_query
-from piccolo.localization.refinement import Fit, Limits, best_and_alternatives, narrow
+from piccolo.localization.beam import Ends, best_and_alternatives, narrow
+from piccolo.localization.comparison import CONTRADICTS, Comparison
+from piccolo.localization.ladder import AROUND_MIDDLE, FINE, SECOND, Limits
+from piccolo.localization.query import Cache, prepare_query
 from piccolo.localization.search import Starts
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.views.view import Cells
@@ -27,13 +29,14 @@ ALL = np.ones(len(FINE_BLOCKS), bool)
 
 
 def _fit(x, score, yaw_deg=0.0):
-    return Fit(at(x, score, yaw_deg).pose, score)
+    return at(x, score, yaw_deg)
 
 
 def _asked(is_partial=False):
     """A query whose images are their names, of a photo that shows all cells."""
-    images = Images(*(Once(lambda name=name: name) for name in Images._fields))
-    photo = SimpleNamespace(images=images, find_shown_cells=lambda *_: np.ones(3), is_partial=is_partial)
+    photo = SimpleNamespace(
+        image=lambda name: name, find_shown_cells=lambda *_: np.ones(3), is_partial=is_partial
+    )
     return replace(QUERY, photo=photo, cache=Cache(VIEWS))
 
 
@@ -55,7 +58,7 @@ def _query(seed):
     ],
 )
 def test_faint_poses_are_compared_only_where_the_best_is_not_plain(scores, kept):
-    found = refinement.keep_comparable([_fit(k, score) for k, score in enumerate(scores)])
+    found = beam.keep_comparable([_fit(k, score) for k, score in enumerate(scores)])
     assert sorted((h.score for h in found), reverse=True) == kept
 
 
@@ -89,21 +92,21 @@ def test_the_beam_narrows_from_stage_to_stage(monkeypatch, is_partial, first):
     """
     made, descents = collections.Counter(), []
 
-    def descend_all(scan_map, image, starts, num_iterations, workers):
-        descents.append((num_iterations, len(starts.candidate)))
-        return starts, None
+    def descend_prepared(query, starts, stage):
+        descents.append((stage.limits.num_iterations, len(starts.candidate)))
+        return Ends(starts, None)
 
-    def stage(name, query, found):
-        made[name] += 1
+    def done(name, query, found, first=None):
+        made[first or name] += 1
         pose = getattr(found, "pose", found)
         return Hypothesis(pose, 0.1 - 1e-5 * place(pose))
 
-    monkeypatch.setattr(refinement, "descend_all", descend_all)
-    for name in ("descend_middle", "perturb_middle", "descend_fine", "refine_by_perturbation", "score_pose"):
-        monkeypatch.setattr(refinement, name, functools.partial(stage, name))
+    monkeypatch.setattr(beam, "descend_prepared", descend_prepared)
+    for name in ("refine", "climb", "score_pose"):
+        monkeypatch.setattr(beam, name, functools.partial(done, name))
     centers = np.outer(np.arange(500), [1.0, 0.0, 0.0])
     starts = Starts(np.repeat(np.eye(3)[None], 500, axis=0), centers, np.arange(500))
-    found = refinement.refine(_asked(is_partial), starts, METHOD.beam)
+    found = beam.refine_starts(_asked(is_partial), starts, METHOD.beam)
     assert descents == [(first, 500), (12, 400)]
     assert list(made.values()) == [48, 8, 8, 2, 12]
     assert [place(h.pose) for h in found] == list(range(12))
@@ -119,26 +122,27 @@ def test_the_beam_narrows_from_stage_to_stage(monkeypatch, is_partial, first):
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
 
-    def around(cells, blocks, wide_image, narrow_image, pose, size, workers):
-        sizes.append(size)
-        assert (wide_image, narrow_image) == ("middle", "fine")
-        return Fit(pose, score[0])
+    def around(query, cells, blocks, pose, stage):
+        sizes.append(stage.around.size)
+        assert (stage.around.image, stage.image) == ("middle", "fine")
+        return Hypothesis(pose, score[0])
 
-    def fine(query, pose):
+    def fine(query, pose, stage):
+        assert stage is FINE
         score[0] += left.pop(0)
-        return Fit(pose, score[0])
+        return Hypothesis(pose, score[0])
 
     score = [0.5]
     monkeypatch.setattr(query_module, "normalize_view", lambda *_: None)
-    monkeypatch.setattr(refinement, "score_on_cells", lambda *_: _fit(0.0, 0.5))  # whatever another view said
-    monkeypatch.setattr(refinement, "descend_around", around)
-    monkeypatch.setattr(refinement, "descend_fine", fine)
+    monkeypatch.setattr(ladder, "score_on_cells", lambda *_: _fit(0.0, 0.5))  # whatever another view said
+    monkeypatch.setattr(ladder, "descend_around", around)
+    monkeypatch.setattr(ladder, "refine", fine)
     query = _asked()
-    found = refinement.refine_by_perturbation(query, _fit(0.0, 0.9))
+    found = ladder.climb(query, _fit(0.0, 0.9))
     assert found.score == pytest.approx(expected)
     assert sizes == [0.4] * rounds
-    again = Fit(found.pose, 0.3)
-    assert refinement.refine_by_perturbation(query, again) is again
+    again = Hypothesis(found.pose, 0.3)
+    assert ladder.climb(query, again) is again
     assert sizes == [0.4] * rounds
 
 
@@ -154,19 +158,25 @@ def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, round
 )
 def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, scores, rounds, end):
     query, masked, made = _asked(), _asked(), []
-    monkeypatch.setattr(
-        last_descent, "score_pose", lambda query, pose: at(place(pose), scores[int(place(pose))])
-    )
-    monkeypatch.setattr(last_descent, "mask_occluders", lambda query, pose: masked if is_masked else query)
-    for name in ("perturb_middle", "descend_fine"):
-        monkeypatch.setattr(last_descent, name, lambda shown, pose: made.append(shown) or Fit(pose, 0.0))
-    monkeypatch.setattr(
-        last_descent,
-        "refine_by_perturbation",
-        lambda shown, fit: made.append(shown) or at(place(fit.pose) + 1, 0),
-    )
-    shown, found = last_descent.refine_unoccluded(query, at(0.0, 0.0).pose)
-    assert made == ([masked] * 3 * rounds if is_masked else [query])
+    correlation = np.array([0.9, CONTRADICTS - 0.01 if is_masked else 0.9])
+    seen = Comparison(correlation, np.ones(2), np.ones(2), 2.0)
+    monkeypatch.setattr(ladder, "score_pose", lambda query, pose: at(place(pose), scores[int(place(pose))]))
+    monkeypatch.setattr(ladder, "compare", lambda query, pose: seen)
+    monkeypatch.setattr(ladder, "mask_occluders", lambda query, seen: masked if is_masked else query)
+
+    def refine(shown, pose, *stages):
+        assert stages == (AROUND_MIDDLE, FINE)
+        made.append(shown)
+        return Hypothesis(pose, 0.0)
+
+    def climb(shown, start):
+        made.append(shown)
+        return at(place(start.pose) + 1, 0)
+
+    monkeypatch.setattr(ladder, "refine", refine)
+    monkeypatch.setattr(ladder, "climb", climb)
+    shown, found = ladder.climb_unoccluded(query, at(0.0, 0.0).pose)
+    assert made == ([masked] * 2 * rounds if is_masked else [query])
     assert shown is made[-1]
     assert (place(found.pose), found.score) == (end, scores[end])
 
@@ -175,23 +185,24 @@ def test_occluders_are_masked_again_where_that_gains(monkeypatch, is_masked, sco
 def test_full_resolution_is_taken_back_where_the_score_falls(monkeypatch, after, is_taken):
     """By a tenth at most may it fall, in exchange for millimetres."""
     moved, start = at(0.04, after), at(0.0, 0.52)
-    asked, descents = [], []
-    monkeypatch.setattr(last_descent, "refine_unoccluded", lambda query, pose: (query, start))
-    monkeypatch.setattr(last_descent, "mask_occluders", lambda query, pose: query)
-    monkeypatch.setattr(last_descent, "score_pose", lambda query, pose: Hypothesis(pose, after))
-    monkeypatch.setattr(type(QUERY), "points_at", lambda query, pose: asked.append(place(pose)))
-    monkeypatch.setattr(last_descent, "descend", lambda *how: descents.append(how[-1]) or moved.pose)
+    asked = []
+    clear = Comparison(np.ones(1), np.ones(1), np.ones(1), 1.0)
+    monkeypatch.setattr(ladder, "climb_unoccluded", lambda query, pose: (query, start))
+    monkeypatch.setattr(ladder, "compare", lambda query, pose: clear)
+    monkeypatch.setattr(ladder, "score_pose", lambda query, pose: Hypothesis(pose, after))
+    monkeypatch.setattr(type(QUERY), "view_at", lambda query, pose, name: asked.append((place(pose), name)))
+    monkeypatch.setattr(ladder, "descend", lambda *_: moved.pose)
     expected = moved if is_taken else start
     query = _asked()
-    assert last_descent.refine_full_resolution(query, start.pose) == expected
-    assert asked == [0.0, 0.04]  # the points are taken again from where the pose is
-    assert last_descent.settle(query, start) == expected
-    assert len(asked) == len(descents) == 4  # the second round of settling moves nothing
-    monkeypatch.setattr(last_descent, "descend", lambda *_: at(len(asked), 0.0).pose)
-    last_descent.settle(query, start)
+    assert ladder.climb_to_full(query, start.pose) == expected
+    assert asked == [(0.0, "points"), (0.04, "points")]  # they are taken again from where the pose is
+    assert ladder.settle(query, start) == expected
+    assert len(asked) == 4  # the second round of settling moves nothing
+    monkeypatch.setattr(ladder, "descend", lambda *_: at(len(asked), 0.0).pose)
+    ladder.settle(query, start)
     assert len(asked) == 10  # six rounds at most
-    monkeypatch.setattr(last_descent, "descend", lambda *_: at(0.019, 0.0).pose)
-    last_descent.refine_full_resolution(query, start.pose)
+    monkeypatch.setattr(ladder, "descend", lambda *_: at(0.019, 0.0).pose)
+    ladder.climb_to_full(query, start.pose)
     assert len(asked) == 11  # so near by it sees the same points
 
 
@@ -199,7 +210,7 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     """Cells around the camera that point where the photo has a picture; all, for a photo of a sphere."""
     whole, pose = _query(1), at(0.0, 0.0, 70.0).pose
     is_hidden = ~(np.abs(np.arange(16) - 4) < 2) & np.ones((8, 1), bool)  # but a fifth, around the left
-    narrow = whole.mask_pixels(is_hidden)
+    narrow = whole.mask(is_hidden)
     grid = make_grid(METHOD.full_view.num_rings)
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
     shown = narrow.photo.find_shown_cells(METHOD.full_view.num_rings, pose)
@@ -211,8 +222,8 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
         averages=lambda *_: None, points=lambda place, config, shown, count: (shown, count)
     )
     asked = replace(narrow, cache=Cache(views))
-    assert (asked.view_at(pose, METHOD.full_view) == shown).all()
-    assert asked.points_at(pose) == (shown.tobytes(), 30_000)
+    assert (asked.view_at(pose, "fine") == shown).all()
+    assert asked.view_at(pose, "points") == (shown.tobytes(), 30_000)
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
@@ -220,13 +231,13 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
     """Starts 5 mm apart end within 0.05 mm where the loss has one minimum; in noise it has several."""
     query, true_pose = _query(seed), rooms.scene(seed)[2]
     ends = [
-        last_descent.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
+        ladder.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
         for d in ([0.002, 0.001, 0.0], [-0.002, -0.001, 0.002])
     ]
     distance, angle_deg = rooms.errors(*ends)
     assert distance < most
     assert angle_deg < 0.03
-    again = last_descent.settle(query, Hypothesis(ends[0], 0.0)).pose
+    again = ladder.settle(query, Hypothesis(ends[0], 0.0)).pose
     assert rooms.errors(again, ends[0])[0] < 2e-5
     assert rooms.errors(ends[0], true_pose)[0] < 0.01
 
@@ -243,23 +254,24 @@ def _fine():
 def test_descent_finds_the_true_pose_again():
     (cells, true_pose), image = _fine(), _query(1).photo.images.fine()
     off = step(true_pose, np.array([0.03, -0.02, 0.04, 0.06, -0.05, 0.04]))
-    pose = refinement.descend(cells, image, off, Limits(1.0, 30, 1e-5))
+    pose = ladder.descend(cells, image, off, Limits(1.0, 30, 1e-5))
     assert rooms.errors(pose, true_pose)[0] < 0.01
-    before, after = (refinement.score_on_cells(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
+    before, after = (ladder.score_on_cells(cells, FINE_BLOCKS, image, p).score for p in (off, pose))
     assert after > max(0.6, before)
-    assert rooms.errors(refinement.descend(cells, image, off, Limits(1.0, 1, 1e-5)), true_pose)[0] > 0.01
+    assert rooms.errors(ladder.descend(cells, image, off, Limits(1.0, 1, 1e-5)), true_pose)[0] > 0.01
 
 
 def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     (_, true_pose), images = _fine(), _query(1).photo.images
-    off = step(true_pose, refinement.perturbations(1.0)[1])
+    off = step(true_pose, ladder.perturbations(1.0)[1])
     assert rooms.errors(off, true_pose)[0] > 0.2
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
-    problem = cells, FINE_BLOCKS, images.search(), images.middle(), off, 1.0
-    found, by_two = (refinement.descend_around(*problem, Workers(n)) for n in (1, 2))
+    stage = AROUND_MIDDLE._replace(view="fine")
+    queries = (replace(_query(1), workers=Workers(n)) for n in (1, 2))
+    found, by_two = (ladder.descend_around(query, cells, FINE_BLOCKS, off, stage) for query in queries)
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
-    expected = refinement.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)
+    expected = ladder.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)
     np.testing.assert_allclose(found.score, expected.score, atol=1e-5)
 
 
@@ -269,7 +281,7 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     k, far = int(np.argmin(distance)), int(np.argmax(distance))
     candidate, R = np.array([k, far, k]), true_pose.R_cam_from_world
     starts = Starts(np.stack([R] * 3), scan_map.centers[candidate], candidate)
-    ends, scores = refinement.descend_all(scan_map, image, starts, 12, Workers(2))
+    ends, scores = beam.descend_prepared(_query(1), starts, SECOND)
     assert ends.candidate.tolist() == [k, k, far]  # the best first
     assert scores[0] == scores[1] > max(0.4, scores[2])
     (row,), views = scan_map.views.at(np.array([k]), Workers(1))
@@ -277,7 +289,7 @@ def test_starts_descend_on_their_candidates_views_as_one_does_alone():
     channels = views.features[row].astype(np.float32) / np.float32(63.75)
     weights = (views.is_seen[row] * make_grid(24).solid_angle).astype(np.float32)
     cells, center = Cells(offsets, channels, weights, scan_map.centers[k]), scan_map.centers[k]
-    alone = refinement.descend(cells, image, Pose(R, center), Limits(1.2, 12, 2e-3))
+    alone = ladder.descend(cells, image, Pose(R, center), Limits(1.2, 12, 2e-3))
     np.testing.assert_allclose(ends.center_map[0], alone.center_world, atol=1e-4)
     np.testing.assert_allclose(ends.R_cam_from_map[0], alone.R_cam_from_world, atol=1e-4)
     assert rooms.errors(alone, true_pose)[0] < 0.1

@@ -21,7 +21,14 @@ from piccolo.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
 from research.evaluation.query_result import read_run
 from research.experiments import reproduce_paper
-from research.experiments.reproduce_paper import EXPERIMENTS, flip, identity, thin, with_random_rotation
+from research.experiments.reproduce_paper import (
+    EXPERIMENTS,
+    conditions_of,
+    flip,
+    identity,
+    thin,
+    with_random_rotation,
+)
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
 QUICK = PaperSettings(num_translations=8, num_iterations=20)
@@ -99,7 +106,7 @@ def test_pictures_beside_the_scene_and_masked_ones_are_flipped_too(rooms, tmp_pa
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_conditions_differ_and_have_files_of_their_own(name):
-    conditions = EXPERIMENTS[name].conditions_of(PRESETS, ["change", "clean"])
+    conditions = conditions_of(EXPERIMENTS[name], PRESETS, ["change", "clean"])
     assert len(conditions) >= 2
     assert len({reproduce_paper.file_name(condition) for condition in conditions}) == len(conditions)
     tried = {(repr(c.settings), repr(c.transform), c.variants, c.use_labels) for c in conditions}

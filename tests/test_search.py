@@ -13,7 +13,8 @@ from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
-from piccolo.localization.query import make_images, prepare_query
+from piccolo.localization.photo import make_images
+from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
@@ -184,7 +185,7 @@ def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
         (None, "level"),
         (GPano(pitch_deg=12.0), "known"),
     ):
-        narrow = _query(gpano).mask_pixels(~is_left & np.ones((512, 1), bool))
+        narrow = _query(gpano).mask(~is_left & np.ones((512, 1), bool))
         assert narrow.photo.is_partial
         assert narrow.photo.has_tilt == (gpano is not None)
         searched = [
@@ -200,7 +201,7 @@ def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
 def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
     """With the means subtracted; nearer in angle than those of a whole photo, and near the true pose."""
     true_pose = rooms.scene(1)[2]
-    narrow = _query().mask_pixels(mask_outside_field(512, 90.0, 0.5))
+    narrow = _query().mask(mask_outside_field(512, 90.0, 0.5))
     starts = search.search_poses(narrow, "level")
     near = [
         np.linalg.norm(center - true_pose.center_world) < 0.8

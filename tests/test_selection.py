@@ -6,20 +6,20 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from made_up import at, compared, place, places
+from made_up import QUERY, at, compared, place, places
 
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.occlusion import Agreement
+from piccolo.localization import beam, last_descent, selection
 from piccolo.localization import judge as judging
-from piccolo.localization import last_descent, refinement, selection
-from piccolo.localization.last_descent import refine_to_the_end
+from piccolo.localization.last_descent import refine_best
 from piccolo.localization.selection import Selection
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
     query = compared(monkeypatch, {0.0: 0.3, 1.0: 0.5, 5.0: 0.6, 6.0: 0.2}, {})
-    monkeypatch.setattr(refinement, "descend_fine", lambda query, pose: at(place(pose) + 1.0, 0.9))
-    found = refinement.refine_matches(query, [at(0.0, 0).pose, at(5.0, 0).pose])
+    monkeypatch.setattr(beam, "refine", lambda query, pose, stage: at(place(pose) + 1.0, 0.9))
+    found = beam.refine_matches(query, [at(0.0, 0).pose, at(5.0, 0).pose])
     assert places(found) == [5.0, 1.0]
     assert [h.score for h in found] == pytest.approx([0.6, 0.5])
 
@@ -37,8 +37,8 @@ def done(monkeypatch):
         made.append(("unoccluded", place(pose)))
         return query, at(place(pose), query.cache.comparisons[pose.key].score)
 
-    monkeypatch.setattr(last_descent, "refine_full_resolution", full)
-    monkeypatch.setattr(last_descent, "refine_unoccluded", unoccluded)
+    monkeypatch.setattr(last_descent, "climb_to_full", full)
+    monkeypatch.setattr(last_descent, "climb_unoccluded", unoccluded)
     monkeypatch.setattr(last_descent, "settle", lambda query, h: made.append(("settled", place(h.pose))) or h)
     return made
 
@@ -47,9 +47,7 @@ def test_alternatives_that_come_near_are_refined_and_the_greatest_odds_win(monke
     """By score or by matches; the third explains more of what both show, though its score is less."""
     explains = {0.0: 0.5, 3.0: 0.4, 6.0: 0.6, 9.0: 0.1, 12.0: 0.05}
     query = compared(monkeypatch, explains, {0.0: 20, 3.0: 3, 6.0: 21, 9.0: 11, 12.0: 12})
-    found = refine_to_the_end(
-        query, [at(9.0, 0.1), at(0.0, 0.5), at(6.0, 0.31), at(3.0, 0.4), at(12.0, 0.05)]
-    )
+    found = refine_best(query, [at(9.0, 0.1), at(0.0, 0.5), at(6.0, 0.31), at(3.0, 0.4), at(12.0, 0.05)])
     assert done == [*(("full", x) for x in (0.0, 3.0, 6.0, 12.0)), ("settled", 6.0)]
     assert places([found.best, *found.alternatives]) == [6.0, 0.0, 3.0, 9.0, 12.0]
     assert found.rival_ratio == pytest.approx(0.5 / 0.6)
@@ -65,7 +63,7 @@ def test_of_a_faint_pose_no_alternative_is_refined_unless_it_gains(
     explains = {3.0 * k: best - 0.001 * k for k in range(8)}
     hypotheses = [at(x, score) for x, score in explains.items()]
     query = compared(monkeypatch, explains | {0.0: best + gain}, dict.fromkeys(explains, num_matches))
-    refine_to_the_end(query, hypotheses)
+    refine_best(query, hypotheses)
     assert [name for name, _ in done].count("full") == num_refined
 
 
@@ -80,7 +78,7 @@ def test_of_a_faint_pose_no_alternative_is_refined_unless_it_gains(
 )
 def test_a_pose_without_rivals_is_refined_by_itself(monkeypatch, done, best, num_matches, expected):
     query = compared(monkeypatch, {0.0: best, 9.0: 0.1 * best}, {0.0: num_matches, 9.0: 0})
-    found = refine_to_the_end(query, [at(0.0, best), at(9.0, 0.1 * best)])
+    found = refine_best(query, [at(0.0, best), at(9.0, 0.1 * best)])
     assert done == [(name, 0.0) for name in expected]
     assert places([found.best, *found.alternatives]) == [0.0, 9.0]
 
@@ -109,8 +107,8 @@ def test_whole_views_alone_have_no_matches_and_ratios_are_to_the_best(monkeypatc
     found = selection.assess_poses(query, *poses)
     assert [(s.score, s.num_matches) for s in found] == [(0.5, 20), (0.3, 7)]
     assert [s.ratio for s in found] == pytest.approx([1.0, 0.8])
-    by_views = selection.assess_poses(replace(query, num_parts=0), *poses)
-    assert by_views == [s._replace(num_matches=None) for s in found]
+    by_views = selection.assess_poses(query.by_views(), *poses)
+    assert by_views == [s._replace(num_matches=None, evidence="views") for s in found]
 
 
 def test_of_poses_that_beat_each_other_in_turn_the_one_beaten_least_is_best(monkeypatch):
@@ -179,13 +177,13 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
 
     monkeypatch.setattr(judging, "find_copies", find_copies)
     best, *others = (at(x, 0.0) for x in (0.0, 1.0, 2.0, 3.0))
-    standings = [Standing(1.0, 0.5, n, is_drawn=True) for n in (12, 3, 4, 20)]
-    for is_partial, num_parts, expected in (
-        (True, 2, [20, 20, 4, 20]),
-        (False, 2, [12, 3, 4, 20]),
-        (True, 0, [12, 3, 4, 20]),
+    standings = [Standing(1.0, 0.5, n, "drawn scan") for n in (12, 3, 4, 20)]
+    for evidence, expected in (
+        ("drawn scan", [20, 20, 4, 20]),
+        ("map features", [12, 3, 4, 20]),
+        ("views", [12, 3, 4, 20]),
     ):
-        query = SimpleNamespace(photo=SimpleNamespace(is_partial=is_partial), num_parts=num_parts)
+        query = replace(QUERY, evidence=evidence)
         found = judging.credit_copies(standings, judging.list_copies(query, best, others))
         assert [s.num_matches for s in found] == expected
     assert asked == [0.0]
@@ -196,7 +194,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
     explains = {0.0: 0.6, 1.0: 0.5, 2.0: 0.4}
     around = SimpleNamespace(surroundings=lambda place, scale: "points" if scale < 0.01 else "coarse points")
     query = compared(monkeypatch, explains, counts)
-    photo = SimpleNamespace(given=None, panorama=None, colors=lambda: None, is_partial=False)
+    photo = SimpleNamespace(panorama=None, is_partial=False)
     query = replace(query, photo=photo, cache=replace(query.cache, views=around))
     query.scan_map.R_map_from_world = np.eye(3)
     for name, value in {

@@ -174,7 +174,7 @@ def test_a_photo_is_found_by_shape(gravity, R):
     assert distance < 0.1
     assert angle_deg < 4.0
     assert found.evidence.num_matches is None
-    assert all(standing.kind == "shape alone" for standing in found.standings)
+    assert all(standing.evidence == "shape" for standing in found.standings)
 
 
 def test_intensity_is_a_channel_of_its_own():
@@ -200,12 +200,8 @@ def test_the_true_rotation_is_one_of_four_by_lines_and_walls(R):
     tried = align_lines(_shape_map().yaw_of_walls, axes, R)
     assert tried.shape == (4, 3, 3)
     assert np.degrees(min(angle_between(one, true) for one in tried)) < 1.0
-    assert align_lines(_shape_map().yaw_of_walls, axes, exp_so3(np.array([0.5, 0.0, 0.0])) @ R).shape == (
-        0,
-        3,
-        3,
-    )
-    assert align_lines(_shape_map().yaw_of_walls, [], R).shape == (0, 3, 3)
+    assert align_lines(_shape_map().yaw_of_walls, axes, exp_so3(np.array([0.5, 0.0, 0.0])) @ R) is None
+    assert align_lines(_shape_map().yaw_of_walls, [], R) is None
 
 
 def test_softer_images_are_whole_across_the_seam():

@@ -98,7 +98,7 @@ def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
 def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
     matches = match_beside(_query(), place_keypoints(_query(), _true_pose()))
-    assert len(matches.query) < 0.2 * len(_query().seen().keypoints.rays)
+    assert len(matches.query) < 0.2 * len(_query().photo.seen().keypoints.rays)
     assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
 
 
@@ -106,7 +106,7 @@ def test_a_mirrored_photo_has_no_matches_beside():
     """It has some without that rule, as many things are symmetric."""
     taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
     mirrored = prepare_query(taken, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    assert len(match_pictures(mirrored.seen().keypoints, _beside().keypoints)[0]) > 0
+    assert len(match_pictures(mirrored.photo.seen().keypoints, _beside().keypoints)[0]) > 0
     assert match_beside(mirrored, _beside()) is NO_MATCHES
 
 
@@ -151,7 +151,7 @@ def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     given = Panorama(rgb, panorama.is_valid)
     occluded = prepare_query(given, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
     for asked, least, most in ((query, 0.5, 1.0), (occluded, 0.0, 0.1)):
-        seen = asked.seen().keypoints.rays
+        seen = asked.photo.seen().keypoints.rays
         kept = place_keypoints(asked, _true_pose()).keypoints.rays
         num_seen, num_kept = (hidden[compute_indices(rays, WIDTH)].sum() for rays in (seen, kept))
         assert num_seen > 10
@@ -209,7 +209,7 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid(monkeypatch):
     assert matches_near(query, Pose(middle.R_cam_from_world, middle.center_world + 0.6 * PLACE)) == 2
     turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * TURN, 0.0]))
     assert matches_near(query, Pose(turned, middle.center_world)) == 3
-    masked = query.mask_pixels(np.zeros((8, 16), bool))
+    masked = query.mask(np.zeros((8, 16), bool))
     assert matches_near(masked, middle) == 4
     assert matches_near(query, middle) == 1
 
@@ -262,7 +262,7 @@ def test_whole_photos_and_whole_views_alone_are_not_drawn(monkeypatch):
     panorama = rooms.scene(1)[1]
     whole = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
     assert count_agreeing(whole, _true_pose()) == count_matches(whole.matches, _true_pose()) > 20
-    assert count_agreeing(replace(_query(), num_parts=0), _true_pose()) == 0
+    assert count_agreeing(_query().by_views(), _true_pose()) == 0
 
 
 def _keypoints(rays, descriptors):

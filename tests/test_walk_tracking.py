@@ -10,13 +10,14 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
-from piccolo.localization import near, refinement, verification
+from piccolo.localization import ladder, near, verification
 from piccolo.localization.attempts import CHANCE_MATCHES
-from piccolo.localization.brief import brief_query, score_briefly, score_mirror
-from piccolo.localization.comparison import score_pose
+from piccolo.localization.beam import brief_query, score_briefly, score_mirror
+from piccolo.localization.comparison import Comparison, score_pose
 from piccolo.localization.near import Near
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
@@ -51,10 +52,8 @@ def _narrow(query):
 def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
     query, true = seen
     asked = []
-    perturb = refinement.perturb_middle
-    monkeypatch.setattr(
-        refinement, "perturb_middle", lambda query, pose: asked.append(pose) or perturb(query, pose)
-    )
+    perturb = ladder.descend_around
+    monkeypatch.setattr(ladder, "descend_around", lambda *how: asked.append(how) or perturb(*how))
     end = track(query, true)
     assert pose_errors(end.pose, true)[0] < 0.02
     assert end.log_odds > 4.0
@@ -62,7 +61,7 @@ def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
     far = track(query, _off(true, 0.6, 20.0))
     assert pose_errors(far.pose, true)[0] < 0.02
     assert track(query, _off(true, 2.0, 90.0)) is None
-    assert 3 < len(asked) <= 1 + 2 * refinement.MAX_PERTURBATIONS
+    assert 3 < len(asked) <= 1 + 2 * ladder.MAX_PERTURBATIONS
 
 
 def test_a_camera_is_expected_by_its_motion_before_or_by_an_odometry(seen):
@@ -200,7 +199,7 @@ def test_a_narrow_photo_is_tracked_again_from_where_its_matches_are(seen, monkey
         starts.append(start)
         return start, start
 
-    monkeypatch.setattr(near, "refine_on_middle_cells", stay)
+    monkeypatch.setattr(near, "climb_from_afar", stay)
     end = tracker.track(taken, _off(true, 0.25, 4.0))
     assert pose_errors(starts[1], true)[0] < 0.1
     assert pose_errors(end.pose, true)[0] < 0.05
@@ -218,7 +217,7 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
         assert elsewhere.num_matches == 0
     assert log_odds(here) > log_odds(elsewhere)
     assert near.assess_end(seen[0], Hypothesis(true, 0.5)).num_matches is None
-    assert near.assess_end(replace(taken, num_parts=0), Hypothesis(true, 0.5)).num_matches is None
+    assert near.assess_end(taken.by_views(), Hypothesis(true, 0.5)).num_matches is None
 
 
 @pytest.mark.parametrize(
@@ -227,7 +226,10 @@ def test_matches_that_put_a_narrow_photo_elsewhere_count_as_none(seen):
 def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, odds, score, is_found):
     query, true = seen
     probability = 1.0 / (1.0 + np.exp(-odds))
-    monkeypatch.setattr(tracker, "refine_near", lambda query, start: Near(start, score, None, probability))
+    seen_there = Comparison(np.array([CHANCE + (1.0 - CHANCE) * score]), np.ones(1), np.ones(1), 1.0)
+    monkeypatch.setattr(
+        tracker, "refine_near", lambda query, start: Near(start, seen_there, None, probability)
+    )
     assert (track(query, true) is not None) == is_found
 
 
@@ -235,7 +237,7 @@ def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, 
 def follower(seen):
     """A tracker with some frames, all with the same narrow photo; and the numbers whose pictures are read."""
     query = seen[0]
-    taken = _narrow(query).photo.given
+    taken = _narrow(query).given
     asked = []
     follower = tracker.Tracker(query.scan_map, query.settings, Workers(2), Motion())
     odds = (4.0, 4.0, 4.0, tracker.MOST_EXPECTED, 4.0, 2.9)
@@ -285,9 +287,9 @@ def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
     taken = _narrow(query)
     here = Hypothesis(true, 0.5)
     alone = near.assess_end(taken, here).num_matches
-    more = taken.seen().keypoints.take(np.arange(2 * alone))
+    more = taken.photo.seen().keypoints.take(np.arange(2 * alone))
     located = verification.Located(more, np.full(2 * alone, 2.0, np.float32), true)
-    others = verification.match_located(taken.seen().keypoints, located)
+    others = verification.match_located(taken.photo.seen().keypoints, located)
     assert near.assess_end(replace(taken, beside=(others,)), here).num_matches > alone
     away = others._replace(points=others.points + np.float32(0.5))
     assert near.assess_end(replace(taken, beside=(away,)), here).num_matches == alone

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,9 @@ LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
 MIN_CONFIDENCE = 0.9
+# what a photo is compared with: the scan's shape or its coloured views, and beside these its local features
+# with those of the map or of the scan drawn at the pose
+EvidenceKind = Literal["shape", "views", "map features", "drawn scan"]
 
 
 class Standing(NamedTuple):
@@ -21,19 +24,9 @@ class Standing(NamedTuple):
 
     ratio: float  # what it explains, divided by what the best pose does, over what both views show
     score: float  # [0, 1] what the photo's blocks explain beyond chance
-    num_matches: int | None  # local features that agree with it; None: whole views alone were compared
+    num_matches: int | None  # local features that agree with it; None of whole views alone
+    evidence: EvidenceKind
     log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
-    is_drawn: bool = False  # the matches are with the scan drawn at the pose, else with the map's features
-    is_shape: bool = False  # edges were compared in place of colours
-
-    @property
-    def kind(self) -> str:
-        """Key in MODELS: what the photo was compared with."""
-        if self.is_shape:
-            return "shape alone"
-        if self.num_matches is None:
-            return "whole views alone"
-        return "scan drawn at the pose" if self.is_drawn else "features of the map"
 
 
 class ChoiceModel(NamedTuple):
@@ -53,11 +46,11 @@ NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at m
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
-MODELS = {
-    "shape alone": ChoiceModel((7.82, 6.89), (-10.78, 2.92)),
-    "whole views alone": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
-    "features of the map": ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82)),
-    "scan drawn at the pose": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),
+MODELS: dict[EvidenceKind, ChoiceModel] = {
+    "shape": ChoiceModel((7.82, 6.89), (-10.78, 2.92)),
+    "views": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
+    "map features": ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82)),
+    "drawn scan": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),
 }
 
 
@@ -72,7 +65,7 @@ def pose_features(standing: Standing) -> Array:
 
 def log_odds(standing: Standing, model: ChoiceModel | None = None) -> float:
     """Return the logarithm of a pose's odds, up to a constant; by default with the model of its evidence."""
-    model = model or MODELS[standing.kind]
+    model = model or MODELS[standing.evidence]
     return float(pose_features(standing) @ np.array(model.weights)) + standing.log_prior
 
 
@@ -97,7 +90,7 @@ def posterior(
     Calibrated for queries of which half were taken in the scan. None is more likely if the best pose's
     deviation makes 0.1 m doubtful.
     """
-    model = model or MODELS[standings[0].kind]
+    model = model or MODELS[standings[0].evidence]
     logits = [log_odds(standing, model) for standing in standings]
     of_none = none_features(std if std_of_fit is None else std_of_fit)
     logits.append(float(of_none @ np.array(model.none_weights)))

@@ -18,11 +18,10 @@ from ..local_features.hypotheses import count_matches, propose_poses
 from ..prior import NOTHING_KNOWN
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
-from .brief import brief_query, score_mirror, score_starts
+from .beam import brief_query, refine_matches, refine_starts, score_mirror, score_starts
 from .comparison import score_pose
 from .prior import contradictions
 from .query import Query
-from .refinement import refine, refine_matches
 from .search import SearchedGravity, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
@@ -37,38 +36,38 @@ ENOUGH_MATCHES = 40  # of a part of the features: the others are not asked
 CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
 NUM_MATCHED = 6  # poses from matches that are refined
 
-Found = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
+Poses = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
 # one search with its refinement, which adds to the known hypotheses
-Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Found]
+Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Poses]
 
 
-def plan_attempts(query: Query) -> list[tuple[int, Attempt]]:
-    """Return the searches for a photo in order, each with the parts of the features that it matches.
+def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
+    """Return the searches for a photo in order, each with the query of the evidence that it uses.
 
-    A first look by whole views (0 parts) may settle a whole upright sphere. Then come poses from feature
-    matches, first of a part of the views, then of all, and at last searches by whole views: with gravity
-    `auto` as known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly
-    taken about level: unless their tilt is known exactly, this is what is searched as known.
+    A first look by whole views may settle a whole upright sphere. Then come poses from feature matches,
+    first of a part of the views, then of all, and at last searches by whole views: with gravity `auto` as
+    known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly taken
+    about level: unless their tilt is known exactly, this is what is searched as known.
     """
     method = query.method
-    num_parts = len(query.features)
     looks_first = method.uses_features and method.uses_search and is_whole(query)
-    attempts: list[tuple[int, Attempt]] = [(0, look_first)] if looks_first else []
-    if len(query.rotations):
-        attempts.append((0, look_along_walls))
+    attempts: list[tuple[Query, Attempt]] = [(query.by_views(), look_first)] if looks_first else []
+    if query.rotations is not None:
+        attempts.append((query, look_along_walls))
     if method.uses_features:
-        attempts += [(k + 1, search_matches) for k in range(num_parts)]
+        parts = (query.features[:k] for k in range(1, len(query.features)))
+        attempts += [(replace(query, features=part), search_part) for part in parts]
+        attempts.append((query, search_matches))
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
         upright: SearchedGravity = "level" if is_partial and not query.photo.has_tilt else "known"
-        attempts.append((num_parts, partial(search_views, gravity=upright)))
+        attempts.append((query, partial(search_views, gravity=upright)))
     if method.uses_search and query.settings.gravity != "known":
-        with_any_tilt = partial(search_views, gravity="unknown", is_brief=looks_first)
-        attempts.append((num_parts, with_any_tilt))
+        attempts.append((query, partial(search_views, gravity="unknown", is_brief=looks_first)))
     return attempts
 
 
-def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
+def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
     first = brief_query(query)
     of_mirror = Once(partial(score_mirror, query))
@@ -76,32 +75,41 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found
         with watch.stage("search"):
             starts = search_poses(first, "known")
         with watch.stage("refine"):
-            found = known + refine(first, starts, FIRST_BEAM)
+            found = known + refine_starts(first, starts, FIRST_BEAM)
             return found, is_clear(query, found) and score_starts(first, starts) >= MIRROR_RATIO * of_mirror()
 
 
-def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
+def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Search the few rotations of a photo whose lines lie along walls; True if one pose alone is clear."""
     with watch.stage("search"):
         starts = search_poses(query, "known")
     with watch.stage("refine"):
-        found = known + refine(query, starts, FIRST_BEAM)
+        found = known + refine_starts(query, starts, FIRST_BEAM)
         return found, is_clear(query, found)
 
 
-def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Found:
-    """Refine the poses that feature matches vote for; True if the result is sure.
-
-    Poses from a part of the features are dropped unless they are sure: all features find better ones.
-    """
+def search_part(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+    """Search by a part of the features; its poses are dropped unless they are sure: all find better ones."""
     with watch.stage("match"):
         poses = match_poses(query)
-        is_part = query.num_parts < len(query.features)
-        if is_part and (not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES):
-            return known, False
+    if not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES:
+        return known, False
+    found, is_enough = refine_matched(query, poses, known, watch)
+    return found if is_enough else known, is_enough
+
+
+def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+    """Refine the poses that feature matches vote for; True if the result is sure."""
+    with watch.stage("match"):
+        poses = match_poses(query)
+    return refine_matched(query, poses, known, watch)
+
+
+def refine_matched(query: Query, poses: list[Pose], known: list[Hypothesis], watch: Stopwatch) -> Poses:
+    """Add poses from matches, refined; True if the best is sure."""
+    with watch.stage("match"):
         found = known + add_verified(query, refine_matches(query, poses))
-        is_enough = is_sure(query, found)
-        return known if is_part and not is_enough else found, is_enough
+        return found, is_sure(query, found)
 
 
 def search_views(
@@ -110,13 +118,13 @@ def search_views(
     watch: Stopwatch,
     gravity: SearchedGravity,
     is_brief: bool = False,
-) -> Found:
+) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
     asked = tilt_query(query) if is_brief else query
     with watch.stage("search"):
         starts = search_poses(asked, gravity)
     with watch.stage("refine"):
-        found = refine(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
+        found = refine_starts(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         found = known + add_verified(query, found)
         return found, is_sure(query, found)
 
@@ -142,7 +150,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
     with watch.stage("search"):
         starts = search_poses(anywhere, "known")
     with watch.stage("refine"):
-        return refine(anywhere, starts, FIRST_BEAM)
+        return refine_starts(anywhere, starts, FIRST_BEAM)
 
 
 def match_poses(query: Query) -> list[Pose]:

@@ -25,7 +25,8 @@ from .attempts import add_verified
 from .comparison import score_pose
 from .covariance import split_errors
 from .judge import judge, reconsider, take_pose
-from .localize import Found, finish
+from .last_descent import refine_best
+from .localize import Found, fit_camera
 from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
 from .selection import SURE_MATCHES
@@ -91,7 +92,7 @@ def localize_beside(
     allowed_map = apply_prior(scan_map, settings.prior)
     with watch.stage("match"):
         query = prepare_query(panorama, allowed_map, settings, workers)
-        is_asked = query.photo.is_partial and query.num_parts > 0 and len(allowed_map.sparse) > 0
+        is_asked = query.evidence == "drawn scan" and len(allowed_map.sparse) > 0
         found = find_beside(query, pictures) if is_asked else []
     if not found:
         return Localization(), ()
@@ -99,8 +100,8 @@ def localize_beside(
         query = replace(query, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
         hypotheses = add_verified(query, [score_pose(query, pose) for pose in poses])
-        ended = finish(query, hypotheses)
-        judged = judge(*ended)
+        ended = fit_camera(query, refine_best(query, hypotheses))
+        judged = judge(ended.query, ended.selection, ended.fit)
         kept = list_agreeing(judged, found, ended.query.beside, scan_map)
         if not kept:
             return Localization(), ()

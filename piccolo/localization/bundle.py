@@ -45,7 +45,7 @@ from .bundle_search import (
 from .comparison import score_pose
 from .focal_length import FocalFit, calibrate
 from .judge import judge, judge_together
-from .localize import find_pose
+from .localize import find, find_by_edges, prepare_search
 from .query import Query
 from .selection import Selection
 from .settings import CoarseToFineSettings
@@ -88,10 +88,14 @@ def localize_bundle(
     alone: list[Localization] = []
     members: dict[int, Member] = {}
     for k, panorama in enumerate(panoramas):
-        found = find_pose(scan_map, panorama, settings, workers, watch)
-        alone.append(found if isinstance(found, Localization) else judge(*found, may_change=False))
-        if not isinstance(found, Localization) and alone[k].pose is not None:
-            query, selection, fit = found
+        query = prepare_search(scan_map, panorama, settings, workers)
+        if isinstance(query, Localization):
+            alone.append(query)
+            continue
+        search = find_by_edges if query.evidence == "shape" else find
+        query, selection, fit = search(query, scan_map, watch)
+        alone.append(judge(query, selection, fit, may_change=False))
+        if alone[k].pose is not None:
             members[k] = Member(query.forget(), selection, fit, alone[k], cams_from_bundle[k])
     with watch.stage("refine"):
         together = judge_members(members, errors)

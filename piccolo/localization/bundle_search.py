@@ -14,12 +14,12 @@ from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose, angle_between, log_so3
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
-from .comparison import score_pose
+from .comparison import compare, score_pose
 from .covariance import estimate_covariance
 from .focal_length import FocalFit
+from .ladder import FINE, refine
 from .last_descent import HOPELESS_SCORE
 from .query import Query
-from .refinement import descend_fine
 from .selection import Selection, assess_poses
 from .verification import verify
 
@@ -170,13 +170,13 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     expected = bundle.place(member.cam_from_bundle)
     poses = [own for own, _ in member.own_poses]
     own = next((h for h in poses if is_same(h.pose, expected)), None)
-    found = own or max(refine_near(query, expected), key=lambda h: h.score)
+    found = own or max(list_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
     gaussian = member.alone.gaussian
     std_of_fit = member.alone.std_of_fit
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
-        errors = estimate_covariance(query, found.pose)
+        errors = estimate_covariance(query, found.pose, compare(query, found.pose))
         gaussian, std_of_fit = errors or (None, None)
         if gaussian is not None and member.fit is not None:
             gaussian = gaussian.widen(member.fit.pose_covariance)
@@ -188,9 +188,9 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     return Support(found, gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places)
 
 
-def refine_near(query: Query, expected: Pose) -> list[Hypothesis]:
+def list_near(query: Query, expected: Pose) -> list[Hypothesis]:
     """Return a photo's poses near the one expected: by whole views, by matches, and that itself."""
-    poses = [descend_fine(query, expected).pose]
+    poses = [refine(query, expected, FINE).pose]
     if query.photo.is_partial:
         poses.append(verify(query, expected).pose)
     near = [pose for pose in poses if is_same(pose, expected)]

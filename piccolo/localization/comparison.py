@@ -53,6 +53,11 @@ class Comparison(NamedTuple):
         beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
+    @property
+    def contradicts(self) -> NDArray[np.bool_]:
+        """Mask (blocks,) of those that contradict the scan: an occluder, or the wrong pose."""
+        return (self.correlation < CONTRADICTS) & (self.visible_area > 0.0)
+
     def compute_ratio(self, other: "Comparison") -> float:
         """Return the ratio of the area explained by this pose to another's, over blocks that both views show.
 
@@ -194,57 +199,59 @@ def compare_cells(
                     kept[i] = F0
 
 
-def compare(query: Query, pose: Pose, seen_from: Pose | None = None) -> Comparison:
-    """Compare the scan as seen from a pose with the photo, by blocks; cached by the pose.
-
-    `seen_from` is a pose so near that it sees the same, and whose view is known; the first one holds.
-    """
-    kept = query.cache.comparisons
+def compare(query: Query, pose: Pose) -> Comparison:
+    """Compare the scan at a pose with the photo, by blocks; kept with the query."""
+    kept: dict[bytes, Comparison] = query.cache.comparisons
     if pose.key not in kept:
-        config = query.method.fine_view
-        view = config.arrays
-        place = round_position(seen_from or pose)
-        sums = query.cache.views.averages(place, config)
-        offsets, colors, weights, center = empty_cells(len(sums), place)
-        moments = np.empty((view.num_stats, 8), np.float32)
-        average_colors(sums, view, np.ones(len(sums), np.bool_), offsets, colors, weights, moments)
-        photo = query.photo.small
-        grid = make_grid(BLOCK_RINGS)
-        by_block = np.empty((3, NUM_BLOCKS))
-        compare_cells(
-            offsets,
-            colors,
-            weights,
-            photo,
-            pose.R_cam_from_world,
-            pose.center_world - center,
-            view,
-            grid.num_columns,
-            grid.first,
-            by_block[0],
-            by_block[1],
-            by_block[2],
-        )
-        kept[pose.key] = Comparison(by_block[0], by_block[1], by_block[2], photo.valid_share)
-    comparison: Comparison = kept[pose.key]
-    return comparison
+        kept[pose.key] = compare_from(query, pose, pose)
+    return kept[pose.key]
 
 
-def score_pose(query: Query, pose: Pose, seen_from: Pose | None = None) -> Hypothesis:
-    """Score a pose by comparing the scan with the photo, as for selection; `seen_from` as in `compare`."""
-    return Hypothesis(pose, compare(query, pose, seen_from).score)
+def compare_from(query: Query, pose: Pose, seen_from: Pose) -> Comparison:
+    """Compare the scan at a pose with the photo, by blocks.
+
+    `seen_from` is a pose so near that it sees the same, whose view may be known.
+    """
+    config = query.method.fine_view
+    view = config.arrays
+    place = round_position(seen_from)
+    sums = query.cache.views.averages(place, config)
+    offsets, colors, weights, center = empty_cells(len(sums), place)
+    moments = np.empty((view.num_stats, 8), np.float32)
+    average_colors(sums, view, np.ones(len(sums), np.bool_), offsets, colors, weights, moments)
+    photo = query.photo.small
+    grid = make_grid(BLOCK_RINGS)
+    by_block = np.empty((3, NUM_BLOCKS))
+    compare_cells(
+        offsets,
+        colors,
+        weights,
+        photo,
+        pose.R_cam_from_world,
+        pose.center_world - center,
+        view,
+        grid.num_columns,
+        grid.first,
+        by_block[0],
+        by_block[1],
+        by_block[2],
+    )
+    return Comparison(by_block[0], by_block[1], by_block[2], photo.valid_share)
 
 
-def mask_occluders(query: Query, pose: Pose) -> Query:
+def score_pose(query: Query, pose: Pose) -> Hypothesis:
+    """Score a pose by comparing the scan with the photo, as for selection."""
+    return Hypothesis(pose, compare(query, pose).score)
+
+
+def mask_occluders(query: Query, seen: Comparison) -> Query:
     """Mask the photo's blocks that contradict the scan at a pose; the query itself if there are none."""
-    seen = compare(query, pose)
-    contradicts = (seen.correlation < CONTRADICTS) & (seen.visible_area > 0.0)
-    if not contradicts.any():
+    if not seen.contradicts.any():
         return query
-    key = contradicts.tobytes()
-    if key not in query.cache.unoccluded:
-        query.cache.unoccluded[key] = query.mask_pixels(contradicts[pixel_blocks()])
-    return query.cache.unoccluded[key]
+    key = seen.contradicts.tobytes()
+    if key not in query.cache.masked:
+        query.cache.masked[key] = query.mask(seen.contradicts[pixel_blocks()])
+    return query.cache.masked[key]
 
 
 @lru_cache(maxsize=1)

@@ -17,9 +17,10 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
-from .comparison import mask_occluders
+from .comparison import Comparison, mask_occluders
+from .ladder import LAST, to_levels
 from .query import Query
-from .refinement import FULL_LOSS, to_levels
+from .settings import ImageName
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
@@ -33,7 +34,7 @@ SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's a
 SHAPE_MOVE = 0.01  # [m]
 TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
 ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common with other photos
-SCALE = FULL_LOSS * LEVELS_PER_UNIT
+SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
 MOST_SCORE = 3.0  # of halves, 1 in the mean; of photos without a seam one in four has more, by nine planes
@@ -49,26 +50,26 @@ class Errors(NamedTuple):
 
 
 class DifferenceSteps(NamedTuple):
-    """Image scale and steps with which the loss is differentiated for a covariance."""
+    """Image and steps with which the loss is differentiated for a covariance."""
 
-    scale: int  # of the photo's images: 0 the finest
+    image: ImageName  # of the photo
     turn: float  # step of the differences [rad]
     move: float  # [m]
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
 STEPS = (
-    DifferenceSteps(0, math.radians(0.1), 0.005, 1.1),
-    DifferenceSteps(1, math.radians(0.3), 0.015, 0.36),
+    DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
+    DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
 )
 # of dark, noisy photos; they are too few to calibrate
-ROUGH_STEPS = DifferenceSteps(2, math.radians(0.3), 0.015, 1.0)
+ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0)
 # of edges, whose poses have larger errors
 SHAPE_STEPS = (
-    DifferenceSteps(0, math.radians(0.5), 0.03, 1.0),
-    DifferenceSteps(1, math.radians(0.5), 0.03, 1.0),
+    DifferenceSteps("full", math.radians(0.5), 0.03, 1.0),
+    DifferenceSteps("fine", math.radians(0.5), 0.03, 1.0),
 )
-ROUGH_SHAPE_STEPS = DifferenceSteps(1, math.radians(0.8), 0.05, 1.0)
+ROUGH_SHAPE_STEPS = DifferenceSteps("fine", math.radians(0.8), 0.05, 1.0)
 
 
 @kernel
@@ -141,9 +142,8 @@ def sum_by_block(problem: ChannelProblem, pose: Pose, begins: NDArray[np.int64])
     return sums
 
 
-def block_gradients(problem: ChannelProblem, pose: Pose, begins: NDArray[np.int64]) -> Array:
-    """Return jackknife gradients (B, 6), in the camera's frame, of the blocks around it."""
-    sums = sum_by_block(problem, pose, begins)
+def block_gradients(sums: Array) -> Array:
+    """Return jackknife gradients (B, 6), in the camera's frame, from the sums (B, 29) of blocks."""
     shown = sums[sums[:, GRADIENT:MATRIX].any(axis=1)]  # of what the photo shows
     return jackknife_gradients(shown[:, GRADIENT:MATRIX], fill_symmetric(shown[:, MATRIX:]))
 
@@ -242,7 +242,7 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
     is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
-    images = shown.photo.images.fine(), shown.photo.images.full()
+    images = shown.photo.image("fine"), shown.photo.image("full")
     scores = score_halves(sum_by_block(make_problem(points, images[-1]), pose, begins), is_ahead)
 
     def separate(k: int) -> tuple[float, Array]:
@@ -268,9 +268,9 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     points, begins = sort_by_block(points)
 
     def by(steps: DifferenceSteps) -> Array | None:
-        problem = make_problem(points, shown.photo.images[steps.scale]())
+        problem = make_problem(points, shown.photo.image(steps.image))
         hessian = compute_hessian(problem, pose, steps)
-        gradients = block_gradients(problem, pose, begins)
+        gradients = block_gradients(sum_by_block(problem, pose, begins))
         covariance = sandwich_covariance(hessian, gradients)
         if covariance is None:
             return None
@@ -308,35 +308,38 @@ def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
 
 def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
-    median_range = float(np.median(np.linalg.norm(query.points_at(pose).offsets, axis=0)))
+    median_range = float(np.median(np.linalg.norm(query.view_at(pose, "points").offsets, axis=0)))
     common = scan_covariance(query.scan_map, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
 
-def estimate_covariance(query: Query, pose: Pose, seen_from: Pose | None = None) -> Errors | None:
+def estimate_covariance(
+    query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None
+) -> Errors | None:
     """Estimate the covariance of a pose in the map; None where the points do not fix it.
 
     Photos have the errors of the scan in common, and of a scan without colours all errors: edges lie beside
-    those of the photos in the same way. `seen_from` is a pose so near that it sees the same points; of a
-    whole photo those behind occluders are then left out, which takes less time than to normalise a masked
-    photo.
+    those of the photos in the same way. `seen` is the comparison at the pose, `seen_from` a pose so near that
+    it sees the same points; of a whole photo those behind occluders are then left out, which takes less time
+    than to normalise a masked photo.
     """
-    shown = mask_occluders(query, pose)
-    seen = shown.points_at(pose) if seen_from is None else query.points_at(seen_from)
-    points = remove_poles(seen.around(pose.center_world), pose)
     is_partial = query.photo.is_partial
-    if seen_from is not None and shown is not query and not is_partial:
-        points = remove_hidden(points, shown.photo.panorama.is_valid, pose)
-        shown = query
+    masked = mask_occluders(query, seen)
+    leaves_out = seen_from is not None and not is_partial
+    points = masked.view_at(pose, "points") if seen_from is None else query.view_at(seen_from, "points")
+    points = remove_poles(points.around(pose.center_world), pose)
+    if leaves_out and seen.contradicts.any():
+        points = remove_hidden(points, masked.photo.panorama.is_valid, pose)
+    shown = query if leaves_out else masked
     covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return None
     turned = pose.R_cam_from_world.T  # R_map_from_cam
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
-    prior = query.photo.given.focal_prior
+    prior = query.given.focal_prior
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
-    turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.photo.pixel
+    turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.pixel
     own = turn_positions(covariance, turned) + photo_covariance(turn, median_range)
     common = scan_covariance(query.scan_map, median_range)
     if query.scan_map.has_shape:

@@ -29,11 +29,12 @@ from ..optimize.channel_loss import ChannelProblem
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
 from ..views.view import Cells
-from .comparison import mask_occluders, score_pose
+from .comparison import compare, mask_occluders, score_pose
 from .covariance import SCALE, remove_poles, sort_by_block, sum_by_block
-from .last_descent import refine_to_the_end
-from .query import Features, Query, make_images, prepare_query
-from .refinement import FINE_LOSS, FULL_LOSS, Limits, descend, to_levels
+from .ladder import FINE, LAST, descend, to_levels
+from .last_descent import refine_best
+from .photo import make_images
+from .query import Features, Query, prepare_query
 from .selection import Selection
 from .verification import matches_near
 
@@ -65,8 +66,7 @@ AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 5  # [px] within the picture's edge that no point may come near
-NEARBY = Limits(FINE_LOSS, 12, 1e-4)
-CLOSE = Limits(FULL_LOSS, 30, 1e-6)
+CLOSE = LAST.limits._replace(tolerance=1e-6)
 
 
 class FocalFit(NamedTuple):
@@ -132,8 +132,8 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
 
     Later fits (`is_first` false) begin from a focal length that is roughly known too.
     """
-    prior = query.photo.given.focal_prior
-    camera = query.photo.given.cameras[0].camera
+    prior = query.given.focal_prior
+    camera = query.given.cameras[0].camera
     assert prior is not None
     names = MODELS[camera.model][1]
     num = 2 if prior.deviation > WIDE and RADIAL in names else 1
@@ -226,8 +226,8 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
 
     Return the losses (K, B) of each block of the sphere at the ends, and the ends.
     """
-    given = query.photo.given
-    shown = mask_occluders(query, pose)
+    given = query.given
+    shown = mask_occluders(query, compare(query, pose))
     whole = query.photo.panorama
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
@@ -236,8 +236,8 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
         return replace(found, is_valid=found.is_valid & is_left)
 
     narrowest = retake(changes.max(axis=0)).is_valid
-    points = mask_edge(shown.points_at(pose), pose, narrowest)
-    fine = shown.view_at(pose, query.method.fine_view)
+    points = mask_edge(shown.view_at(pose, "points"), pose, narrowest)
+    fine = shown.view_at(pose, "fine")
     around, begins = sort_by_block(remove_poles(points.around(pose.center_world), pose))
     levels = to_levels(around.channels)
     middle = changes.mean(axis=0)
@@ -246,7 +246,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
         images = make_images(retake(change), query.method.scales)
         full = images.full()
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
-        near = pose if is_near else descend(fine, images.fine(), pose, NEARBY)
+        near = pose if is_near else descend(fine, images.fine(), pose, FINE.limits)
         end = descend(points, full, near, CLOSE)
         offsets = around.around(end.center_world).offsets
         problem = ChannelProblem(offsets, levels, around.weights, full.rgbx, full.width, SCALE)
@@ -320,7 +320,7 @@ def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tu
     query = recalibrate(query, change)
     poses = [best, *(h.pose for h in found.alternatives)]
     moved = query.workers.map(partial(score_pose, query), poses, "compare")
-    return query, refine_to_the_end(query, moved)
+    return query, refine_best(query, moved)
 
 
 def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection]:
@@ -337,8 +337,8 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
 
     Return the change of the focal length's logarithm, its information (0 if few matches agree), and the pose.
     """
-    matches = matches_near(query, pose) if query.num_parts else NO_MATCHES
-    before = query.photo.given.cameras[0]
+    matches = matches_near(query, pose) if query.uses_matches else NO_MATCHES
+    before = query.given.cameras[0]
 
     def move(delta: Array) -> Pose:
         return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:6])
@@ -369,14 +369,15 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
 
 def recalibrate(query: Query, change: Array) -> Query:
     """Prepare the query again with another calibration; its matches stay, and their rays follow."""
-    given = query.photo.given
+    given = query.given
     before = given.cameras[0]
     after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
     features = tuple(Once(partial(_turn_features, part, before, after)) for part in query.features)
     beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in query.beside)
-    return replace(fresh, features=features, num_parts=query.num_parts, beside=beside)
+    found = replace(fresh, features=features, beside=beside)
+    return found if query.uses_matches else found.by_views()
 
 
 def _turn_features(part: Once[Features], before: Mount, after: Mount) -> Features:

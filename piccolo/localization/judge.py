@@ -8,7 +8,6 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple
 
@@ -29,13 +28,13 @@ from ..optimize.sampling_loss import sampling_loss
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
-from .brief import mirror_query
+from .beam import refine_matches
+from .comparison import compare
 from .covariance import estimate_covariance
 from .focal_length import FocalFit, fit_focal
-from .last_descent import settle
+from .ladder import settle
 from .prior import contradictions
 from .query import Query
-from .refinement import refine_matches
 from .selection import Selection, assess_poses
 from .verification import count_agreeing, find_copies
 
@@ -124,8 +123,8 @@ def conclude(
         alternatives=tuple(alternatives),
         covariance=describe_errors(gaussian, scan_map.R_map_from_world.T),
         warnings=warnings,
-        cameras=() if fit is None else query.photo.given.cameras,
-        focal_length=None if fit is None else fit.focal_length(query.photo.given),
+        cameras=() if fit is None else query.given.cameras,
+        focal_length=None if fit is None else fit.focal_length(query.given),
         is_ruled_out=bool(warnings) or (fit is not None and fit.conflict > MOST_CONFLICT),
         gaussian=gaussian,
         std_of_fit=measured.std_of_fit,
@@ -134,7 +133,7 @@ def conclude(
     decided = decide(described, probabilities, least)
     if fit is None or decided.status == LOCALIZED:
         return decided
-    return replace(decided, warnings=warnings + explain_doubts(query.photo.given, fit))
+    return replace(decided, warnings=warnings + explain_doubts(query.given, fit))
 
 
 def decide(found: Localization, probabilities: Array, min_confidence: float) -> Localization:
@@ -203,11 +202,11 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     points, coarse = query.surroundings_at(pose)
     if settings.solver != "gauss-newton":
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
-        pose = refine(points, make_sampling_loss(query.photo.colors()), pose, descent).pose
+        pose = refine(points, make_sampling_loss(query.colors()), pose, descent).pose
     measures: list[Callable[[], Any]] = [
-        partial(estimate_covariance, query, pose),  # takes longest
-        lambda: compare_occlusion(points, query.photo.given, pose).fractions(),
-        lambda: sampling_loss(visible_points(points, pose.center_world), query.photo.colors(), pose),
+        lambda: estimate_covariance(query, pose, compare(query, pose)),  # takes longest
+        lambda: compare_occlusion(points, query.given, pose).fractions(),
+        lambda: sampling_loss(visible_points(points, pose.center_world), query.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),
     ]
     errors, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
@@ -221,7 +220,7 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
 
 def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:
     """Return True for the best pose and for copies of its place; of a photo without matches there False."""
-    if not query.photo.is_partial or not query.num_parts:
+    if query.evidence != "drawn scan":
         return [False] * (1 + len(others))
     return [True, *find_copies(query, best.pose, [h.pose for h in others])]
 
@@ -268,8 +267,8 @@ def collect_evidence(
         explained_fraction=fractions[0],
         contradicted_fraction=fractions[1],
         seen_fraction=agreement.seen_fraction,
-        num_matches=num_matches[0] if query.num_parts else None,
-        alternative_matches=max(num_matches[1:], default=0) if query.num_parts else None,
+        num_matches=num_matches[0] if query.uses_matches else None,
+        alternative_matches=max(num_matches[1:], default=0) if query.uses_matches else None,
     )
 
 
@@ -279,11 +278,11 @@ def is_mirrored(query: Query, best: Hypothesis) -> bool:
     In a symmetric scene both are about equal. The test is skipped for a pose that explains nearly all of the
     photo, and after a first look, which has compared the mirrored photo itself.
     """
-    if best.score >= ENOUGH_EXPLAINED or not query.num_parts:
+    if best.score >= ENOUGH_EXPLAINED or not query.uses_matches:
         return False
     matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
     found = propose_poses(matches, None, 1, query.workers)
     num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
     if not found or found[0].num_matches <= num_matches:
         return False
-    return refine_matches(mirror_query(query), [found[0].pose])[0].score > MIRROR_RATIO * best.score
+    return refine_matches(query.mirror(), [found[0].pose])[0].score > MIRROR_RATIO * best.score

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -18,12 +18,12 @@ from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate
 from .judge import judge, reconsider
-from .last_descent import is_faint, refine_to_the_end
+from .last_descent import is_faint, refine_best
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
-from .shape import Aligned, align_level, find_tilts, is_explained, is_tilt_known
+from .shape import align_level, find_tilts, is_explained, is_tilt_known
 from .verification import NEAR, is_near
 
 GUESSES = (
@@ -53,81 +53,72 @@ def localize(
     method: MethodConfig = METHOD,
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
-    found = find_pose(scan_map, panorama, settings, workers, watch, method)
-    if isinstance(found, Localization):
-        return found
+    query = prepare_search(scan_map, panorama, settings, workers, method)
+    if isinstance(query, Localization):
+        return query
+    with watch.stage("search"):
+        query.photo.images.search()  # each search begins with it
+    search = find_by_edges if query.evidence == "shape" else find
+    found = search(query, scan_map, watch)
     with watch.stage("refine"):
-        return judge(*found)
+        return judge(found.query, found.selection, found.fit)
 
 
-def find_pose(
+def prepare_search(
     scan_map: ScanMap,
     panorama: Panorama,
     settings: CoarseToFineSettings,
     workers: Workers,
-    watch: Stopwatch,
     method: MethodConfig = METHOD,
-) -> Found | Localization:
-    """Search and refine, as `localize`; a result says why nothing can be searched."""
+) -> Query | Localization:
+    """Prepare a panorama for the search where the prior allows; a result says why nothing is searched."""
     allowed_map = apply_prior(scan_map, settings.prior)
     if len(allowed_map.sparse) == 0:
         return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
     if not panorama.is_valid.any():
         return Localization(warnings=(NO_PIXEL,))
-    if not scan_map.has_shape:
-        return find_once(scan_map, allowed_map, panorama, settings, workers, watch, method)
-    axes = find_axes(panorama)
+    return prepare_query(panorama, allowed_map, settings, workers, method)
+
+
+def find(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:
+    """Search until one attempt is sure, and refine the best poses to the end.
+
+    The query has the part of the map that its prior allows.
+    """
+    images = query.photo.images
+    # idle cores prepare the images that later steps need
+    with query.workers.beside(images.middle, images.fine, images.full, query.colors):
+        hypotheses: list[Hypothesis] = []
+        asked = query
+        for asked, attempt in plan_attempts(query):
+            hypotheses, is_enough = attempt(asked, hypotheses, watch)
+            if is_enough:
+                break
+        hypotheses += search_beyond_prior(asked, scan_map, watch)
+        with watch.stage("refine"):
+            return fit_camera(asked, refine_best(asked, hypotheses))
+
+
+def find_by_edges(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:
+    """Find the poses of a photo in a scan without colours, at one tilt of the camera after another."""
+    axes = find_axes(query.source)
     yaw_of_walls = scan_map.yaw_of_walls
-    level = align_level(yaw_of_walls, panorama, axes, settings)
-
-    def search(one: Aligned) -> Found:
-        return find_once(
-            scan_map, allowed_map, one.panorama, one.settings, workers, watch, method, one.rotations
-        )
-
-    found = [search(level)]  # most cameras are about level
-    if not is_tilt_known(panorama, settings) and not is_explained(found[0].selection, level):
+    level = align_level(query, axes, yaw_of_walls)
+    found = [find(level, scan_map, watch)]  # most cameras are about level
+    if not is_tilt_known(query) and not is_explained(found[0].selection, level):
         with watch.stage("search"):
-            tilts = find_tilts(allowed_map, yaw_of_walls, panorama, axes, settings, workers, method)
-        found += [search(tilt) for tilt in tilts]
+            tilts = find_tilts(query, axes, yaw_of_walls)
+        found += [find(tilt, scan_map, watch) for tilt in tilts]
     best = max(found, key=lambda one: one.selection.best.score)
-    if len(level.rotations) == 0 or is_explained(best.selection, level):
+    if level.rotations is None or is_explained(best.selection, level):
         return best
-    in_any_heading = search(level._replace(rotations=level.rotations[:0]))
+    in_any_heading = find(level.with_rotations(None), scan_map, watch)
     return max([best, in_any_heading], key=lambda one: one.selection.best.score)
 
 
-def find_once(
-    scan_map: ScanMap,
-    allowed_map: ScanMap,
-    panorama: Panorama,
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
-    method: MethodConfig,
-    rotations: Array | None = None,
-) -> Found:
-    """Search what the prior allows of a map, or some rotations (N, 3, 3) there, and refine."""
-    with watch.stage("search"):
-        query = prepare_query(panorama, allowed_map, settings, workers, method, rotations)
-    images = query.photo.images
-    # idle cores prepare the images that later steps need
-    with workers.beside(images.middle, images.fine, images.full, query.photo.colors):
-        hypotheses: list[Hypothesis] = []
-        for num_parts, attempt in plan_attempts(query):
-            query = replace(query, num_parts=num_parts)
-            hypotheses, is_enough = attempt(query, hypotheses, watch)
-            if is_enough:
-                break
-        hypotheses += search_beyond_prior(query, scan_map, watch)
-        with watch.stage("refine"):
-            return finish(query, hypotheses)
-
-
-def finish(query: Query, hypotheses: Sequence[Hypothesis]) -> Found:
-    """Refine the best of several poses to the end, of the photo of one camera with the focal length."""
-    found = refine_to_the_end(query, hypotheses)
-    if query.photo.given.focal_prior is None or is_faint(query, found):
+def fit_camera(query: Query, found: Selection) -> Found:
+    """Refine the poses of a photo of one camera with its focal length, unless they are hopeless."""
+    if query.given.focal_prior is None or is_faint(query, found):
         return Found(query, found, None)
     return Found(*calibrate(query, found))
 

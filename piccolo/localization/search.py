@@ -220,7 +220,7 @@ def list_rotations(query: Query, gravity: SearchedGravity) -> NDArray[np.float64
     """Return the rotations (N, 3, 3), camera from map, to search: upright, about level, or all."""
     R_map_from_world = query.scan_map.R_map_from_world
     settings = query.settings
-    if len(query.rotations):
+    if query.rotations is not None:
         rotations = query.rotations
     elif gravity == "known":
         rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)

@@ -65,13 +65,12 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
     standings = []
     for h, wrong in zip(hypotheses, is_wrong, strict=True):
-        num_matches = count_agreeing(query, h.pose) if query.num_parts else None
+        num_matches = count_agreeing(query, h.pose) if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
-        is_drawn = query.photo.is_partial
-        is_shape = query.scan_map.has_shape
+        is_narrow = query.evidence == "shape" and query.photo.is_partial
         # with fewer blocks, chance explains more of them
-        score = h.score * math.sqrt(query.photo.small.valid_share) if is_shape and is_drawn else h.score
-        standings.append(Standing(1.0, score, num_matches, of_prior, is_drawn, is_shape))
+        score = h.score * math.sqrt(query.photo.small.valid_share) if is_narrow else h.score
+        standings.append(Standing(1.0, score, num_matches, query.evidence, of_prior))
     return standings
 
 

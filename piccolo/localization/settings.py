@@ -1,7 +1,7 @@
 """Settings of the default method."""
 
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from ..arguments import check_fields
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
@@ -39,6 +39,10 @@ class CoarseToFineSettings:
     def to_json(self) -> dict[str, object]:
         """Return the settings as they took effect."""
         return {"preset": "default", **asdict(self)}
+
+
+ViewName = Literal["prepared", "middle", "fine", "points"]
+ImageName = Literal["full", "fine", "middle", "search"]
 
 
 class Beam(NamedTuple):
@@ -83,6 +87,16 @@ class MethodConfig(NamedTuple):
     uses_features: bool = True
     uses_search: bool = True  # where features alone are not sure
     min_starts: int = 1000
+
+    def view(self, name: ViewName) -> ViewConfig:
+        """Return the configuration of a view."""
+        views: dict[ViewName, ViewConfig] = {
+            "prepared": SEARCH_VIEW,
+            "middle": self.middle_view,
+            "fine": self.fine_view,
+            "points": self.full_view,
+        }
+        return views[name]
 
 
 METHOD = MethodConfig()

@@ -54,7 +54,7 @@ def count_agreeing(query: Query, pose: Pose) -> int:
     Features of a photo of a part of the sphere are matched with the scan drawn at the pose and with photos
     beside, those of others with the map's features.
     """
-    if not (query.photo.is_partial and query.num_parts):
+    if query.evidence != "drawn scan":
         return count_matches(query.matches, pose)
     verified = verify(query, pose)
     return verified.num_matches if is_near(verified.pose, pose) else 0
@@ -92,12 +92,12 @@ def matches_near(query: Query, pose: Pose) -> Matches:
 
 def match_drawn(query: Query, pose: Pose) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
-    return match_located(query.seen().keypoints, find_all_drawn(query, pose))
+    return match_located(query.photo.seen().keypoints, find_all_drawn(query, pose))
 
 
 def find_all_drawn(query: Query, pose: Pose) -> Located:
     """Draw all that the photo would show at a pose in the map; return the keypoints."""
-    parts = [find_drawn(query, pose, view) for view in query.seen().views]
+    parts = [find_drawn(query, pose, view) for view in query.photo.seen().views]
     ranges = np.concatenate([ranges for _, ranges in parts])
     return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
 
@@ -121,7 +121,7 @@ def place_keypoints(query: Query, pose: Pose) -> Located:
 
     Those on what the scan does not show, as people and furniture that has moved, are left out.
     """
-    views, keypoints = query.seen()
+    views, keypoints = query.photo.seen()
     panorama = query.photo.panorama
     mask = occlusion_mask(query.surroundings_at(pose)[0], panorama, pose)
     keypoints = keypoints.take(mask[compute_indices(keypoints.rays, mask.shape[1])] == EXPLAINED)
@@ -139,7 +139,7 @@ def match_beside(query: Query, other: Located) -> Matches:
     What both show in the same direction is left out: it may be carried along, as dirt on a lens is. A photo
     whose mirror image has more matches has none.
     """
-    own = query.seen().keypoints
+    own = query.photo.seen().keypoints
     mine, theirs = match_pictures(own, other.keypoints)
     if len(mine) < LEAST_MATCHES or len(match_pictures(own.mirror(), other.keypoints)[0]) > len(mine):
         return NO_MATCHES

@@ -17,6 +17,7 @@ from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose, pose_errors
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, std_of
+from ..localization.comparison import Comparison
 from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
@@ -34,6 +35,7 @@ class State:
     log_odds: float  # against none of the frame's poses being right
     score: float | None = None  # as of Evidence; None of a pose that was not refined
     gaussian: PoseGaussian | None = None  # the pose with its covariance, in the map
+    seen: Comparison | None = None  # where the photo was tracked to; None of one that was searched
     gain: float = 0.0  # [log] of one that was found among the few places within reach
 
     @property

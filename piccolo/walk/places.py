@@ -14,7 +14,7 @@ from ..confidence.confidence import MODELS, Standing, pose_features
 from ..geometry.pose import Pose
 from ..geometry.rotations import uniform_yaws
 from ..geometry.suppression import non_maximum_suppression
-from ..localization.brief import Ends, brief_query, descend_briefly, score_near
+from ..localization.beam import Ends, brief_query, descend_briefly, score_near
 from ..localization.query import Cache, Query
 
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
@@ -28,7 +28,7 @@ def query_near(query: Query, pose: Pose, radius: float) -> Query:
     distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
     near = m if math.isinf(radius) else m.narrow(distances <= max(radius, float(distances.min())))
     level = pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
-    close = replace(query, scan_map=near, cache=Cache(query.cache.views), num_parts=0, rotations=level)
+    close = replace(query.by_views(), scan_map=near, cache=Cache(query.cache.views), rotations=level)
     return brief_query(close, max(len(near.sparse), 1))
 
 
@@ -51,6 +51,6 @@ def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
 
 def log_behind(query: Query, score: float, own_score: float) -> float:
     """Return the log odds of a pose against another by their scores, at most 0, by the model of views."""
-    standing = Standing(score / max(own_score, 1e-9), 1.0, None, is_shape=query.scan_map.has_shape)
-    weight = MODELS[standing.kind].weights[0]
+    standing = Standing(score / max(own_score, 1e-9), 1.0, None, query.by_views().evidence)
+    weight = MODELS[standing.evidence].weights[0]
     return min(weight * float(pose_features(standing)[0]), 0.0)

@@ -15,12 +15,13 @@ from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
 from ..localization.attempts import is_whole
-from ..localization.brief import brief_query, descend_briefly, score_briefly, score_mirror, score_near
+from ..localization.beam import brief_query, descend_briefly, score_briefly, score_mirror, score_near
+from ..localization.comparison import compare
 from ..localization.localize import localize
-from ..localization.near import has_own_matches, refine_near
+from ..localization.near import refine_near
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
-from ..localization.selection import SURE_SCORE, assess_poses
+from ..localization.selection import SURE_SCORE, assess_alone
 from ..localization.settings import CoarseToFineSettings
 from ..localization.verification import match_beside, place_keypoints, verify
 from ..panorama import Panorama
@@ -159,7 +160,7 @@ class Tracker:
 
         A narrow photo is matched with those of them that are sure by themselves.
         """
-        if has_own_matches(query):
+        if query.evidence == "drawn scan":
             sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= MOST_EXPECTED]
             others = [(other, pose) for k, pose in sure if (other := self.query_of(k))]
             located = (place_keypoints(*other) for other in others)
@@ -179,7 +180,7 @@ class Tracker:
 
     def _keep(self, k: int, query: Query) -> None:
         """Keep the query of a narrow photo among the last few."""
-        if has_own_matches(query):
+        if query.evidence == "drawn scan":
             self.queries[k] = query
         for old in list(self.queries)[:-NUM_QUERIES]:
             del self.queries[old]
@@ -249,7 +250,10 @@ def refine_state(query: Query, states: Sequence[State], rough: State) -> list[St
     if end is None or any(s.is_refined and is_same(s.pose, end.pose) for s in others):
         return others
     ends = [Hypothesis(s.pose, s.score or 0.0) for s in (best, end)]
-    first, second = posterior(assess_poses(replace(query, num_parts=0), ends[0], ends[1:]), None)[:2]
+    at_best, at_end = (s.seen or compare(query, s.pose) for s in (best, end))
+    standings = assess_alone(query.by_views(), ends)
+    standings[1] = standings[1]._replace(ratio=at_end.compute_ratio(at_best))
+    first, second = posterior(standings, None)[:2]
     return put_state(others, replace(end, log_odds=best.log_odds + log_ratio(float(second), float(first))))
 
 
@@ -325,10 +329,10 @@ def track(query: Query, start: Pose) -> State | None:
     A narrow photo is tracked again from where its matches put it.
     """
     ends = [refine_near(query, start)]
-    if has_own_matches(query):
+    if query.evidence == "drawn scan":
         ends.append(refine_near(query, verify(query, ends[0].pose).pose))
     odds = [log_odds_of_place(end.probability, end.probability, end.gaussian) for end in ends]
     best = int(np.argmax(odds))
     end = ends[best]
-    is_wrong = odds[best] < 0.0 or end.score < SURE_SCORE
-    return None if is_wrong else State(end.pose, odds[best], end.score, end.gaussian)
+    is_wrong = odds[best] < 0.0 or end.seen.score < SURE_SCORE
+    return None if is_wrong else State(end.pose, odds[best], end.seen.score, end.gaussian, end.seen)

@@ -2,7 +2,7 @@
 
 import csv
 import io
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds
 HUGE = 1e30  # stands for an error without a pose while quartiles are interpolated
 ACCURACY_DISTANCES = (0.02, 0.05, 0.1, 0.2, 0.5, 1.0)  # [m]
 CONFIDENCES = (0.999, 0.99, 0.95, 0.9, 0.7, 0.5, 0.2, 0.0)
+PERCENTS = (25, 50, 75)
 ALL = "all"
 
 
@@ -28,38 +29,33 @@ class Counts(NamedTuple):
     num_wrong: int  # of the localized
 
 
-class Summary(NamedTuple):
-    """Statistics of some queries."""
-
-    num_queries: int
-    num_correct: int
-    num_localized: int
-    num_wrong: int  # of the localized
-    position_quartiles: NDArray[np.float64]  # (3,) [m] over all queries, inf where there is no pose
-    rotation_quartiles: NDArray[np.float64]  # (3,) [rad]
-    seconds: float  # median
-
-    @property
-    def accuracy(self) -> float:
-        """Fraction of correct poses, whatever their status."""
-        return self.num_correct / self.num_queries
-
-
 def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
-    """Return the 25th, 50th and 75th percentiles (3,) of values, some of which may be infinite."""
-    found = np.quantile(np.minimum(values, HUGE), [0.25, 0.5, 0.75])
+    """Return the PERCENTS (3,) of values, some of which may be infinite."""
+    found = np.percentile(np.minimum(values, HUGE), PERCENTS)
     return np.where(found > 1e-6 * HUGE, np.inf, found)
 
 
-def summarize(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Summary:
-    """Return the statistics of one or more queries."""
-    return Summary(
-        len(rows),
-        *count_rows(rows, thresholds),
-        position_quartiles=quartiles([row.position_error for row in rows]),
-        rotation_quartiles=quartiles([row.rotation_error for row in rows]),
-        seconds=float(np.median([row.seconds for row in rows])),
-    )
+def statistics(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> dict[str, str]:
+    """Return the statistics of one or more queries by the columns of tables.
+
+    Quartiles of the errors are over all queries, infinite where there is no pose; `t of correct` and the
+    seconds are medians.
+    """
+    counts = count_rows(rows, thresholds)
+    distances = quartiles([row.position_error for row in rows])
+    angles_deg = np.degrees(quartiles([row.rotation_error for row in rows]))
+    of_correct = [row.position_error for row in rows if row.is_correct(thresholds)] or [np.nan]
+    return {
+        "number": f"{len(rows)}",
+        "correct": f"{counts.num_correct}",
+        "accuracy": f"{counts.num_correct / len(rows):.3f}",
+        **{f"t {p} % [m]": f"{value:.4f}" for p, value in zip(PERCENTS, distances, strict=True)},
+        **{f"R {p} % [deg]": f"{value:.3f}" for p, value in zip(PERCENTS, angles_deg, strict=True)},
+        "t of correct [m]": f"{np.median(of_correct):.4f}",
+        "localized": f"{counts.num_localized}",
+        "wrong of these": f"{counts.num_wrong}",
+        "s": f"{np.median([row.seconds for row in rows]):.2f}",
+    }
 
 
 def count_rows(rows: Sequence[QueryResult], thresholds: Thresholds = PAPER_THRESHOLDS) -> Counts:
@@ -109,6 +105,11 @@ class Table(NamedTuple):
         return "\n".join([*head, lines[0], f"|{'|'.join(marks)}|", *lines[1:], ""])
 
 
+def table_of(lines: Sequence[Mapping[str, str]], title: str = "", num_left: int = 1) -> Table:
+    """Return a table of lines whose cells are named by their columns."""
+    return Table(title, tuple(lines[0]), tuple(tuple(line.values()) for line in lines), num_left)
+
+
 def per_query(rows: Sequence[QueryResult]) -> Table:
     """One line a query."""
     columns = "scene", "panorama", "status", "error [m]", "error [deg]", "confidence", "score", "margin"
@@ -135,18 +136,8 @@ def groups(rows: Sequence[QueryResult]) -> Iterator[tuple[str, list[QueryResult]
 
 def summary_table(rows: Sequence[QueryResult], thresholds: Thresholds, title: str) -> Table:
     """Quartiles of the errors, accuracy and statuses of every group."""
-    words = f"{title}; correct: {thresholds}"
-    errors = "t 25 % [m]", "t 50 %", "t 75 %", "R 25 % [deg]", "R 50 %", "R 75 %"
-    columns = "queries", "number", "correct", "accuracy", *errors, "localized", "wrong of these", "s"
-    cells = []
-    for name, some in groups(rows):
-        s = summarize(some, thresholds)
-        meters = [f"{value:.4f}" for value in s.position_quartiles]
-        degrees = [f"{value:.3f}" for value in np.degrees(s.rotation_quartiles)]
-        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}"
-        ends = f"{s.num_localized}", f"{s.num_wrong}", f"{s.seconds:.2f}"
-        cells.append((name, *counts, *meters, *degrees, *ends))
-    return Table(words, columns, tuple(cells))
+    lines = [{"queries": name, **statistics(some, thresholds)} for name, some in groups(rows)]
+    return table_of(lines, f"{title}; correct: {thresholds}")
 
 
 def threshold_table(rows: Sequence[QueryResult], thresholds: Thresholds) -> Table:
@@ -208,14 +199,10 @@ def pair_up(first: Sequence[QueryResult], second: Sequence[QueryResult]) -> list
 
 def side_by_side(pairs: Sequence[Pair], names: tuple[str, str], thresholds: Thresholds) -> Table:
     """Return the statistics of two runs over the queries that both have."""
-    columns = "run", "queries", "correct", "accuracy", "localized", "wrong of these"
-    rows = []
+    lines = []
     for k, name in enumerate(names):
-        s = summarize([pair[k] for pair in pairs], thresholds)
-        counts = f"{s.num_queries}", f"{s.num_correct}", f"{s.accuracy:.3f}", f"{s.num_localized}"
-        medians = f"{s.position_quartiles[1]:.4f}", f"{np.degrees(s.rotation_quartiles[1]):.3f}"
-        rows.append((name, *counts, f"{s.num_wrong}", *medians, f"{s.seconds:.2f}"))
-    return Table("", (*columns, "t 50 % [m]", "R 50 % [deg]", "s"), tuple(rows))
+        lines.append({"run": name, **statistics([pair[k] for pair in pairs], thresholds)})
+    return table_of(lines)
 
 
 def changes(pairs: Sequence[Pair], thresholds: Thresholds) -> Table:

@@ -41,7 +41,7 @@ from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
-from ..evaluation.tables import Table, summarize
+from ..evaluation.tables import statistics, table_of
 from ..synthetic.photos import UPSIDE_DOWN
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
@@ -126,143 +126,119 @@ class Condition(NamedTuple):
         return "paper" if isinstance(self.settings, PaperSettings) else "default"
 
 
-ConditionsOf = Callable[[Sequence[Settings], Sequence[str]], list[Condition]]
-
-
 class Experiment(NamedTuple):
     """A question, and the conditions that answer it."""
 
     title: str
     note: str  # what is varied, in a sentence
-    conditions_of: ConditionsOf  # by the presets and the scenes' variants
+    cases: Mapping[str, Mapping[str, Any]] | None  # by name: of Condition and of the settings; None: splits
+    is_of_paper: bool = False  # about what only that preset has
 
 
-def _paper_setting(setting: str, names: Mapping[Any, str]) -> ConditionsOf:
-    """Return a condition for each value of a setting that only preset paper has."""
-
-    def conditions_of(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-        paper = next((p for p in presets if isinstance(p, PaperSettings)), PaperSettings())
-        return [Condition(name, replace(paper, **{setting: value})) for value, name in names.items()]
-
-    return conditions_of
-
-
-def _each_preset(cases: Mapping[str, dict[str, Any]]) -> ConditionsOf:
-    """Return a condition for each case and preset.
-
-    A case has fields of Condition, and `gravity` of the settings.
-    """
-
-    def conditions_of(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-        return [
-            Condition(name, replace(preset, gravity=case.get("gravity", preset.gravity)), **fields)
-            for name, case in cases.items()
-            for fields in [{field: value for field, value in case.items() if field != "gravity"}]
-            for preset in presets
-        ]
-
-    return conditions_of
+def conditions_of(
+    experiment: Experiment, presets: Sequence[Settings], variants: Sequence[str]
+) -> list[Condition]:
+    """Return a condition for each case and each preset; the cases of splits are the scenes' variants."""
+    cases = experiment.cases
+    if cases is None:
+        cases = {v: {"variants": (v,), "paper": OF_SPLITS.get(v, "-")} for v in variants}
+        # They may be tilted. The paper's preset needs one of known and unknown; the default tries both.
+        presets = [replace(p, gravity="auto") if isinstance(p, CoarseToFineSettings) else p for p in presets]
+    if experiment.is_of_paper:
+        presets = [p for p in presets if isinstance(p, PaperSettings)] or [PaperSettings()]
+    found = []
+    for name, case in cases.items():
+        own = {field: value for field, value in case.items() if field in Condition._fields}
+        settings = {field: value for field, value in case.items() if field not in own}
+        found += [Condition(name, replace(preset, **settings), **own) for preset in presets]
+    return found
 
 
-def _variants(presets: Sequence[Settings], variants: Sequence[str]) -> list[Condition]:
-    found = {"handheld": 0.71, "turtlebot": 0.77, "change_handheld": 0.43, "change_turtlebot": 0.55}
-    figures = {variant: f"accuracy {value} (OmniScenes)" for variant, value in found.items()}
-    figures["mpo"] = "accuracy 0.45 (MPO)"
-    # Splits may be tilted. The paper's preset needs one of known and unknown; the default tries both.
-    tried = [replace(s, gravity="auto") if isinstance(s, CoarseToFineSettings) else s for s in presets]
-    return [
-        Condition(variant, settings, variants=(variant,), paper=figures.get(variant, "-"))
-        for variant in variants
-        for settings in tried
-    ]
-
-
-GRAVITY_CASES: dict[str, dict[str, Any]] = {
-    "gravity known": {"gravity": "known"},
-    "gravity unknown": {"gravity": "unknown"},
-    "images upside down": {"gravity": "unknown", "transform": flip},
-    "clouds turned at random": {"gravity": "unknown", "transform": with_random_rotation},
-}
-PERCENTS = (100, 50, 20, 10, 5, 2, 1)
-LABEL_CASES: dict[str, dict[str, Any]] = {
-    "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
-    "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
+OF_SPLITS = {
+    "handheld": "accuracy 0.71 (OmniScenes)",
+    "turtlebot": "accuracy 0.77 (OmniScenes)",
+    "change_handheld": "accuracy 0.43 (OmniScenes)",
+    "change_turtlebot": "accuracy 0.55 (OmniScenes)",
+    "mpo": "accuracy 0.45 (MPO)",
 }
 RUNTIMES = {10_000: "1.77 s + 0.01 s", 100_000: "1.90 s + 0.01 s", 1_000_000: "3.74 s + 0.02 s"}
-RUNTIME_CASES = {
-    f"{count} points": {"transform": partial(thin, num_points=count), "paper": f"{seconds} (RTX 2080)"}
-    for count, seconds in RUNTIMES.items()
-}
 EXPERIMENTS = {
     "translations": Experiment(
         "number of start positions",
         "N_t of preset paper is varied",
-        _paper_setting("num_translations", {n: f"N_t = {n}" for n in (10, 25, 50, 100, 200, 400)}),
+        {f"N_t = {n}": {"num_translations": n} for n in (10, 25, 50, 100, 200, 400)},
+        is_of_paper=True,
     ),
     "rotations": Experiment(
         "number of start rotations",
         "N_r of preset paper is varied",
-        _paper_setting("num_rotations", {n: f"N_r = {n}" for n in (2, 4, 8, 16, 32)}),
+        {f"N_r = {n}": {"num_rotations": n} for n in (2, 4, 8, 16, 32)},
+        is_of_paper=True,
     ),
     "initialization": Experiment(
         "choice of the start poses",
         "K2 by the loss alone, or by the loss and then histograms",
-        _paper_setting("initialization", {"loss-only": "loss alone", "two-stage": "loss, then histograms"}),
+        {
+            "loss alone": {"initialization": "loss-only"},
+            "loss, then histograms": {"initialization": "two-stage"},
+        },
+        is_of_paper=True,
     ),
     "loss": Experiment(
         "sampling against photometric loss",
         "the loss of preset paper, in search and descent",
-        _paper_setting("loss", {"photometric": "photometric loss", "sampling": "sampling loss"}),
+        {"photometric loss": {"loss": "photometric"}, "sampling loss": {"loss": "sampling"}},
+        is_of_paper=True,
     ),
     "gravity": Experiment(
         "gravity, images upside down, clouds rotated",
         "what is known of the vertical is varied",
-        _each_preset(GRAVITY_CASES),
+        {
+            "gravity known": {"gravity": "known"},
+            "gravity unknown": {"gravity": "unknown"},
+            "images upside down": {"gravity": "unknown", "transform": flip},
+            "clouds turned at random": {"gravity": "unknown", "transform": with_random_rotation},
+        },
     ),
     "density": Experiment(
         "density of the cloud",
         "points are left out at random",
-        _each_preset(
-            {f"{p:g} % of the points": {"transform": partial(thin, fraction=p / 100)} for p in PERCENTS}
-        ),
+        {
+            f"{percent} % of the points": {"transform": partial(thin, fraction=percent / 100)}
+            for percent in (100, 50, 20, 10, 5, 2, 1)
+        },
     ),
     "labels": Experiment(
         "semantic labels as colours",
         "what is compared: colours or labels",
-        _each_preset(LABEL_CASES),
+        {
+            "RGB": {"paper": "0.03 m, 0.66 deg (Stanford2D-3D-S, all areas)"},
+            "labels": {"use_labels": True, "paper": "0.01 m, 0.28 deg (Stanford2D-3D-S, all areas)"},
+        },
     ),
     "runtime": Experiment(
         "run time over the number of points",
         "points are left out at random; search + refinement",
-        _each_preset(RUNTIME_CASES),
+        {
+            f"{count} points": {
+                "transform": partial(thin, num_points=count),
+                "paper": f"{seconds} (RTX 2080)",
+            }
+            for count, seconds in RUNTIMES.items()
+        },
     ),
-    "variants": Experiment(
-        "splits of the data, such as changed scenes or light", "a line a split", _variants
-    ),
+    "variants": Experiment("splits of the data, such as changed scenes or light", "a line a split", None),
 }
 
 
-def table(title: str, found: Sequence[tuple[Condition, Sequence[QueryResult]]]) -> Table:
-    """Return a line a condition, the paper's figure at its end."""
-    lines = [_cells(condition, rows) for condition, rows in found]
-    return Table(title, tuple(lines[0]), tuple(tuple(line.values()) for line in lines), 2)
-
-
-def _cells(condition: Condition, rows: Sequence[QueryResult]) -> dict[str, str]:
-    summary = summarize(rows)
-    of_correct = [row.position_error for row in rows if row.is_correct()] or [np.nan]
+def cells(condition: Condition, rows: Sequence[QueryResult]) -> dict[str, str]:
+    """Return the line of a condition by its columns, the paper's figure at its end."""
     seconds = {s: [row.result.seconds.get(s, 0.0) for row in rows] for s in ("search", "refine")}
     return {
         "": condition.name,
         "preset": condition.preset,
-        "queries": f"{summary.num_queries}",
-        "accuracy": f"{summary.accuracy:.3f}",
-        "t 50 % [m]": f"{summary.position_quartiles[1]:.4f}",
-        "t of correct [m]": f"{np.median(of_correct):.4f}",
-        "R 50 % [deg]": f"{np.degrees(summary.rotation_quartiles[1]):.3f}",
+        **statistics(rows),
         **{f"{stage} s": f"{np.median(values):.2f}" for stage, values in seconds.items()},
-        "localized": f"{summary.num_localized}",
-        "wrong of these": f"{summary.num_wrong}",
         "the paper": condition.paper,
     }
 
@@ -336,7 +312,7 @@ def run_experiment(
     variants = [variant for variant in variants if not arguments.variants or variant in arguments.variants]
     num_failed = 0
     found = []
-    conditions = experiment.conditions_of(presets, variants)
+    conditions = conditions_of(experiment, presets, variants)
     files = [page, *(folder / file_name(condition) for condition in conditions)]
     check_distinct({file.name: file for file in files}, input_files(scenes))
     folder.mkdir(parents=True, exist_ok=True)
@@ -349,7 +325,7 @@ def run_experiment(
         raise InputError(f"{name}: no query could be localized; check --scenes and --variants")
     num_scenes = len({row.scene for _, rows in found for row in rows})
     title = f"{experiment.title}: {experiment.note}; {num_scenes} scenes"
-    text = table(title, found).markdown()
+    text = table_of([cells(*one) for one in found], title, num_left=2).markdown()
     print(text, flush=True)
     write_atomically(page, text.encode())
     return num_failed

@@ -19,6 +19,7 @@ from piccolo.confidence.confidence import (
     MIN_CONFIDENCE,
     NONE_FEATURES,
     ChoiceModel,
+    EvidenceKind,
     Standing,
     classify,
     none_features,
@@ -60,9 +61,9 @@ class Outcome(NamedTuple):
     error: Array  # (6,) of the best pose, as PoseCovariance has it; NaN without truth
 
     @property
-    def kind(self) -> str:
+    def evidence(self) -> EvidenceKind:
         """Key in MODELS: what the photo was compared with."""
-        return self.standings[0].kind
+        return self.standings[0].evidence
 
     @property
     def std(self) -> float | None:
@@ -169,16 +170,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     learnt = read(arguments.fit)
     sets = {"learnt from": learnt, "others": read(arguments.check)}
-    models: dict[str, ChoiceModel] = {}
-    for kind in sorted({o.kind for o in learnt}):
-        models[kind] = model = fit([o for o in learnt if o.kind == kind])
+    models: dict[EvidenceKind, ChoiceModel] = {}
+    for kind in sorted({o.evidence for o in learnt}):
+        models[kind] = model = fit([o for o in learnt if o.evidence == kind])
         print(f"{kind}:")
         for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
             print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=False)))
     for name, outcomes in sets.items():
         if not outcomes:
             continue
-        stated = [o.probabilities(models.get(o.kind)) for o in outcomes]
+        stated = [o.probabilities(models.get(o.evidence)) for o in outcomes]
         right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
         called = [classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]

@@ -1,0 +1,249 @@
+"""From starts to a few poses: successive halving on ever finer views."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..confidence.alternatives import (
+    MIN_ANGLE,
+    MIN_DISTANCE,
+    Hypothesis,
+    best_distinct,
+    sort_by_score,
+    suppress_near,
+)
+from ..geometry.pose import Array, Pose
+from ..geometry.suppression import non_maximum_suppression
+from ..kernels.jit import F0, kernel
+from ..optimize.channel_loss import ChannelProblem, descend_channels, score
+from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
+from ..panorama.texels import Texels
+from ..views.candidate_views import SEARCH_VIEW, Views
+from ..views.view import ViewArrays
+from .comparison import compare, score_pose
+from .cone import Cone, find_cone, select_cells
+from .ladder import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage, climb, refine
+from .query import Query
+from .search import Starts, search_poses
+from .settings import Beam
+
+BATCH = 16  # starts that a thread takes at a time
+NUM_FOUND = 12  # poses of a search, at most
+PLAIN_SCORE = 0.2  # if the best has this score, poses with less than FAINT_PART of it are dropped
+FAINT_PART = 0.25
+SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
+SAME_ANGLE = math.radians(5.0)  # and this are one
+CLOSE_DISTANCE = 0.1  # [m] SAME_DISTANCE after the descent on middle cells
+FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
+NUM_SCORED = 64  # starts, if only the best score is needed
+
+
+class Ends(NamedTuple):
+    """Ends of short descents, best first."""
+
+    poses: Starts
+    scores: Array  # (N,)
+
+    @property
+    def best_score(self) -> float:
+        """Score of the best end; 0 if there is none."""
+        return float(self.scores.max(initial=0.0))
+
+
+def refine_starts(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
+    """Refine the starts by successive halving to a few distinct poses on fine cells, best first."""
+    workers = query.workers
+
+    def descend(poses: Sequence[Pose], stage: Stage) -> list[Hypothesis]:
+        return workers.map(partial(refine, query, first=stage), poses, "descend")
+
+    coarse = keep_ends(descend_prepared(query, starts, first_stage(query)), beam.num_coarse)
+    coarse = keep_ends(descend_prepared(query, coarse, SECOND), beam.num_middle)
+    middle = descend(coarse.poses(), MIDDLE)
+    perturbed = descend(narrow(middle, beam.num_fine), AROUND_MIDDLE)
+    fine = descend(narrow(perturbed, beam.num_fine), FINE)
+    best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
+    others = keep_comparable(keep_distinct(fine, middle))[len(best) :]  # these most likely stay
+    with workers.beside(*(partial(compare, query, f.pose) for f in others)):
+        ends = workers.map(partial(climb, query), best, "descend")
+    poses = [f.pose for f in keep_comparable(keep_distinct([*ends, *fine], middle))]
+    return sort_by_score(workers.map(partial(score_pose, query), poses, "descend"))
+
+
+def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
+    """Descend on fine cells from poses of matches; keep the better of each start and end, best first."""
+
+    def refine_match(pose: Pose) -> Hypothesis:
+        end = refine(query, pose, FINE).pose
+        return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
+
+    return sort_by_score(query.workers.map(refine_match, poses, "descend"))
+
+
+def first_stage(query: Query) -> Stage:
+    """Return the stage of the first descents; a narrow photo needs more iterations."""
+    return SECOND if query.photo.is_partial else FIRST
+
+
+def keep_ends(ends: Ends, count: int) -> Starts:
+    """Keep the distinct best ends and alternatives."""
+    poses = ends.poses
+    return poses.take(best_and_alternatives(poses.R_cam_from_map, poses.center_map, count, SAME_DISTANCE))
+
+
+def best_and_alternatives(
+    rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, min_distance: float
+) -> NDArray[np.int64]:
+    """Return the indices of `count` of the ranked poses (n, 3, 3), (n, 3), best first, in ascending order.
+
+    Three quarters are the best poses that differ a little, a quarter the best that lie far apart.
+    """
+    near = non_maximum_suppression(rotations, centers, count - count // 4, min_distance, SAME_ANGLE)
+    apart = non_maximum_suppression(rotations, centers, count, MIN_DISTANCE, MIN_ANGLE)
+    others = apart[~np.isin(apart, near)][: count - len(near)]
+    return np.sort(np.concatenate([near, others]))
+
+
+def narrow(fits: Sequence[Hypothesis], count: int) -> list[Pose]:
+    """Return the `best_and_alternatives` of the fits, ranked by score."""
+    ranked = [f.pose for f in sort_by_score(fits)]
+    rotations = np.array([pose.R_cam_from_world for pose in ranked])
+    centers = np.array([pose.center_world for pose in ranked])
+    return [ranked[k] for k in best_and_alternatives(rotations, centers, count, CLOSE_DISTANCE)]
+
+
+def keep_distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return the best poses of fine cells, then of middle cells, by non-maximum suppression."""
+    return suppress_near([*sort_by_score(fine), *sort_by_score(middle)], NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
+
+
+def keep_comparable(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Drop the fits that score far below a good best: a comparison could not bring them near it."""
+    best = max((f.score for f in ranked), default=0.0)
+    least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
+    return [f for f in ranked if f.score >= least]
+
+
+def brief_query(query: Query, most: int = FIRST_STARTS) -> Query:
+    """Return the query with fewer starts, at most so many."""
+    settings = replace(query.settings, max_starts=min(most, FIRST_STARTS, query.settings.max_starts))
+    return replace(query, settings=settings)
+
+
+def descend_briefly(query: Query) -> Ends:
+    """Search at the photo's tilt, and descend a few steps."""
+    return descend_prepared(query, search_poses(query, "known"), first_stage(query))
+
+
+def score_briefly(query: Query) -> float:
+    """Return the best score of a brief search."""
+    return descend_briefly(query).best_score
+
+
+def score_mirror(query: Query) -> float:
+    """Return the best score of a brief search with the photo mirrored."""
+    return score_briefly(brief_query(query.mirror(), NUM_SCORED))
+
+
+def score_near(query: Query, pose: Pose) -> float:
+    """Return the score a few steps from a pose, on the prepared view of the candidate nearest to it."""
+    distances = np.linalg.norm(query.scan_map.centers - pose.center_world, axis=1)
+    nearest = np.array([distances.argmin()])
+    start = Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest)
+    return descend_prepared(query, start, first_stage(query)).best_score
+
+
+def score_starts(query: Query, starts: Starts) -> float:
+    """Return the best score after short descents from the best starts."""
+    best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
+    return descend_prepared(query, best, FIRST).best_score
+
+
+@kernel
+def descend_starts(
+    views: Views,
+    view: ViewArrays,
+    image: Texels,
+    scale: float,
+    num_iterations: int,
+    tolerance: float,
+    cone: Cone,
+    row: NDArray[np.int64],
+    R_cam_from_map: Array,
+    center_map: Array,
+    scores: Array,
+) -> None:
+    """Descend from each start, (n, 3, 3) and (n, 3) in place, on the cells of its row (n,) of the views.
+
+    Cells outside of the cone around what the photo shows, as seen from the start, are left out.
+    """
+    centers, offsets, unit, features, is_seen = views
+    solid_angle = view.solid_angle
+    blocks = view.blocks
+    texels = image.rgbx
+    width = image.width
+    R = R_cam_from_map
+    t = center_map
+    n = len(solid_angle)
+    room = np.empty(3 * n, np.float32)
+    more_room = np.empty(3 * n, np.float32)
+    weights = np.empty(n, np.float32)
+    own_blocks = np.empty(n, np.int32)
+    kept = np.empty(n, np.int64)
+    for k in range(len(row)):
+        c = row[k]
+        for i in range(3):
+            t[k, i] -= centers[c, i]
+        num = select_cells(offsets[c], unit[c], cone, R[k], t[k], kept)
+        points = room[: 3 * num].reshape(3, num)
+        levels = more_room[: 3 * num].reshape(3, num)
+        for i in range(3):
+            for m in range(num):
+                points[i, m] = np.float32(offsets[c, i, kept[m]]) * unit[c]
+                levels[i, m] = np.float32(features[c, i, kept[m]]) + np.float32(ZERO_LEVEL)
+        for m in range(num):
+            weights[m] = solid_angle[kept[m]] if is_seen[c, kept[m]] else F0
+            own_blocks[m] = blocks[kept[m]]
+        problem = ChannelProblem(points, levels, weights[:num], texels, width, scale)
+        descend_channels(problem, num_iterations, tolerance, R[k], t[k])
+        scores[k] = score(points, levels, weights[:num], own_blocks[:num], texels, width, R[k], t[k])
+        for i in range(3):
+            t[k, i] += centers[c, i]
+
+
+def descend_prepared(query: Query, starts: Starts, stage: Stage) -> Ends:
+    """Descend from each start on its candidate's prepared view."""
+    R = starts.R_cam_from_map.copy()
+    t = starts.center_map.copy()
+    scores = np.empty(len(t))
+    row, views = query.scan_map.views.at(starts.candidate, query.workers)
+    view = SEARCH_VIEW.arrays
+    image = query.photo.image(stage.image)
+    limits = stage.limits
+    scale = limits.loss_scale * LEVELS_PER_UNIT
+    cone = find_cone(image)
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + BATCH)
+        descend_starts(
+            views,
+            view,
+            image,
+            scale,
+            limits.num_iterations,
+            limits.tolerance,
+            cone,
+            row[part],
+            R[part],
+            t[part],
+            scores[part],
+        )
+
+    query.workers.map(run, range(0, len(t), BATCH), "descend")
+    order = np.argsort(-scores, kind="stable")
+    return Ends(Starts(R, t, starts.candidate).take(order), scores[order])

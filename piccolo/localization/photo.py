@@ -1,0 +1,143 @@
+"""A photo at the sizes at which it is compared: each image is made once, when it is first asked for."""
+
+import math
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ..geometry.pose import Array, Pose, rotate_points
+from ..geometry.sphere import compute_indices, make_grid
+from ..jobs.threads import Once, Workers
+from ..local_features.keypoints import Keypoints, find_keypoints
+from ..local_features.perspective_view import PerspectiveView, cover_sphere, view_around
+from ..panorama import Panorama
+from ..panorama.edges import soften
+from ..panorama.local_normalization import normalize_panorama
+from ..panorama.model import resize
+from ..panorama.texels import Texels, find_valid, pack_texels
+from .settings import ImageName, ImageScale, ImageScales
+
+WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
+MOST_SHARE = 0.98  # of the sphere: a photo that shows more counts as showing all cells
+ACROSS = np.diag([1.0, -1.0, 1.0])  # mirrors a camera's axes left for right
+
+
+class Images(NamedTuple):
+    """A photo's locally normalised channels at several scales."""
+
+    full: Once[Texels]  # for the last millimetres
+    fine: Once[Texels]  # for fine views
+    middle: Once[Texels]  # for middle views
+    search: Once[Texels]  # for prepared views
+
+
+class Seen(NamedTuple):
+    """Views that show all of a photo, and the keypoints in them."""
+
+    views: list[PerspectiveView]
+    keypoints: Keypoints
+
+
+@dataclass(frozen=True)
+class Photo:
+    """A photo at the sizes at which it is compared; immutable, as threads share it."""
+
+    panorama: Panorama  # at the width of its features
+    images: Images
+    small: Texels  # colours at the size of fine images, at which poses are compared
+    seen: Once[Seen]  # what verification compares with the scan drawn at a pose
+    R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
+    has_tilt: bool  # R_cam_from_level is known, from metadata or a gravity vector
+    scales: ImageScales
+    workers: Workers
+
+    @property
+    def is_partial(self) -> bool:
+        """True if the photo shows a part of the sphere."""
+        return self.small.valid_share < WHOLE
+
+    def image(self, name: ImageName) -> Texels:
+        """Return one of the images."""
+        found: Texels = getattr(self.images, name)()
+        return found
+
+    def find_shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
+        """Return a mask (N,) of the grid cells around a pose that the photo shows."""
+        grid = make_grid(num_rings)
+        if self.small.valid_share > MOST_SHARE:
+            return np.ones(len(grid), np.bool_)
+        rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
+        return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
+
+    def mask(self, is_hidden: NDArray[np.bool_]) -> "Photo":
+        """Return the photo without pixels (h, 2 h), the rest normalised again."""
+        height, width = self.panorama.is_valid.shape
+        enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
+        rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
+        return self._remake(rest)
+
+    def mirror(self) -> "Photo":
+        """Return the photo mirrored left to right."""
+        rgb = self.panorama.rgb[:, ::-1]
+        panorama = replace(self.panorama, rgb=rgb, is_valid=self.panorama.is_valid[:, ::-1])
+        small = self.small.mirror()
+        return replace(
+            self,
+            panorama=panorama,
+            images=Images(*(Once(partial(mirror_image, image)) for image in self.images)),
+            small=small,
+            seen=Once(partial(find_seen, panorama, small, self.workers)),
+            R_cam_from_level=ACROSS @ self.R_cam_from_level @ ACROSS,
+        )
+
+    def forget(self) -> "Photo":
+        """Return the photo with its images as they are before they are asked for."""
+        return self._remake(self.panorama)
+
+    def _remake(self, panorama: Panorama) -> "Photo":
+        return make_photo(panorama, self.scales, self.R_cam_from_level, self.has_tilt, self.workers)
+
+
+def make_photo(
+    panorama: Panorama, scales: ImageScales, R_cam_from_level: Array, has_tilt: bool, workers: Workers
+) -> Photo:
+    """Make the photo of a panorama, each of its images resized from the one before."""
+    panorama = resize(panorama, scales.full.width)
+    least = reduce(panorama, scales.fine)
+    small = pack_texels(least.rgb, least.is_valid)
+    seen = Once(partial(find_seen, panorama, small, workers))
+    images = make_images(panorama, scales)
+    return Photo(panorama, images, small, seen, R_cam_from_level, has_tilt, scales, workers)
+
+
+def make_images(panorama: Panorama, scales: ImageScales) -> Images:
+    """Make the images of a panorama, each resized from the one before."""
+    images = {}
+    for name, scale in scales._asdict().items():
+        panorama = reduce(panorama, scale)
+        images[name] = Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg))
+    return Images(**images)
+
+
+def reduce(panorama: Panorama, scale: ImageScale) -> Panorama:
+    """Return a panorama at the size of one of its images, made of one that is wider or of the same size."""
+    return resize(soften(panorama, scale.blur_px) if scale.blur_px else panorama, scale.width)
+
+
+def mirror_image(image: Once[Texels]) -> Texels:
+    """Return an image mirrored left for right."""
+    return image().mirror()
+
+
+def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
+    """Find keypoints in one view around what a photo shows, or in those of many that show a part of it."""
+    width = panorama.rgb.shape[1]
+    around = view_around(find_valid(small), width / math.tau, width)
+    views = [around] if around else cover_sphere(width)
+    views = [view for view in views if view.cut_mask(panorama.is_valid).any()]
+    gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    return Seen(views, find_keypoints(gray, panorama.is_valid, views, workers))
