@@ -23,7 +23,7 @@ from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
-from .localization.beside import Picture, localize_beside, locate
+from .localization.beside import SurePhoto, localize_beside, locate
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
@@ -126,7 +126,7 @@ class OpenedScan:
 
     def locate(
         self, panorama: File, result: Result, read_options: ReadOptions, settings: Settings
-    ) -> Picture | None:
+    ) -> SurePhoto | None:
         """Return the keypoints of a photo that is localized; None if it is another photo now."""
         if result.best_pose is None:
             raise ValueError("a photo without a pose")
@@ -145,7 +145,7 @@ class OpenedScan:
         self,
         panorama: File,
         first: Result,
-        list_pictures: Callable[[], Mapping[str, Picture]],
+        list_pictures: Callable[[], Mapping[str, SurePhoto]],
         read_options: ReadOptions,
         settings: Settings,
     ) -> tuple[Result, tuple[str, ...]]:
