@@ -46,6 +46,7 @@ LAYERS = [
     "optional",
     "arguments",
     "errors",
+    "arrays",
 ]
 
 
