@@ -1,14 +1,14 @@
 """Score every candidate position with every rotation, and keep the distinct best."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.nearness import STARTING, STARTING_NARROW
 from ..geometry.pose import Pose
-from ..geometry.rotations import Gravity, R_cam_from_angles, uniform_rotations, uniform_yaws
+from ..geometry.rotations import R_cam_from_angles, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.memory import check_memory
@@ -25,13 +25,10 @@ from .query import Query
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB
 LOWEST = np.float32(-np.inf)
-SearchedGravity = Gravity | Literal["level"]
+Tilts = Literal["known", "level", "any"]  # of the camera that are searched: its own, about level, all
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 CANDIDATES_PER_START = 2
 POSES_PER_START = 12
-START_DISTANCE = 0.5  # [m] starts nearer than this
-START_ANGLE = math.radians(20.0)  # and this are one; of a photo of a part of the sphere
-PARTIAL_START_ANGLE = math.radians(14.0)  # this
 PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
 NUM_LEVEL_YAWS = 40
 
@@ -179,7 +176,7 @@ def best_poses(
     return row, column, flat[top]
 
 
-def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
+def search_poses(query: Query, tilts: Tilts) -> Starts:
     """Search all candidates with all rotations in two stages; return the distinct best.
 
     The first scores wide cells of the sparse candidates, by matrix products, the second scores fine cells of
@@ -187,7 +184,7 @@ def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
     """
     m = query.scan_map
     settings = query.settings
-    rotations = list_rotations(query, gravity)
+    rotations = list_rotations(query, tilts)
     num_views = min(views_at_once(len(rotations)), len(m.sparse))
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
@@ -201,8 +198,8 @@ def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
     candidate = m.sparse[sparse]
     R = rotations[turn]
     centers = m.centers[candidate]
-    angle = PARTIAL_START_ANGLE if is_partial else START_ANGLE
-    kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, angle)
+    near = STARTING_NARROW if is_partial else STARTING
+    kept = non_maximum_suppression(R, centers, num_starts, near)
     candidate = candidate[kept]
     if is_partial:
         return Starts(R[kept], centers[kept], candidate)
@@ -216,15 +213,15 @@ def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
     return Starts(R[kept][order], centers[kept][order], candidate[order])
 
 
-def list_rotations(query: Query, gravity: SearchedGravity) -> NDArray[np.float64]:
+def list_rotations(query: Query, tilts: Tilts) -> NDArray[np.float64]:
     """Return the rotations (N, 3, 3), camera from map, to search: upright, about level, or all."""
     R_map_from_world = query.scan_map.R_map_from_world
     settings = query.settings
     if query.rotations is not None:
         rotations = query.rotations
-    elif gravity == "known":
+    elif tilts == "known":
         rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)
-    elif gravity == "level":
+    elif tilts == "level":
         headings = 360.0 / NUM_LEVEL_YAWS * np.arange(NUM_LEVEL_YAWS)
         tilted = [R_cam_from_angles(heading, pitch, 0.0) for pitch in PITCHES_DEG for heading in headings]
         rotations = query.photo.R_cam_from_level @ np.stack(tilted)
