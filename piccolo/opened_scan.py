@@ -17,6 +17,7 @@ from .confidence.occlusion import occlusion_mask
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.colors import Labels
+from .geometry.nearness import CONFIRMED
 from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.stopwatch import Stopwatch
@@ -26,7 +27,6 @@ from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
 from .localization.settings import CoarseToFineSettings
-from .localization.verification import is_near
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperMap
@@ -147,7 +147,7 @@ class OpenedScan:
             pictures = list_pictures()
         found, names = localize_beside(prepared, picture, poses, pictures, settings, self.workers, watch)
         is_surer = found.confidence > first.confidence
-        is_other = first.best_pose and found.pose and not is_near(found.pose, first.best_pose)
+        is_other = first.best_pose and found.pose and not CONFIRMED.holds(found.pose, first.best_pose)
         if not names or not (is_surer or is_other):
             return first, ()
         if focal is not None:

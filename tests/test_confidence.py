@@ -12,6 +12,7 @@ from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
 from piccolo.confidence.occlusion import Agreement, measure_agreement
 from piccolo.errors import InputError
+from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
@@ -125,8 +126,8 @@ def test_alternatives_are_apart_from_the_best_and_from_each_other():
 
 def test_best_distinct_keeps_the_better_of_two_that_are_near():
     a, b, c = at(0.0, 0.5), at(0.05, 0.6), at(1.0, 0.1)
-    assert alternatives.best_distinct([a, b, c], 5, 0.1, 0.1) == [b, c]
-    assert alternatives.best_distinct([a, b, c], 1, 0.1, 0.1) == [b]
+    assert alternatives.best_distinct([a, b, c], 5, Nearness(0.1, 0.1)) == [b, c]
+    assert alternatives.best_distinct([a, b, c], 1, Nearness(0.1, 0.1)) == [b]
 
 
 def _words(std_ratio=3.0, tilt_deg=0.0, turn=0.0):

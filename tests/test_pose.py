@@ -5,6 +5,7 @@ from hypothesis import strategies as st
 
 from piccolo.errors import InputError
 from piccolo.geometry import pose as poses
+from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.rotations import uniform_yaws
 from piccolo.geometry.suppression import non_maximum_suppression
 
@@ -106,9 +107,14 @@ def test_rotation_near_the_poles(tiny):
 def test_kept_poses_are_the_first_of_their_neighbourhood():
     centers = np.array([[0.0, 0, 0], [0.1, 0, 0], [2, 0, 0], [0.1, 0, 0]])
     rotations = np.stack([uniform_yaws(36)[k] for k in (0, 1, 0, 9)])
-    assert non_maximum_suppression(rotations, centers, 9, 0.5, np.radians(20)).tolist() == [0, 2, 3]
-    assert non_maximum_suppression(rotations, centers, 2, 0.5, np.radians(20)).tolist() == [0, 2]
-    assert non_maximum_suppression(rotations, centers, 9, 0.5, np.radians(5)).tolist() == [0, 1, 2, 3]
+    assert non_maximum_suppression(rotations, centers, 9, Nearness(0.5, np.radians(20))).tolist() == [0, 2, 3]
+    assert non_maximum_suppression(rotations, centers, 2, Nearness(0.5, np.radians(20))).tolist() == [0, 2]
+    assert non_maximum_suppression(rotations, centers, 9, Nearness(0.5, np.radians(5))).tolist() == [
+        0,
+        1,
+        2,
+        3,
+    ]
 
 
 def test_poses_are_a_group_and_act_on_points():

@@ -11,6 +11,7 @@ import rooms
 from made_up import QUERY, VIEWS, at, place
 
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
@@ -69,11 +70,21 @@ def test_a_quarter_of_the_beam_is_for_the_best_that_lie_far_apart():
     """Twenty poses in a row 0.2 m apart, and behind them two at other places."""
     x = np.concatenate([0.2 * np.arange(20), [50.0, 60.0]])
     rotations, centers = np.repeat(np.eye(3)[None], 22, axis=0), np.outer(x, [1.0, 0, 0])
-    kept = best_and_alternatives(rotations, centers, 8, 0.15)
+    near = Nearness(0.15, 0.1)
+    kept = best_and_alternatives(rotations, centers, 8, near)
     assert kept.tolist() == [0, 1, 2, 3, 4, 5, 6, 9]  # six near ones; of those half a metre apart, two more
     few = np.concatenate([np.arange(6), [20, 21]])
-    assert best_and_alternatives(rotations[few], centers[few], 6, 0.15).tolist() == [0, 1, 2, 3, 4, 6]
-    assert best_and_alternatives(rotations, centers, 8, 0.3).tolist() == [0, 2, 3, 4, 6, 8, 9, 10]
+    assert best_and_alternatives(rotations[few], centers[few], 6, near).tolist() == [0, 1, 2, 3, 4, 6]
+    assert best_and_alternatives(rotations, centers, 8, near._replace(distance=0.3)).tolist() == [
+        0,
+        2,
+        3,
+        4,
+        6,
+        8,
+        9,
+        10,
+    ]
 
 
 def test_narrow_ranks_poses_first():
@@ -122,7 +133,7 @@ def test_the_beam_narrows_from_stage_to_stage(monkeypatch, is_partial, first):
 def test_poses_are_perturbed_for_as_long_as_that_helps(monkeypatch, gains, rounds, expected):
     left, sizes = list(gains), []
 
-    def around(query, cells, blocks, pose, stage):
+    def around(query, cells, pose, stage):
         sizes.append(stage.around.size)
         assert (stage.around.image, stage.image) == ("middle", "fine")
         return Hypothesis(pose, score[0])
@@ -268,7 +279,7 @@ def test_perturbed_descents_lead_out_of_a_place_a_quarter_of_a_metre_off():
     cells = rooms.view(rooms.scan_map(1).octree, off.center_world, METHOD.fine_view, ALL)
     stage = AROUND_MIDDLE._replace(view="fine")
     queries = (replace(_query(1), workers=Workers(n)) for n in (1, 2))
-    found, by_two = (ladder.descend_around(query, cells, FINE_BLOCKS, off, stage) for query in queries)
+    found, by_two = (ladder.descend_around(query, cells, off, stage) for query in queries)
     assert (found.pose.key, found.score) == (by_two.pose.key, by_two.score)
     assert rooms.errors(found.pose, true_pose)[0] < 0.06
     expected = ladder.score_on_cells(cells, FINE_BLOCKS, images.middle(), found.pose)

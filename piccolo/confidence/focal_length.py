@@ -62,12 +62,12 @@ class Consensus:
             self._weights = self._precision / (1.0 + square / OUTLYING**2) ** 2
             middle = self._weights @ self._off / self._weights.sum()
 
-    def opinion(self, without: int | None = None) -> Opinion | None:
-        """Return the opinion of all, or of all without one; None of too few."""
+    def opinion(self, without: int | None = None, least: int = LEAST_PHOTOS) -> Opinion | None:
+        """Return the opinion of all, or of all without one; None of fewer than `least`."""
         weights = self._weights.copy()
         if without is not None:
             weights[without] = 0.0
-        if np.count_nonzero(weights) < LEAST_PHOTOS:
+        if np.count_nonzero(weights) < least:
             return None
         off = weights @ self._off / weights.sum()
         scatter = weights**2 @ (self._off - off) ** 2 / weights.sum() ** 2

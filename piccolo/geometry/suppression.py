@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..kernels.jit import copy_to, kernel
+from .nearness import Nearness
 from .vectors import dot, minus, row
 
 
@@ -44,13 +45,9 @@ def non_maximum_suppression(
     rotations: NDArray[np.float64],
     centers: NDArray[np.float64],
     count: int,
-    min_distance: float,
-    min_angle: float,
+    near: Nearness,
 ) -> NDArray[np.int64]:
-    """Return the indices of at most `count` poses (n, 3, 3), (n, 3), best first, that are near no better one.
-
-    Near is within both the distance [m] and the angle [rad].
-    """
+    """Return the indices of at most `count` poses (n, 3, 3), (n, 3), best first, near no better one."""
     kept = np.empty(count, np.int64)
-    min_trace = 1.0 + 2.0 * math.cos(min_angle)
-    return kept[: suppress(rotations, centers, min_distance, min_trace, kept)]
+    min_trace = 1.0 + 2.0 * math.cos(near.angle)
+    return kept[: suppress(rotations, centers, near.distance, min_trace, kept)]

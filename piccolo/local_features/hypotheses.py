@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.nearness import MATCHED, VOTED
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..geometry.vectors import cross, dot, minus, rotate, row
@@ -34,8 +35,6 @@ COS_TILT = math.cos(math.radians(12.0))  # most angle between a pose's vertical 
 LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
-CLUSTER = (1.0, math.radians(30.0))  # [m], [rad] rough poses nearer than both are one
-SAME = (0.3, math.radians(10.0))  # exact poses nearer than both are one
 NUM_CLUSTERS = 48  # that are made exact, at most
 FIRST_CLUSTERS = 8  # of them, before the rest is chosen by the votes
 FAIR_PART = 0.2  # of the best pose's matches
@@ -363,7 +362,7 @@ def propose_poses(
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
-    kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, *CLUSTER)]
+    kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
 
     def exact_ones(clusters: NDArray[np.int64]) -> list[MatchedPose]:
         rough = [Pose(rotations[k], centers[k]) for k in clusters]
@@ -378,4 +377,4 @@ def propose_poses(
     found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)
     R = np.array([f.pose.R_cam_from_world for f in found]).reshape(-1, 3, 3)
     t = np.array([f.pose.center_world for f in found]).reshape(-1, 3)
-    return [found[k] for k in non_maximum_suppression(R, t, count, *SAME)]
+    return [found[k] for k in non_maximum_suppression(R, t, count, MATCHED)]

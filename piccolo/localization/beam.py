@@ -9,14 +9,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.alternatives import (
-    MIN_ANGLE,
-    MIN_DISTANCE,
-    Hypothesis,
-    best_distinct,
-    sort_by_score,
-    suppress_near,
-)
+from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
+from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness
 from ..geometry.pose import Array, Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..kernels.jit import F0, kernel
@@ -36,9 +30,6 @@ BATCH = 16  # starts that a thread takes at a time
 NUM_FOUND = 12  # poses of a search, at most
 PLAIN_SCORE = 0.2  # if the best has this score, poses with less than FAINT_PART of it are dropped
 FAINT_PART = 0.25
-SAME_DISTANCE = 0.15  # [m] poses on their way down nearer than this
-SAME_ANGLE = math.radians(5.0)  # and this are one
-CLOSE_DISTANCE = 0.1  # [m] SAME_DISTANCE after the descent on middle cells
 FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
 NUM_SCORED = 64  # starts, if only the best score is needed
 
@@ -58,16 +49,13 @@ class Ends(NamedTuple):
 def refine_starts(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
     """Refine the starts by successive halving to a few distinct poses on fine cells, best first."""
     workers = query.workers
-
-    def descend(poses: Sequence[Pose], stage: Stage) -> list[Hypothesis]:
-        return workers.map(partial(refine, query, first=stage), poses, "descend")
-
     coarse = keep_ends(descend_prepared(query, starts, first_stage(query)), beam.num_coarse)
     coarse = keep_ends(descend_prepared(query, coarse, SECOND), beam.num_middle)
-    middle = descend(coarse.poses(), MIDDLE)
-    perturbed = descend(narrow(middle, beam.num_fine), AROUND_MIDDLE)
-    fine = descend(narrow(perturbed, beam.num_fine), FINE)
-    best = best_distinct(fine, beam.num_perturbed, CLOSE_DISTANCE, SAME_ANGLE)
+    middle = workers.map(partial(refine, query, first=MIDDLE), coarse.poses(), "descend")
+    narrowed = narrow(middle, beam.num_fine)
+    perturbed = workers.map(partial(refine, query, first=AROUND_MIDDLE), narrowed, "descend")
+    fine = workers.map(partial(refine, query, first=FINE), narrow(perturbed, beam.num_fine), "descend")
+    best = best_distinct(fine, beam.num_perturbed, DESCENDED)
     others = keep_comparable(keep_distinct(fine, middle))[len(best) :]  # these most likely stay
     with workers.beside(*(partial(compare, query, f.pose) for f in others)):
         ends = workers.map(partial(climb, query), best, "descend")
@@ -93,20 +81,20 @@ def first_stage(query: Query) -> Stage:
 def keep_ends(ends: Ends, count: int) -> Starts:
     """Keep the distinct best ends and alternatives."""
     poses = ends.poses
-    return poses.take(best_and_alternatives(poses.R_cam_from_map, poses.center_map, count, SAME_DISTANCE))
+    return poses.take(best_and_alternatives(poses.R_cam_from_map, poses.center_map, count, DESCENDING))
 
 
 def best_and_alternatives(
-    rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, min_distance: float
+    rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, near: Nearness
 ) -> NDArray[np.int64]:
     """Return the indices of `count` of the ranked poses (n, 3, 3), (n, 3), best first, in ascending order.
 
     Three quarters are the best poses that differ a little, a quarter the best that lie far apart.
     """
-    near = non_maximum_suppression(rotations, centers, count - count // 4, min_distance, SAME_ANGLE)
-    apart = non_maximum_suppression(rotations, centers, count, MIN_DISTANCE, MIN_ANGLE)
-    others = apart[~np.isin(apart, near)][: count - len(near)]
-    return np.sort(np.concatenate([near, others]))
+    best = non_maximum_suppression(rotations, centers, count - count // 4, near)
+    apart = non_maximum_suppression(rotations, centers, count, ONE_ANSWER)
+    others = apart[~np.isin(apart, best)][: count - len(best)]
+    return np.sort(np.concatenate([best, others]))
 
 
 def narrow(fits: Sequence[Hypothesis], count: int) -> list[Pose]:
@@ -114,12 +102,12 @@ def narrow(fits: Sequence[Hypothesis], count: int) -> list[Pose]:
     ranked = [f.pose for f in sort_by_score(fits)]
     rotations = np.array([pose.R_cam_from_world for pose in ranked])
     centers = np.array([pose.center_world for pose in ranked])
-    return [ranked[k] for k in best_and_alternatives(rotations, centers, count, CLOSE_DISTANCE)]
+    return [ranked[k] for k in best_and_alternatives(rotations, centers, count, DESCENDED)]
 
 
 def keep_distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> list[Hypothesis]:
     """Return the best poses of fine cells, then of middle cells, by non-maximum suppression."""
-    return suppress_near([*sort_by_score(fine), *sort_by_score(middle)], NUM_FOUND, MIN_DISTANCE, MIN_ANGLE)
+    return suppress_near([*sort_by_score(fine), *sort_by_score(middle)], NUM_FOUND, ONE_ANSWER)
 
 
 def keep_comparable(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:

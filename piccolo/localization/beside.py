@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.localization import Localization
+from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Array, Pose, skew
 from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
 from ..jobs.blas import one_blas_thread
@@ -31,7 +32,7 @@ from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
 from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
-from .verification import Located, is_near, match_beside, place_keypoints
+from .verification import Located, match_beside, place_keypoints
 
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
@@ -124,7 +125,7 @@ def list_agreeing(
     agreeing = []
     for other, turned in zip(found, matches, strict=True):
         exact = exact_pose(turned, own, None)
-        if exact and exact.num_matches >= SURE_MATCHES and is_near(exact.pose, own):
+        if exact and exact.num_matches >= SURE_MATCHES and CONFIRMED.holds(exact.pose, own):
             agreeing.append(other._replace(matches=turned, pose=exact.pose))
     return agreeing
 

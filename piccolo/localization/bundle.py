@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.confidence import LOCALIZED
-from ..confidence.focal_length import MOST_CONFLICT
+from ..confidence.focal_length import MOST_CONFLICT, Consensus
 from ..confidence.localization import Localization
 from ..geometry.pose import Array, Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
@@ -85,21 +85,46 @@ def localize_bundle(
     `errors` are those expected of these poses; their scale is unknown if its deviation is large.
     """
     cams_from_bundle = move_origin_near(cams_from_bundle)
-    alone: list[Localization] = []
     members: dict[int, Member] = {}
-    for k, panorama in enumerate(panoramas):
+
+    def localize_alone(k: int, panorama: Panorama) -> Localization:
         query = prepare_search(scan_map, panorama, settings, workers)
         if isinstance(query, Localization):
-            alone.append(query)
-            continue
+            return query
         search = find_by_edges if query.evidence == "shape" else find
         query, selection, fit = search(query, scan_map, watch)
-        alone.append(judge(query, selection, fit, may_change=False))
-        if alone[k].pose is not None:
-            members[k] = Member(query.forget(), selection, fit, alone[k], cams_from_bundle[k])
+        judged = judge(query, selection, fit, may_change=False)
+        if judged.pose is not None:
+            members[k] = Member(query.forget(), selection, fit, judged, cams_from_bundle[k])
+        return judged
+
+    alone = [localize_alone(k, panorama) for k, panorama in enumerate(panoramas)]
+    for k, panorama in expect_focal(panoramas, alone).items():
+        members.pop(k, None)
+        alone[k] = localize_alone(k, panorama)
+    members = dict(sorted(members.items()))
     with watch.stage("refine"):
         together = judge_members(members, errors)
     return [together.get(k, one) for k, one in enumerate(alone)]
+
+
+def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -> dict[int, Panorama]:
+    """Return the photos that are not sure, by number, with the focal length that those that are sure tell.
+
+    The photos are of one camera: what was given and what these say are averaged.
+    """
+    opinions = [one.focal_length.opinion for one in alone if one.status == LOCALIZED and one.focal_length]
+    told = Consensus(opinions).opinion(least=1)
+    if told is None:
+        return {}
+    expected: dict[int, Panorama] = {}
+    for k, (panorama, one) in enumerate(zip(panoramas, alone, strict=True)):
+        prior = panorama.focal_prior
+        if one.status != LOCALIZED and prior is not None:
+            share = told.share_of_given(prior.deviation)
+            focal_px = prior.focal * math.exp((1.0 - share) * told.off)
+            expected[k] = panorama.expect_focal(focal_px, prior.deviation * math.sqrt(share))
+    return expected
 
 
 def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[int, Localization]:

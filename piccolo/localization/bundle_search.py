@@ -11,7 +11,8 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CONTRADICTED, posterior
 from ..confidence.localization import Localization
-from ..geometry.pose import Array, Pose, angle_between, log_so3
+from ..geometry.nearness import ONE_IN_BUNDLE
+from ..geometry.pose import Array, Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .comparison import compare, score_pose
@@ -29,8 +30,6 @@ SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of the
 CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
 LEAST_NONE = 1e-6
 NUM_BUNDLES = 4  # poses of the bundle that are tested
-SAME_PLACE = 0.5  # [m] a photo's pose this near to that by the bundle,
-SAME_TURN = math.radians(6.0)  # and this, supports it
 SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
 LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
 NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most probability
@@ -123,7 +122,7 @@ def propose_with_scale(
     found = own_of_other @ own.inverse()
     given_apart = float(np.linalg.norm(relative.center_world))
     found_apart = float(np.linalg.norm(found.center_world))
-    if angle_between(relative.R_cam_from_world, found.R_cam_from_world) > SAME_TURN:
+    if angle_between(relative.R_cam_from_world, found.R_cam_from_world) > ONE_IN_BUNDLE.angle:
         return []
     is_free = errors.log_scale > 1.0
     if found_apart < LEAST_APART or given_apart <= 0.0:
@@ -141,7 +140,7 @@ def join_near(members: Sequence[Member], bundle: Bundle, errors: RelativeErrors)
     near = []
     for member in members:
         expected = bundle.place(member.cam_from_bundle)
-        own = next((own for own, _ in member.own_poses if is_same(own.pose, expected)), None)
+        own = next((own for own, _ in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), None)
         if own:
             near.append(Estimate(PoseGaussian(own.pose, nothing, nothing), member.cam_from_bundle))
     loose = errors._replace(log_scale=max(errors.log_scale, 1.0))
@@ -150,26 +149,21 @@ def join_near(members: Sequence[Member], bundle: Bundle, errors: RelativeErrors)
 
 def is_same_bundle(members: Sequence[Member], bundle: Bundle, other: Bundle) -> bool:
     """Return True if two poses of the bundle put every photo at the same place."""
-    return all(is_same(bundle.place(m.cam_from_bundle), other.place(m.cam_from_bundle)) for m in members)
+    cams = [member.cam_from_bundle for member in members]
+    return all(ONE_IN_BUNDLE.holds(bundle.place(cam), other.place(cam)) for cam in cams)
 
 
 def vote(member: Member, bundle: Bundle) -> float:
     """Return the probability of a photo's own pose that supports a pose of the bundle."""
     expected = bundle.place(member.cam_from_bundle)
-    return max((p for own, p in member.own_poses if is_same(own.pose, expected)), default=0.0)
-
-
-def is_same(pose: Pose, other: Pose) -> bool:
-    """Return True if two poses may be one, with the errors of relative poses."""
-    turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
-    return bool(turn < SAME_TURN and pose.distance(other) < SAME_PLACE)
+    return max((p for own, p in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), default=0.0)
 
 
 def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     """Return a photo's evidence for a bundle pose: its best own pose near the prediction."""
     expected = bundle.place(member.cam_from_bundle)
     poses = [own for own, _ in member.own_poses]
-    own = next((h for h in poses if is_same(h.pose, expected)), None)
+    own = next((h for h in poses if ONE_IN_BUNDLE.holds(h.pose, expected)), None)
     found = own or max(list_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
@@ -193,7 +187,7 @@ def list_near(query: Query, expected: Pose) -> list[Hypothesis]:
     poses = [refine(query, expected, FINE).pose]
     if query.photo.is_partial:
         poses.append(verify(query, expected).pose)
-    near = [pose for pose in poses if is_same(pose, expected)]
+    near = [pose for pose in poses if ONE_IN_BUNDLE.holds(pose, expected)]
     return [score_pose(query, pose) for pose in (*near, expected)]
 
 

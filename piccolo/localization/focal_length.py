@@ -164,7 +164,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
             doubt = opinion.doubt(prior.deviation) * opinion.share_of_given(prior.deviation)
         spread = crest.variance + prior.deviation**2
         # of the prior's variance, as by DerSimonian and Laird (1986)
-        excess = max(opinion.off**2 - spread, 0.0)
+        excess = 0.0 if prior.is_measured else max(opinion.off**2 - spread, 0.0)
         wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
     if conflict > MOST_CONFLICT:
         precision = wide  # the picture alone says where to look next

@@ -8,6 +8,7 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple
 
@@ -204,7 +205,7 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, make_sampling_loss(query.colors()), pose, descent).pose
     measures: list[Callable[[], Any]] = [
-        lambda: estimate_covariance(query, pose, compare(query, pose)),  # takes longest
+        partial(estimate_covariance, query, pose, compare(query, pose)),  # takes longest
         lambda: compare_occlusion(points, query.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points, pose.center_world), query.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),

@@ -80,20 +80,18 @@ def refine(query: Query, start: Pose, first: Stage, then: Stage | None = None) -
 
     The score of the end is that on the cells of the last view; nan on points.
     """
-    end = descend_stage(query, query.view_at(start, first.view), start, first)
+    cells = query.view_at(start, first.view)
+    end = (descend_around if first.around else descend_on)(query, cells, start, first)
     return end if then is None else refine(query, end.pose, then)
 
 
-def descend_stage(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
-    """Descend from a pose on the cells or points that are seen from there."""
+def descend_on(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
+    """Descend from a pose on the cells or points that are seen from there, and score the end on the cells."""
     image = query.photo.image(stage.image)
-    limits = stage.limits
+    end = descend(cells, image, pose, stage.limits)
     if stage.view == "points":
-        return Hypothesis(descend(cells, image, pose, limits), math.nan)
-    blocks = query.method.view(stage.view).arrays.blocks
-    if stage.around is None:
-        return score_on_cells(cells, blocks, image, descend(cells, image, pose, limits))
-    return descend_around(query, cells, blocks, pose, stage)
+        return Hypothesis(end, math.nan)
+    return score_on_cells(cells, query.method.view(stage.view).arrays.blocks, image, end)
 
 
 def climb(query: Query, start: Hypothesis) -> Hypothesis:
@@ -107,7 +105,7 @@ def climb(query: Query, start: Hypothesis) -> Hypothesis:
     blocks = query.method.view(FINE.view).arrays.blocks
     best = score_on_cells(cells, blocks, query.photo.image(FINE.image), start.pose)
     for _ in range(MAX_PERTURBATIONS):
-        around = descend_stage(query, cells, best.pose, AROUND_FINE)
+        around = descend_around(query, cells, best.pose, AROUND_FINE)
         refined = refine(query, around.pose, FINE)
         gain = refined.score - best.score
         best = refined if gain > 0.0 else best
@@ -257,11 +255,10 @@ def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose:
     return Hypothesis(pose, float(value))
 
 
-def descend_around(
-    query: Query, cells: Cells, blocks: NDArray[np.int32], pose: Pose, stage: Stage
-) -> Hypothesis:
+def descend_around(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
     """Return the best end of descents from a pose and around it, on the wide image first."""
     assert stage.around is not None
+    blocks = query.method.view(stage.view).arrays.blocks
     wide = query.photo.image(stage.around.image)
     narrow = query.photo.image(stage.image)
     limits = stage.limits

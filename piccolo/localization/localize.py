@@ -8,6 +8,7 @@ from typing import NamedTuple
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
+from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
@@ -24,7 +25,6 @@ from .query import Query, prepare_query
 from .selection import Selection
 from .settings import METHOD, CoarseToFineSettings, MethodConfig
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
-from .verification import NEAR, is_near
 
 GUESSES = (
     0.0,
@@ -152,7 +152,7 @@ def is_same_place(one: Localization, pose: Pose, focal: FocalLength | None) -> b
     ahead = one.pose.R_cam_from_world[0]
     along = float(offset @ ahead)
     moved = Pose(pose.R_cam_from_world, pose.center_world - along * ahead)
-    return abs(along) < NEAR + MOST_RANGE * abs(change) and is_near(one.pose, moved)
+    return abs(along) < CONFIRMED.distance + MOST_RANGE * abs(change) and CONFIRMED.holds(one.pose, moved)
 
 
 def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettings) -> Localization:
@@ -171,6 +171,6 @@ def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettin
         for f in others_found
         if f.pose and f.evidence
     ]
-    of_best = (a for a in best.alternatives if not any(is_near(o.pose, a.pose) for o in others))
+    of_best = (a for a in best.alternatives if not any(CONFIRMED.holds(o.pose, a.pose) for o in others))
     listed = replace(best, alternatives=(*others, *of_best)[:MAX_ALTERNATIVES])
     return reconsider(listed, fraction, settings.min_confidence)

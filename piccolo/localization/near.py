@@ -5,7 +5,8 @@ from typing import NamedTuple
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import Standing, posterior
-from ..geometry.pose import MAX_DISTANCE, Pose
+from ..geometry.nearness import RIGHT
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .comparison import Comparison, compare, compare_from
 from .covariance import estimate_covariance
@@ -13,7 +14,7 @@ from .ladder import FULL, NEARLY, climb_from_afar, refine, settle
 from .last_descent import HOPELESS_SCORE
 from .query import Query
 from .selection import assess_alone
-from .verification import is_near, verify
+from .verification import verify
 
 
 class Near(NamedTuple):
@@ -55,5 +56,5 @@ def assess_end(query: Query, end: Hypothesis) -> Standing:
     if query.evidence != "drawn scan":
         return standing
     found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
-    own = [v.num_matches for v in found if is_near(v.pose, end.pose, MAX_DISTANCE)]
+    own = [v.num_matches for v in found if RIGHT.holds(v.pose, end.pose)]
     return standing._replace(num_matches=max(own, default=0), evidence=query.evidence)

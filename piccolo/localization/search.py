@@ -1,12 +1,12 @@
 """Score every candidate position with every rotation, and keep the distinct best."""
 
-import math
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..geometry.nearness import STARTING, STARTING_NARROW
 from ..geometry.pose import Pose
 from ..geometry.rotations import Gravity, R_cam_from_angles, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
@@ -29,9 +29,6 @@ SearchedGravity = Gravity | Literal["level"]
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 CANDIDATES_PER_START = 2
 POSES_PER_START = 12
-START_DISTANCE = 0.5  # [m] starts nearer than this
-START_ANGLE = math.radians(20.0)  # and this are one; of a photo of a part of the sphere
-PARTIAL_START_ANGLE = math.radians(14.0)  # this
 PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
 NUM_LEVEL_YAWS = 40
 
@@ -201,8 +198,8 @@ def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
     candidate = m.sparse[sparse]
     R = rotations[turn]
     centers = m.centers[candidate]
-    angle = PARTIAL_START_ANGLE if is_partial else START_ANGLE
-    kept = non_maximum_suppression(R, centers, num_starts, START_DISTANCE, angle)
+    near = STARTING_NARROW if is_partial else STARTING
+    kept = non_maximum_suppression(R, centers, num_starts, near)
     candidate = candidate[kept]
     if is_partial:
         return Starts(R[kept], centers[kept], candidate)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..confidence.occlusion import EXPLAINED, occlusion_mask
+from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
 from ..local_features.hypotheses import LEAST_MATCHES, count_matches, exact_pose
@@ -29,8 +30,6 @@ AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose 
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = math.cos(math.radians(2.0))
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
-NEAR = 0.3  # [m] matches with which a pose moves farther are another pose's
-NEAR_TURN = math.radians(5.0)
 
 
 class Located(NamedTuple):
@@ -57,7 +56,7 @@ def count_agreeing(query: Query, pose: Pose) -> int:
     if query.evidence != "drawn scan":
         return count_matches(query.matches, pose)
     verified = verify(query, pose)
-    return verified.num_matches if is_near(verified.pose, pose) else 0
+    return verified.num_matches if CONFIRMED.holds(verified.pose, pose) else 0
 
 
 def verify(query: Query, pose: Pose) -> Verified:
@@ -71,12 +70,6 @@ def verify(query: Query, pose: Pose) -> Verified:
     if found is None:
         return Verified(pose, 0)
     return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
-
-
-def is_near(pose: Pose, other: Pose, most: float = NEAR) -> bool:
-    """Return True if two poses are so near each other, at most so far [m], that they are one place."""
-    turn = np.linalg.norm(log_so3(pose.R_cam_from_world @ other.R_cam_from_world.T))
-    return bool(turn < NEAR_TURN and pose.distance(other) < most)
 
 
 def matches_near(query: Query, pose: Pose) -> Matches:
@@ -111,7 +104,7 @@ def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
 
     def is_copy(other: Pose) -> bool:
         found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other, None)
-        return found is not None and is_near(found.pose, other)
+        return found is not None and CONFIRMED.holds(found.pose, other)
 
     return query.workers.map(is_copy, others, "compare places")
 

@@ -28,6 +28,7 @@ class FocalPrior:
     source: str  # the option that gives it, or EXIF
     view: View  # the photo, what is masked in it left out
     is_hidden: NDArray[np.bool_]  # (H, W) of the sphere, masked beside
+    is_measured: bool = False  # by other photos of the camera
 
 
 @dataclass(frozen=True)
@@ -56,14 +57,14 @@ class Panorama:
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def expect_focal(self, focal_px: float, deviation: float) -> "Panorama":
-        """Return the panorama by another focal length, with the deviation of its logarithm, as is then known.
+        """Return the panorama by the focal length of other photos, with the deviation of its logarithm.
 
         The panorama must have a focal_prior.
         """
         assert self.focal_prior is not None
         camera = self.cameras[0].camera
         taken = self.resample(camera.change(math.log(focal_px / camera.focal[0])), self.rgb.shape[1])
-        prior = replace(self.focal_prior, focal=focal_px, deviation=deviation)
+        prior = replace(self.focal_prior, focal=focal_px, deviation=deviation, is_measured=True)
         return replace(taken, focal_prior=prior)
 
 

@@ -1,10 +1,13 @@
 """Steps 1 to 3 of the paper's Algorithm 1: score poses on a grid in free space, keep the diverse best."""
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
 from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import Hypothesis, best_distinct
+from ..geometry.nearness import Nearness
 from ..geometry.pose import Array, Pose
 from ..geometry.sphere import solid_angles
 from ..jobs.threads import Workers
@@ -110,15 +113,14 @@ def search(
         return [h for h in found if np.isfinite(h.score)]
 
     scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
-    distance = settings.min_distance
-    angle = np.radians(settings.min_angle_deg)
+    near = Nearness(settings.min_distance, math.radians(settings.min_angle_deg))
     if settings.initialization == "loss-only":
-        return best_distinct(scored, settings.num_by_histogram, distance, angle)
-    by_loss = best_distinct(scored, settings.num_by_loss, distance, angle)
+        return best_distinct(scored, settings.num_by_histogram, near)
+    by_loss = best_distinct(scored, settings.num_by_loss, near)
     small = shrink(panorama, settings.histogram_width)
 
     def rescore(h: Hypothesis) -> Hypothesis:
         return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
 
     by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
-    return best_distinct(by_histogram, settings.num_by_histogram, distance, angle)
+    return best_distinct(by_histogram, settings.num_by_histogram, near)

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Array, Pose, carry
-from .frames import Frame, State, is_same
+from .frames import Frame, State
 from .path import EVEN, Path
 
 
@@ -54,7 +55,7 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     departed = frames[key].departed or at_key.states[0].pose
     carried = [carry(frame.arrived, departed, state.pose) for state in at_key.states]
     states = [State(pose, own.log_odds) for pose in carried]
-    if is_same(carried[0], own.pose):
+    if ONE_ANSWER.holds(carried[0], own.pose):
         return Belief([own, *states[1:]], probabilities)
     expected = carried[0] if probabilities[0] > EVEN else None
     probabilities[0] = min(probabilities[0], EVEN)  # nothing was seen there

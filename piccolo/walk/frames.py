@@ -12,17 +12,15 @@ from typing import Literal
 
 import numpy as np
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Localization
-from ..geometry.pose import Array, Pose, pose_errors
+from ..geometry.nearness import ONE_ANSWER
+from ..geometry.pose import Array, Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, std_of
 from ..localization.comparison import Comparison
 from ..scan_map.scan_map import ScanMap
 
 How = Literal["alone", "near", "tracked", "none"]
-SAME_PLACE = 2.0  # [m] poses nearer to each other: key frames are so far apart
-SAME_HEADING = math.pi / 4.0  # and this are of one place: square rooms look alike turned by twice that
 MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was to be expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
 
@@ -103,21 +101,9 @@ def log_ratio(probability: float, other: float) -> float:
     return min(max(ratio, -2.0 * MOST_ODDS), MOST_ODDS)
 
 
-def is_same(pose: Pose, other: Pose) -> bool:
-    """Return True if two poses are nearer than distinct poses are."""
-    distance, angle = pose_errors(pose, other)
-    return distance < MIN_DISTANCE and angle < MIN_ANGLE
-
-
-def is_same_place(pose: Pose, other: Pose) -> bool:
-    """Return True if two poses are of one place, not of copies of it."""
-    distance, angle = pose_errors(pose, other)
-    return distance < SAME_PLACE and angle < SAME_HEADING
-
-
 def put_state(states: Sequence[State], state: State) -> list[State]:
     """Return the states with another in place of those that are the same pose."""
-    return [state, *(s for s in states if not is_same(s.pose, state.pose))]
+    return [state, *(s for s in states if not ONE_ANSWER.holds(s.pose, state.pose))]
 
 
 def state_centers(states: Sequence[State]) -> Array:

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
+from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Array, Pose, carry
 from ..scan_map.free_space import FreeSpace
 from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
@@ -101,13 +101,13 @@ def motion_between(frames: Sequence[Frame], m: int, k: int) -> tuple[Pose, Pose,
     before, frame = frames[m], frames[k]
     end = track_back(frames, m, k)
     if end is not None and before.departed is not None:
-        return before.departed, end, MIN_DISTANCE
+        return before.departed, end, ONE_ANSWER.distance
     poses = [f.odometry for f in frames[m : k + 1] if f.odometry is not None]
     if before.odometry is None or frame.odometry is None:
         return None
     steps = np.diff([pose.center_world for pose in poses], axis=0)
     walked = float(np.linalg.norm(steps, axis=1).sum())
-    return before.odometry, frame.odometry, MIN_DISTANCE + DRIFT * walked
+    return before.odometry, frame.odometry, ONE_ANSWER.distance + DRIFT * walked
 
 
 def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
@@ -131,7 +131,8 @@ def is_moved(
     distances = np.linalg.norm(centers[:, None] - state_centers(ends)[None], axis=2)
     R_carried = np.array([pose.R_cam_from_world for pose in carried]).reshape(-1, 9)
     R_ends = np.array([state.pose.R_cam_from_world for state in ends]).reshape(-1, 9)
-    is_turned_so = R_carried @ R_ends.T >= 1.0 + 2.0 * math.cos(MIN_ANGLE)  # the trace of R is 1 + 2 cos
+    least_trace = 1.0 + 2.0 * math.cos(ONE_ANSWER.angle)
+    is_turned_so = R_carried @ R_ends.T >= least_trace
     return np.asarray((distances < error) & is_turned_so)
 
 

@@ -9,8 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..confidence.alternatives import MIN_ANGLE, MIN_DISTANCE
 from ..confidence.confidence import MODELS, Standing, pose_features
+from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.rotations import uniform_yaws
 from ..geometry.suppression import non_maximum_suppression
@@ -44,7 +44,7 @@ def find_places(query: Query, own: Pose) -> list[Place]:
 def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
     """List the distinct ends with their odds to a pose of a score."""
     R, centers = ends.poses.R_cam_from_map, ends.poses.center_map
-    kept = non_maximum_suppression(R, centers, MOST_PLACES, MIN_DISTANCE, MIN_ANGLE)
+    kept = non_maximum_suppression(R, centers, MOST_PLACES, ONE_ANSWER)
     found = zip(ends.poses.take(kept).poses(), ends.scores[kept], strict=True)
     return [(pose, log_behind(query, float(score), own_score)) for pose, score in found]
 

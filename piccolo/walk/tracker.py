@@ -10,6 +10,7 @@ import numpy as np
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import posterior
+from ..geometry.nearness import ONE_ANSWER, ONE_PLACE
 from ..geometry.pose import Pose, carry, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch
@@ -30,12 +31,9 @@ from ..scan_map.scan_map import ScanMap
 from .frames import (
     MOST_EXPECTED,
     MOST_ODDS,
-    SAME_PLACE,
     Frame,
     How,
     State,
-    is_same,
-    is_same_place,
     list_states,
     log_odds_of_place,
     log_ratio,
@@ -47,7 +45,8 @@ from .places import MOST_PLACES, find_places, list_places, log_behind, query_nea
 
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 NUM_QUERIES = 4  # are kept, of the frames that were asked for last
-ELSEWHERE = SAME_PLACE + 2.0 * REACH_SLACK  # [m] a camera of so long a reach may be at another place
+BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
+ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] a camera of so long a reach may be at another place
 
 
 class Expected(NamedTuple):
@@ -137,7 +136,7 @@ class Tracker:
     def _is_telling(self, frame: Frame) -> bool:
         """Return True if the camera has moved so far since the last key frame that it sees another place."""
         begin = None if frame.key is None else self.frames[frame.key].tracking_pose
-        return begin is None or frame.arrived is None or frame.arrived.distance(begin) >= SAME_PLACE
+        return begin is None or frame.arrived is None or frame.arrived.distance(begin) >= BETWEEN_KEYS
 
     def _follow(self, query: Query, frame: Frame) -> None:
         """Find a frame from the last one that was found."""
@@ -230,11 +229,11 @@ def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -
     rough = [
         State(pose, best.log_odds + min(behind, limit))
         for pose, behind in find_places(query, best.pose)
-        if not any(is_same_place(pose, state.pose) for state in own)
+        if not any(ONE_PLACE.holds(pose, state.pose) for state in own)
     ]
     states: list[State] = []
     for state in (*own, *rough):
-        if not any(is_same(state.pose, other.pose) for other in states):
+        if not any(ONE_ANSWER.holds(state.pose, other.pose) for other in states):
             states.append(state)
     return states[:MOST_PLACES]
 
@@ -247,7 +246,7 @@ def refine_state(query: Query, states: Sequence[State], rough: State) -> list[St
     best = max((s for s in states if s.is_refined), key=lambda s: s.log_odds)
     end = track(query, rough.pose)
     others = [s for s in states if s is not rough]
-    if end is None or any(s.is_refined and is_same(s.pose, end.pose) for s in others):
+    if end is None or any(s.is_refined and ONE_ANSWER.holds(s.pose, end.pose) for s in others):
         return others
     ends = [Hypothesis(s.pose, s.score or 0.0) for s in (best, end)]
     at_best, at_end = (s.seen or compare(query, s.pose) for s in (best, end))
@@ -303,9 +302,9 @@ def find_near(query: Query, expected: Expected) -> Found | None:
     end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
     if end is None:
         return None
-    how: How = "tracked" if is_same_place(end.pose, expected.pose) else "near"
+    how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
     state = replace(end, gain=compute_gain(query, near))
-    return Found(state, how, all(is_same_place(pose, end.pose) for pose in alike))
+    return Found(state, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
 
 
 def compute_gain(query: Query, near: Query) -> float:
@@ -319,7 +318,7 @@ def compute_gain(query: Query, near: Query) -> float:
 
 def is_acceptable(state: State, expected: Expected) -> bool:
     """Return True for a pose within reach that is where it was expected, or sure by itself."""
-    is_sure = state.log_odds >= MOST_EXPECTED or is_same_place(state.pose, expected.pose)
+    is_sure = state.log_odds >= MOST_EXPECTED or ONE_PLACE.holds(state.pose, expected.pose)
     return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
