@@ -42,7 +42,7 @@ class Journal:
             self._earlier.append((str(step), str(text), end))
 
     def recall(self, steps: Iterable[str], take: Callable[[int, str], Kept]) -> list[Kept]:
-        """Return what `take` makes of numbers and texts of the next steps, up to one that was not done before.
+        """Return what `take` makes of numbers and texts of the next steps, up to one that is not done.
 
         What an earlier run did instead, and after it, is forgotten. `take` raises ValueError for a damaged
         text.
