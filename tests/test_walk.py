@@ -184,7 +184,7 @@ def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, bu
 def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, building, monkeypatch):
     _, queries = building
     monkeypatch.setattr(tracker_module, "BETWEEN_KEYS", 0.4)  # [m] the camera goes 0.23 at a time
-    walk = scan.track(motion=piccolo.Motion(max_speed=0.6), gravity=\"known\")
+    walk = scan.track(motion=piccolo.Motion(max_speed=0.6), gravity="known")
     live = [walk.add(q.image, q.time) for q in queries]
     _assert_right(live, queries)
     assert [frame.is_key for frame in walk.tracker.frames] == [k % 2 == 0 for k in range(NUM_FRAMES)]
