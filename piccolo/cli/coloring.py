@@ -67,11 +67,11 @@ def make_coloring_job(
         for result in results:
             print_result(result, [warning for warning in result.warnings if warning not in of_scan])
         if sum(result.status == LOCALIZED for result in results) < LEAST_PHOTOS:
-            why = f"{arguments.color_scan} is not written: wanted {LEAST_PHOTOS} localized photos or more"
+            why = f"; {arguments.color_scan} is not written: wanted {LEAST_PHOTOS} localized photos or more"
             return Report(why, is_whole=False)
         colored = color_scan.write_colored_scan(scan, results, arguments.color_scan)
         part = 100.0 * colored.num_colored / max(colored.num_points, 1)
-        return Report(f"{part:.0f} % of the points coloured")
+        return Report(f"; {part:.0f} % of the points coloured")
 
     fields = localizer.expect(scan_map.scan_sha256, more)
     return Job("photos", given, fields, run, report, arguments.color_scan)

@@ -60,6 +60,7 @@ from .walking import check_walk_options, make_walk_job, walk_frames
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
+JOINT = ("walk", "video", "relative", "color_scan")  # options of photos that help each other
 Write = Callable[[str], object]
 
 
@@ -330,7 +331,8 @@ def run_jointly(run: Run) -> int:
     arguments = run.arguments
     settings = run.localizer.settings
     if not isinstance(settings, CoarseToFineSettings):
-        raise UsageError("--walk, --video, --relative, --color-scan: not options of the preset paper")
+        option = next(name for name in JOINT if getattr(arguments, name))
+        raise UsageError(f"--{option.replace('_', '-')}: not an option of the preset paper")
     photos = list(run.panoramas)
     opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
     if arguments.walk or arguments.video:
@@ -349,7 +351,7 @@ def main(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
     watch = Stopwatch()
     run = prepare_run(arguments)
-    if arguments.walk or arguments.video or arguments.relative or arguments.color_scan:
+    if any(getattr(arguments, name) for name in JOINT):
         return run_jointly(run)
     rig = run.localizer.photo.instant
     with open_output(run) as (output, records):

@@ -18,7 +18,7 @@ from ..jobs.stopwatch import Stopwatch
 from ..panorama.photo import sha256_of
 from ..photo import Photo
 from ..result import FAILED, Result, read_results
-from .errors import print_note
+from .errors import print_error, print_note
 from .executing import EXIT_SOME_NOT, Interruption, choose_exit_code
 
 
@@ -64,9 +64,12 @@ def run_together(arguments: argparse.Namespace, job: Job) -> int:
     report = job.report(results)
     counts = Counter(result.status for result in results)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
-    seconds = watch.seconds.get("all", 0.0)
-    print_note(arguments, f"{len(results)} {job.what} in {seconds:.0f} s: {words}; {report.words}")
-    return choose_exit_code(counts) or (0 if report.is_whole else EXIT_SOME_NOT)
+    note = f"{len(results)} {job.what} in {watch.seconds.get('all', 0.0):.0f} s: {words}{report.words}"
+    code = choose_exit_code(counts)
+    if not report.is_whole:
+        return print_error(arguments, note, code or EXIT_SOME_NOT)
+    print_note(arguments, note)
+    return code
 
 
 def steps_file(out: Path | None) -> Path | None:

@@ -109,7 +109,7 @@ def make_walk_job(arguments: argparse.Namespace, frames: Sequence[WalkInput], wa
         warnings = {w for r in results for w in r.warnings if w.startswith("`odometry`")}
         print_warnings(arguments, warnings)
         gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
-        return Report(f"{gaps} gaps")
+        return Report(f"; {gaps} gaps")
 
     photos = {frame.name: frame.photo for frame in frames}
     return Job("frames", photos, lambda _: fields, run, report)
