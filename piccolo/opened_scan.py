@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Bytes
 from .camera import Calibration
 from .cloud.settings import CloudSettings
 from .cloud.soa import PackedPoints
@@ -22,7 +22,7 @@ from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Workers
-from .localization.beside import Picture, localize_beside, locate
+from .localization.beside import SurePhoto, localize_beside, locate
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
@@ -71,7 +71,7 @@ class OpenedScan:
         """Transform a pose from the scan's own coordinates to the frame of `points`."""
         return self.prepared.from_world(pose)
 
-    def occlusion_mask(self, photo: Photo, pose: Pose) -> NDArray[np.uint8]:
+    def occlusion_mask(self, photo: Photo, pose: Pose) -> Bytes:
         """Return the pixels (H, W) of a photo that contradict the scan at a pose (`Scan.occlusion_mask`)."""
         pose = self.from_world(check_pose(pose, "`pose`"))
         return occlusion_mask(self.points, self.read(photo), pose)
@@ -107,7 +107,7 @@ class OpenedScan:
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
         return replace(self.add_localization(blank, found), gps_prior=gps)
 
-    def locate(self, photo: Photo, result: Result, settings: Settings) -> Picture | None:
+    def locate(self, photo: Photo, result: Result, settings: Settings) -> SurePhoto | None:
         """Return the keypoints of a photo that is localized; None if it is another photo now."""
         if result.best_pose is None:
             raise ValueError("a photo without a pose")
@@ -125,7 +125,7 @@ class OpenedScan:
         self,
         photo: Photo,
         first: Result,
-        list_pictures: Callable[[], Mapping[str, Picture]],
+        list_pictures: Callable[[], Mapping[str, SurePhoto]],
         settings: Settings,
     ) -> tuple[Result, tuple[str, ...]]:
         """Localize a photo that is not sure, beside others that are; return also the names of these.

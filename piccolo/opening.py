@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .arguments import check_fields, check_kind
+from .arrays import Floats
 from .cloud import open_cloud
 from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
@@ -63,7 +64,7 @@ class Cloud:
         An option is invalid, or does not go with another.
     """
 
-    source: File | Sequence[File] | NDArray[np.floating[Any]]
+    source: File | Sequence[File] | Floats
     _: KW_ONLY
     colors: NDArray[Any] | None = None
     units: Units = "m"
@@ -103,7 +104,7 @@ class Cloud:
 
 
 def open_scan(
-    cloud: File | Sequence[File] | NDArray[np.floating[Any]] | Cloud,
+    cloud: File | Sequence[File] | Floats | Cloud,
     *,
     settings: Settings = DEFAULT,
     cache: bool | File = True,

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .arguments import check_fields
+from .arrays import Bytes, Mask
 from .camera import Calibration, Mount
 from .camera.files import find_calibration, open_calibration, read_rig
 from .camera.rig import IDENTITY
@@ -64,9 +64,9 @@ class Photo:
         when it is localized.
     """
 
-    picture: File | NDArray[np.uint8]
+    picture: File | Bytes
     _: KW_ONLY
-    mask: File | NDArray[np.bool_] | None = None
+    mask: File | Mask | None = None
     mask_nadir_deg: float = 0.0
     camera: File | Calibration | None = None
     rig: File | Calibration | None = None
@@ -176,7 +176,7 @@ class Photo:
                 "`projection` fisheye: found no `fov_deg`, wanted the angle that the width shows"
             )
 
-    def _check_array(self, picture: NDArray[np.uint8]) -> None:
+    def _check_array(self, picture: Bytes) -> None:
         """Refuse an array that is no picture, and options that need a file."""
         if picture.dtype != np.uint8 or picture.ndim != 3 or picture.shape[2] != 3 or not picture.size:
             found = f"{picture.dtype} of shape {picture.shape}"
@@ -194,6 +194,6 @@ class Photo:
             raise InputError(f"`mask`: found {found}, wanted bool of shape {size}, as the picture's")
 
 
-def as_photo(photo: File | NDArray[np.uint8] | Photo) -> Photo:
+def as_photo(photo: File | Bytes | Photo) -> Photo:
     """Return a photo; a path or an array is one without options."""
     return photo if isinstance(photo, Photo) else Photo(photo)

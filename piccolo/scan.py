@@ -3,12 +3,9 @@
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import repeat
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
 
 from .arguments import check_kind, check_one_each
+from .arrays import Bytes, Floats
 from .cloud.soa import PackedPoints
 from .errors import InputError
 from .files.atomic import check_output
@@ -24,7 +21,7 @@ from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk
 from .walk.motion import Motion
 
-Picture = File | NDArray[np.uint8] | Photo  # a path or an array (H, W, 3) is a photo without options
+Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
 
 class Scan:
@@ -190,7 +187,7 @@ class Scan:
     def localize_walk(
         self,
         frames: Iterable[Picture],
-        times: Sequence[float] | NDArray[np.floating[Any]] | None = None,
+        times: Sequence[float] | Floats | None = None,
         *,
         odometry: Sequence[Pose | None] | None = None,
         motion: Motion | None = None,
@@ -230,7 +227,7 @@ class Scan:
         """
         walk = self.track(motion=motion, prior=prior, gravity=gravity)
         check_kind("frames", frames, Iterable[Picture])
-        check_kind("times", times, Sequence[float] | NDArray[np.floating[Any]] | None)
+        check_kind("times", times, Sequence[float] | Floats | None)
         check_kind("odometry", odometry, Sequence[Pose | None] | None)
         taken = [as_photo(frame) for frame in frames]
         check_one_each("times", times, len(taken), "frame")
@@ -241,7 +238,7 @@ class Scan:
             walk.add(frame, time, odometry=pose)
         return walk.finish()
 
-    def occlusion_mask(self, photo: Picture, pose: Pose) -> NDArray[np.uint8]:
+    def occlusion_mask(self, photo: Picture, pose: Pose) -> Bytes:
         """Return the pixels of a photo that contradict the scan at a pose, such as moved furniture.
 
         The array (H, W) of uint8 is a full sphere, W = 2 H, also for a photo of a part of it: 255 where the

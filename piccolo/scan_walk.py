@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import __version__
 from .arguments import check_kind
+from .arrays import Bytes
 from .confidence.localization import Localization
 from .errors import InputError
 from .files.json_file import reading_once
@@ -80,7 +80,7 @@ class Walk:
 
     def add(
         self,
-        frame: File | NDArray[np.uint8] | Photo,
+        frame: File | Bytes | Photo,
         time: float | None = None,
         name: str | None = None,
         odometry: Pose | None = None,
@@ -96,7 +96,7 @@ class Walk:
         check_kind("name", name, str | None)
         return self.follow(self.prepare(frame, name), time, odometry)
 
-    def prepare(self, frame: File | NDArray[np.uint8] | Photo, name: str | None = None) -> Prepared:
+    def prepare(self, frame: File | Bytes | Photo, name: str | None = None) -> Prepared:
         """Read a frame and prepare what does not depend on other frames; another thread may do it.
 
         Of a live camera, one thread prepares frames and another follows them. Two cores do most with a scan

@@ -141,9 +141,9 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
     """With the gravity `auto`, where the upright search came first, by a brief search."""
     made = []
 
-    def searched(query, gravity):
-        made.append((gravity, query.settings, len(query.scan_map.sparse)))
-        return search_poses(query, gravity)
+    def searched(query, tilts):
+        made.append((tilts, query.settings, len(query.scan_map.sparse)))
+        return search_poses(query, tilts)
 
     monkeypatch.setattr(attempts, "search_poses", searched)
     monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
@@ -152,7 +152,7 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
     assert is_correct(found.pose, taken.pose)
     how, asked, num_searched = made[-1]
     num_candidates = len(rooms.scan_map(1).sparse)
-    assert (how, asked) == ("unknown", replace(settings, **changes))
+    assert (how, asked) == ("any", replace(settings, **changes))
     assert 0.3 < num_searched / num_candidates < 0.7 if changes else num_searched == num_candidates
 
 
@@ -160,17 +160,17 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
     few = whole.narrow(np.arange(len(whole.sparse)) < 7)
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    assert attempts.tilt_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
-    assert 0.3 < len(attempts.tilt_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    assert attempts.thin_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    assert 0.3 < len(attempts.thin_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
 
 
 LOOK = (0, "look_first")
 HALF = (1, "search_part")
 ALL = (2, "search_matches")
-UPRIGHT = (2, {"gravity": "known"})
-ABOUT_LEVEL = (2, {"gravity": "level"})
-TILTED = (2, {"gravity": "unknown", "is_brief": False})
-BRIEFLY = (2, {"gravity": "unknown", "is_brief": True})
+UPRIGHT = (2, {"tilts": "known"})
+ABOUT_LEVEL = (2, {"tilts": "level"})
+TILTED = (2, {"tilts": "any", "is_brief": False})
+BRIEFLY = (2, {"tilts": "any", "is_brief": True})
 
 
 @pytest.mark.parametrize(

@@ -48,6 +48,7 @@ LAYERS = [
     "prior",
     "arguments",
     "errors",
+    "arrays",
 ]
 
 

@@ -18,7 +18,7 @@ from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
-from ..localization.beside import Picture
+from ..localization.beside import SurePhoto
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
@@ -157,11 +157,11 @@ class Localizer:
         return self._answer(scan, task, lambda photo: scan.localize(photo, task.settings))
 
     def answer_again(
-        self, scan: OpenedScan, task: Task, look: Look, locate: Callable[[str], Picture | None]
+        self, scan: OpenedScan, task: Task, look: Look, locate: Callable[[str], SurePhoto | None]
     ) -> Answer:
         """Look at a photo again, beside others; `locate` returns one of these by its result's JSON."""
 
-        def list_pictures() -> dict[str, Picture]:
+        def list_pictures() -> dict[str, SurePhoto]:
             found = ((json.loads(line)["pano"], locate(line)) for line in look.beside)
             return {name: picture for name, picture in found if picture}
 
@@ -177,7 +177,7 @@ class Localizer:
 
         return self._answer(scan, task, localize)
 
-    def locate(self, scan: OpenedScan, line: str) -> Picture | None:
+    def locate(self, scan: OpenedScan, line: str) -> SurePhoto | None:
         """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
         result = Result.from_json(line)
         photo, settings = self.ask(Path(result.pano))

@@ -22,10 +22,9 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..errors import InputError
-from ..geometry.pose import Array
 from ..geometry.sphere import compute_pixels, compute_rays
 
 MAX_STEPS = 25  # of Newton; five are usual
@@ -131,14 +130,12 @@ class Distortion(NamedTuple):
             g + 2.0 * y * y * by_r2 + 2.0 * self.p2 * x + (6.0 * self.p1 + 2.0 * self.sy1) * y,
         )
 
-    def keeps_sides(self, x: Array, y: Array) -> NDArray[np.bool_]:
+    def keeps_sides(self, x: Array, y: Array) -> Mask:
         """Return True where the distortion does not turn the picture inside out."""
         a, b, c, d = self.jacobian(x, y)
         return np.asarray(a * d - b * c > 0.0)
 
-    def invert(
-        self, x_distorted: Array, y_distorted: Array, radii: Array
-    ) -> tuple[Array, Array, NDArray[np.bool_]]:
+    def invert(self, x_distorted: Array, y_distorted: Array, radii: Array) -> tuple[Array, Array, Mask]:
         """Return the (x, y) whose distortion is (x', y'), and where it was found, arrays of one shape.
 
         By Newton, from the inverse of the radial part, which grows over `radii` (N,), the last its limit.
@@ -256,7 +253,7 @@ class Camera:
         """Return the same camera with its picture at another width [px]."""
         return self.scale_to_size(width, max(1, round(width * self.height / self.width)))
 
-    def pixels(self, rays: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def pixels(self, rays: Array) -> tuple[Array, Mask]:
         """Pixels (..., 2) that rays (..., 3) of any length come to, and which are in the picture (...).
 
         Pixels of rays that are not in the picture mean nothing.
@@ -285,7 +282,7 @@ class Camera:
         is_in = is_in & (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
         return np.stack([u, v], axis=-1), is_in
 
-    def rays(self, pixels: Array) -> tuple[Array, NDArray[np.bool_]]:
+    def rays(self, pixels: Array) -> tuple[Array, Mask]:
         """Return unit rays (..., 3) of pixels (..., 2), and which of them there are (...)."""
         u, v = np.moveaxis(np.asarray(pixels, np.float64), -1, 0)
         if self.lens == SPHERE:

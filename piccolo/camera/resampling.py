@@ -10,9 +10,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..arrays import Array, Bytes, Floats, Mask
 from ..geometry.sphere import compute_rays
 from .model import SPHERE
 from .rig import Mount
@@ -26,14 +25,14 @@ LOOK = 8  # [px] every so many it is seen first which blocks a camera shows
 MAX_SAMPLES = 8  # a pixel, across and down
 MAX_SIDE = 32_000  # [px] of what cv2.remap reads
 
-Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]  # rgb (H, W, 3), is_valid (H, W)
+Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
 
 
 class View(NamedTuple):
     """One camera with what it has taken."""
 
     mount: Mount
-    pixels: NDArray[np.uint8]  # (H, W, 4): RGB and 255 where valid, at any size of the camera's shape
+    pixels: Bytes  # (H, W, 4): RGB and 255 where valid, at any size of the camera's shape
 
 
 def sphere_width(mounts: Sequence[Mount]) -> int:
@@ -116,9 +115,7 @@ def _interpolate_between(values: Array, count: int) -> Array:
     return np.asarray(found.reshape(-1, *values.shape[1:]))
 
 
-def _places(
-    view: View, width: int, u: NDArray[np.floating], v: NDArray[np.floating]
-) -> tuple[Array, NDArray[np.bool_]]:
+def _places(view: View, width: int, u: Floats, v: Floats) -> tuple[Array, Mask]:
     """Pixels (h, w, 2) of the picture at columns u (w,), rows v (h,) of the sphere, and which are in it."""
     camera = view.mount.camera
     places, is_in = camera.pixels(compute_rays(u, v[:, None], width) @ view.mount.rotation.T)
@@ -126,7 +123,7 @@ def _places(
     return places * (width_here / camera.width, height_here / camera.height), is_in
 
 
-def _num_samples(places: Array, is_in: NDArray[np.bool_]) -> int:
+def _num_samples(places: Array, is_in: Mask) -> int:
     """Return the number of samples a pixel needs in each direction, for the largest step between cells."""
     across = np.linalg.norm(np.diff(places, axis=1), axis=2)[is_in[:, 1:] & is_in[:, :-1]]
     down = np.linalg.norm(np.diff(places, axis=0), axis=2)[is_in[1:] & is_in[:-1]]

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError, unreadable
-from ..geometry.pose import Array, Pose, check_pose
+from ..geometry.pose import Pose, check_pose
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

@@ -5,17 +5,13 @@ from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ..arrays import Bytes
 from ..files.atomic import replacing
 from ..optional import import_optional
 
 
 @contextmanager
-def writing_video(
-    path: Path, rate: float, size: tuple[int, int]
-) -> Iterator[Callable[[NDArray[np.uint8]], None]]:
+def writing_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Callable[[Bytes], None]]:
     """Yield a function that takes the frames (H, W, 3) of an MP4 video (H.264), `rate` a second.
 
     `size` (W, H) is even both ways. Raises InputError if PyAV is not there.
@@ -27,7 +23,7 @@ def writing_video(
         stream.pix_fmt = "yuv420p"
         stream.options = {"crf": "18"}  # nothing to be seen is lost
 
-        def add(rgb: NDArray[np.uint8]) -> None:
+        def add(rgb: Bytes) -> None:
             container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
 
         yield add

@@ -7,6 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Bytes, Floats, Int32s, Mask
+
 NUM_LEVELS = 16  # of a channel that colours are made of
 NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not fall together
 
@@ -17,13 +19,13 @@ class Labels:
 
     ignored: tuple[int, ...] = ()  # values that say nothing: masked in panoramas, left out of clouds
 
-    def are_kept(self, labels: NDArray[np.integer]) -> NDArray[np.bool_]:
+    def are_kept(self, labels: NDArray[np.integer]) -> Mask:
         """Return True for the labels (...) that are not ignored."""
         return np.isin(labels, self.ignored, invert=True)
 
 
 @functools.cache
-def palette() -> NDArray[np.uint8]:
+def palette() -> Bytes:
     """Return RGB (NUM_COLORS, 3), each the colour of a grid farthest from all before it; none is black.
 
     The loss is a norm in RGB: a label mistaken for another costs their distance.
@@ -40,12 +42,12 @@ def palette() -> NDArray[np.uint8]:
     return colors
 
 
-def label_colors(labels: NDArray[np.integer]) -> NDArray[np.uint8]:
+def label_colors(labels: NDArray[np.integer]) -> Bytes:
     """Return the colour (..., 3) of each label (...); labels equal modulo NUM_COLORS have the same colour."""
     return np.asarray(palette()[labels % NUM_COLORS])
 
 
-def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> NDArray[np.int32]:
+def pack_rgbx(rgb: Bytes, is_valid: Mask | None = None) -> Int32s:
     """Pack each colour (..., 3) into an int32 (...): R, G, B from the lowest byte up, then 1 where valid."""
     shape = rgb.shape[:-1]
     if 0 in shape:
@@ -57,14 +59,12 @@ def pack_rgbx(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None)
     return rgbx.view("<i4").reshape(shape).astype(np.int32, copy=False)
 
 
-def unpack_rgb(rgbx: NDArray[np.int32]) -> NDArray[np.uint8]:
+def unpack_rgb(rgbx: Int32s) -> Bytes:
     """Return the colours (N, 3) that `pack_rgbx` packed (N,)."""
     return np.ascontiguousarray(rgbx.astype("<i4")).view(np.uint8).reshape(-1, 4)[:, :3]
 
 
-def colors_of_edges(
-    strength: NDArray[np.floating], vertical: NDArray[np.floating], gray: NDArray[np.floating] | float
-) -> NDArray[np.uint8]:
+def colors_of_edges(strength: Floats, vertical: Floats, gray: Floats | float) -> Bytes:
     """Return the colours (..., 3) that stand for edges (...) in [0, 1], the vertical ones, and a grey.
 
     (2 G - R - B) / 4 is the strength, (R - B) / 2 that of vertical edges minus that of others, luminance the

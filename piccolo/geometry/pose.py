@@ -7,11 +7,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array as Array  # noqa: PLC0414  # other rooms import it from here
 from ..errors import InputError
 
-Array = NDArray[np.float64]
 NEWTON_STEPS = 4  # from an error of 5 % to rounding
 MAX_DISTANCE = 0.1  # [m] the paper's line between correct and wrong
 MAX_ANGLE = math.radians(5.0)

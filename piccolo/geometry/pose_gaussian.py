@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .pose import MAX_DISTANCE, Array, Pose, exp_so3, log_so3, orthonormal, skew
+from ..arrays import Array
+from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, skew
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
 LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible

@@ -9,9 +9,9 @@ from functools import lru_cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .pose import Array, Pose, exp_so3, rotation_from_quaternion_wxyz, yaw_rotation
+from ..arrays import Array
+from .pose import Pose, exp_so3, rotation_from_quaternion_wxyz, yaw_rotation
 
 # of a query: known: the camera is upright, up to yaw; unknown: any rotation; auto: both are tried
 Gravity = Literal["auto", "known", "unknown"]
@@ -25,13 +25,13 @@ CAMERA_AXES = {"optical": OPTICAL_FROM_CAM, "piccolo": np.eye(3)}  # by the name
 DECIMALS = 9  # of degrees
 
 
-def uniform_yaws(num_rotations: int) -> NDArray[np.float64]:
+def uniform_yaws(num_rotations: int) -> Array:
     """Return R_cam_from_world (num_rotations, 3, 3) of an upright camera at evenly spaced yaws."""
     return np.stack([yaw_rotation(2.0 * math.pi * k / num_rotations) for k in range(num_rotations)])
 
 
 @lru_cache(maxsize=4)
-def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
+def uniform_rotations(num_rotations: int) -> Array:
     """Return rotations (num_rotations, 3, 3) spread evenly over SO(3) by the super-Fibonacci spiral."""
     s = np.arange(num_rotations) + 0.5
     r = np.sqrt(s / num_rotations)
@@ -44,7 +44,7 @@ def uniform_rotations(num_rotations: int) -> NDArray[np.float64]:
     return rotations
 
 
-def random_rotation(rng: np.random.Generator) -> NDArray[np.float64]:
+def random_rotation(rng: np.random.Generator) -> Array:
     """Draw a rotation (3, 3) evenly from SO(3) (Shoemake, 1992: a normalised Gaussian quaternion)."""
     quaternion = rng.normal(size=4)
     return rotation_from_quaternion_wxyz(quaternion / np.linalg.norm(quaternion))

@@ -13,8 +13,8 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Floats, Int32s, Int64s
 from ..kernels.jit import F0, HALF, Scalar, inline_kernel
 
 PI = np.float32(math.pi)
@@ -83,12 +83,12 @@ def pixel_jacobian(
     return y * per_rho2, -x * per_rho2, x * z * per_rho_r2, y * z * per_rho_r2, -rho2 * per_rho_r2
 
 
-def pixel_rays(width: int, rows: slice = slice(None)) -> NDArray[np.float64]:
+def pixel_rays(width: int, rows: slice = slice(None)) -> Array:
     """Return the unit camera directions (width / 2, width, 3) of pixel centres, or of some `rows` of them."""
     return compute_rays(np.arange(width) + 0.5, np.arange(width // 2)[rows, None] + 0.5, width)
 
 
-def compute_rays(u: Any, v: Any, width: int) -> NDArray[np.float64]:
+def compute_rays(u: Any, v: Any, width: int) -> Array:
     """Return the unit camera directions (..., 3) of continuous pixels u, v (...) in an image of `width`."""
     azimuth = (0.5 - u / width) * 2.0 * np.pi
     elevation = (0.5 - v / (width / 2.0)) * np.pi
@@ -99,9 +99,7 @@ def compute_rays(u: Any, v: Any, width: int) -> NDArray[np.float64]:
     return rays
 
 
-def compute_pixels(
-    rays: NDArray[np.floating], width: int
-) -> tuple[NDArray[np.floating], NDArray[np.floating]]:
+def compute_pixels(rays: Floats, width: int) -> tuple[Floats, Floats]:
     """Return the continuous pixels u, v (...) of camera directions (..., 3) in an image of `width`."""
     x, y, z = np.moveaxis(rays, -1, 0)
     u = (0.5 - np.arctan2(y, x) / (2.0 * np.pi)) * width
@@ -109,13 +107,13 @@ def compute_pixels(
     return u, v
 
 
-def compute_indices(rays: NDArray[np.floating], width: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def compute_indices(rays: Floats, width: int) -> tuple[Int64s, Int64s]:
     """Return rows and columns (...) of the pixels that contain directions (..., 3) in an image of `width`."""
     u, v = compute_pixels(rays, width)
     return np.minimum(v.astype(np.int64), width // 2 - 1), u.astype(np.int64) % width
 
 
-def ray_jacobian(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def ray_jacobian(rays: Array) -> tuple[Array, Array]:
     """Return the gradients (H, W, 3) of u and of v in camera coordinates, at `pixel_rays`, 1 m away."""
     x, y, z = np.moveaxis(rays, -1, 0)
     rho = np.hypot(x, y)
@@ -125,7 +123,7 @@ def ray_jacobian(rays: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArra
     return scale * by_u, scale * by_v
 
 
-def solid_angles(width: int) -> NDArray[np.float64]:
+def solid_angles(width: int) -> Array:
     """Return the solid angle [sr] of a pixel of each row (width / 2,); exact: all pixels' sum to 4 pi."""
     edges = np.sin((0.5 - np.arange(width // 2 + 1) / (width // 2)) * np.pi)
     return np.asarray((edges[:-1] - edges[1:]) * 2.0 * np.pi / width)
@@ -135,10 +133,10 @@ def solid_angles(width: int) -> NDArray[np.float64]:
 class SphereGrid:
     """`num_rings` rings of equal height; ring i has about 2 num_rings cos(elevation) cells."""
 
-    num_columns: NDArray[np.int32]  # (rings,) cells of each ring
-    first: NDArray[np.int32]  # (rings,) index of its first cell
-    directions: NDArray[np.float32]  # (cells, 3) unit vectors of the cell centres
-    solid_angle: NDArray[np.float32]  # (cells,) fractions of the sphere, sum 1
+    num_columns: Int32s  # (rings,) cells of each ring
+    first: Int32s  # (rings,) index of its first cell
+    directions: Array32  # (cells, 3) unit vectors of the cell centres
+    solid_angle: Array32  # (cells,) fractions of the sphere, sum 1
 
     def __len__(self) -> int:
         return len(self.solid_angle)
@@ -148,9 +146,9 @@ class SphereGrid:
 class Neighbors:
     """Gaussian weights from the cells of one grid to those of another, as compressed rows."""
 
-    row: NDArray[np.int32]  # (cells + 1,)
-    cell: NDArray[np.int32]
-    weight: NDArray[np.float32]  # not normalised: the valid weights are summed where they are used
+    row: Int32s  # (cells + 1,)
+    cell: Int32s
+    weight: Array32  # not normalised: the valid weights are summed where they are used
 
 
 @lru_cache(maxsize=8)
@@ -186,7 +184,7 @@ def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
 
 
 @lru_cache(maxsize=8)
-def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def interpolation(num_rings: int, coarse_rings: int) -> tuple[Int32s, Array32]:
     """Return the cells (cells, 4) of a coarser grid around each cell's centre, and their bilinear weights.
 
     The four are two cells in each of two rings; beyond the last ring that ring is used again, on the other
@@ -212,7 +210,7 @@ def interpolation(num_rings: int, coarse_rings: int) -> tuple[NDArray[np.int32],
 
 
 @lru_cache(maxsize=4)
-def wider_cells(num_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
+def wider_cells(num_rings: int) -> tuple[Int32s, Array32]:
     """Return, for each search cell, the cell of `num_rings` that it lies in, and the areas (cells,) of those.
 
     The area is the sum of the search cells' `whole_areas`.
@@ -222,13 +220,13 @@ def wider_cells(num_rings: int) -> tuple[NDArray[np.int32], NDArray[np.float32]]
     return cells, areas.astype(np.float32)
 
 
-def whole_areas(num_rings: int) -> NDArray[np.float32]:
+def whole_areas(num_rings: int) -> Array32:
     """Return the solid angles (cells,) of a grid in whole numbers up to AREA_UNITS: their sums are exact."""
     area = make_grid(num_rings).solid_angle
     return np.asarray(np.rint(area / area.max() * np.float32(AREA_UNITS)))
 
 
-def find_cell(directions: NDArray[np.float32], num_rings: int) -> NDArray[np.int32]:
+def find_cell(directions: Array32, num_rings: int) -> Int32s:
     """Return the cell (N,) of a grid in which each direction (N, 3) lies."""
     d = directions.astype(np.float64)
     grid = make_grid(num_rings)

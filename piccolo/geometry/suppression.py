@@ -3,21 +3,15 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Int64s
 from ..kernels.jit import copy_to, kernel
 from .nearness import Nearness
 from .vectors import dot, minus, row
 
 
 @kernel
-def suppress(
-    rotations: NDArray[np.float64],
-    centers: NDArray[np.float64],
-    min_distance: float,
-    min_trace: float,
-    kept: NDArray[np.int64],
-) -> int:
+def suppress(rotations: Array, centers: Array, min_distance: float, min_trace: float, kept: Int64s) -> int:
     """Write the indices of the poses, best first, that are near none kept before; return their number."""
     places = np.empty((len(kept), 3))
     count = 0
@@ -41,12 +35,7 @@ def suppress(
     return count
 
 
-def non_maximum_suppression(
-    rotations: NDArray[np.float64],
-    centers: NDArray[np.float64],
-    count: int,
-    near: Nearness,
-) -> NDArray[np.int64]:
+def non_maximum_suppression(rotations: Array, centers: Array, count: int, near: Nearness) -> Int64s:
     """Return the indices of at most `count` poses (n, 3, 3), (n, 3), best first, near no better one."""
     kept = np.empty(count, np.int64)
     min_trace = 1.0 + 2.0 * math.cos(near.angle)

@@ -1,13 +1,8 @@
 """Vectors of three numbers in kernels: tuples, or arrays (3,) that are read."""
 
-from typing import Any
-
-import numpy as np
-from numpy.typing import NDArray
-
+from ..arrays import Floats
 from ..kernels.jit import Scalar, inline_kernel
 
-Floats = NDArray[np.floating[Any]]
 Triple = tuple[Scalar, Scalar, Scalar]
 Vector = Triple | Floats
 

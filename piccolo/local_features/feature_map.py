@@ -7,8 +7,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Int8s, Int32s, Int64s, Mask
 from ..cloud.octree import Octree
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
 from ..jobs.threads import Workers
@@ -34,7 +35,7 @@ MAX_VIEWS = 2500  # some minutes and 0.4 GB
 WIDER = 1.5  # growth of the spacing where there would be more
 ABOVE_LOWEST = 1.0  # [m] first are positions so high above the lowest around
 HEIGHT_STEP = 0.3  # [m]
-Look = Callable[[int], NDArray[np.float32]]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
+Look = Callable[[int], Array32]  # ranges (cells,) [m] seen from a candidate, 0 for nothing
 CELL = np.array([2.5, 2.5, 3.0])  # [m] around: a part of a storey
 TABLE_HEIGHT = 48  # rows of directions, 3.75 degrees each
 SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
@@ -43,27 +44,27 @@ SLACK = 1.0  # [m] a wall is so much nearer than what is behind it
 class FeatureMap(NamedTuple):
     """Local features in the map's frame, sorted by the list that each is in."""
 
-    points: NDArray[np.float32]  # (F, 3) [m]
-    directions: NDArray[np.int8]  # (F, 3) from the camera to the point, times 127
-    tangents: NDArray[np.int8]  # (F, 3) in which the keypoint points, across the direction, times 127
-    sizes: NDArray[np.float32]  # (F,) diameter [m]
-    descriptors: NDArray[np.int8]  # (F, NUM_COMPONENTS)
+    points: Array32  # (F, 3) [m]
+    directions: Int8s  # (F, 3) from the camera to the point, times 127
+    tangents: Int8s  # (F, 3) in which the keypoint points, across the direction, times 127
+    sizes: Array32  # (F,) diameter [m]
+    descriptors: Int8s  # (F, NUM_COMPONENTS)
     views: NDArray[np.uint16]  # (F,) index of the view that each is from
-    view_centers: NDArray[np.float64]  # (V, 3) [m]
+    view_centers: Array  # (V, 3) [m]
     mean: NDArray[np.int16]  # (128,) of the descriptors, and
-    components: NDArray[np.int8]  # (128, NUM_COMPONENTS) their principal components, times 127
-    middles: NDArray[np.int8]  # (L, NUM_COMPONENTS) of the lists
-    list_start: NDArray[np.int32]  # (L + 1,) where each begins
+    components: Int8s  # (128, NUM_COMPONENTS) their principal components, times 127
+    middles: Int8s  # (L, NUM_COMPONENTS) of the lists
+    list_start: Int32s  # (L + 1,) where each begins
 
 
 class FeaturesOfView(NamedTuple):
     """Features of one view: arrays of FeatureMap, but whole descriptors (F, 128)."""
 
-    points: NDArray[np.float32]
-    directions: NDArray[np.int8]
-    tangents: NDArray[np.int8]
-    sizes: NDArray[np.float32]
-    descriptors: NDArray[np.uint8]
+    points: Array32
+    directions: Int8s
+    tangents: Int8s
+    sizes: Array32
+    descriptors: Bytes
 
 
 _ROWS = np.empty((0, 3), np.int8)
@@ -76,7 +77,7 @@ NO_FEATURES = FeaturesOfView(
 )
 
 
-def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> FeaturesOfView:
+def extract_view_features(octree: Octree, center_map: Array) -> FeaturesOfView:
     """Find the features seen from a centre (3,) [m] whose ray meets the scan within MAX_RANGE."""
     is_drawn = np.ones((VIEW_WIDTH // 2, VIEW_WIDTH), np.bool_)
     image = render_gray(octree, Pose(np.eye(3), center_map), is_drawn)
@@ -94,7 +95,7 @@ def extract_view_features(octree: Octree, center_map: NDArray[np.float64]) -> Fe
     )
 
 
-def principal_components(descriptors: NDArray[np.uint8]) -> tuple[NDArray[np.int16], NDArray[np.int8]]:
+def principal_components(descriptors: Bytes) -> tuple[NDArray[np.int16], Int8s]:
     """Return mean (128,) and first components (128, NUM_COMPONENTS), times 127, of descriptors (N, 128)."""
     values = descriptors.astype(np.float64)
     mean = np.rint(values.sum(axis=0) / max(len(values), 1))
@@ -104,9 +105,7 @@ def principal_components(descriptors: NDArray[np.uint8]) -> tuple[NDArray[np.int
     return mean.astype(np.int16), np.rint(axes * 127.0).astype(np.int8)
 
 
-def project(
-    descriptors: NDArray[np.uint8], mean: NDArray[np.int16], components: NDArray[np.int8]
-) -> NDArray[np.int8]:
+def project(descriptors: Bytes, mean: NDArray[np.int16], components: Int8s) -> Int8s:
     """Return the components (N, NUM_COMPONENTS) of descriptors (N, 128).
 
     Sums of whole numbers below 2^24 are exact in float32.
@@ -120,7 +119,7 @@ def project(
 
 
 @inline_kernel
-def squared_gap(first: NDArray[np.int8], second: NDArray[np.int8]) -> np.int32:
+def squared_gap(first: Int8s, second: Int8s) -> np.int32:
     """Return the squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits.
 
     Numba makes 64 bits of products of 32 bits; cut to 32 again, 16 are computed at a time.
@@ -133,9 +132,7 @@ def squared_gap(first: NDArray[np.int8], second: NDArray[np.int8]) -> np.int32:
 
 
 @kernel
-def nearest_middle(
-    descriptors: NDArray[np.int8], middles: NDArray[np.int8], nearest: NDArray[np.int32]
-) -> None:
+def nearest_middle(descriptors: Int8s, middles: Int8s, nearest: Int32s) -> None:
     """Write the index of the nearest middle (L, D) of each descriptor (N, D)."""
     for i in range(len(descriptors)):
         best = np.int32(2147483647)
@@ -146,7 +143,7 @@ def nearest_middle(
                 nearest[i] = k
 
 
-def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.int8]:
+def list_middles(descriptors: Int8s, num_lists: int) -> Int8s:
     """Cluster an even sample of descriptors (N, D) by Lloyd's k-means; return the middles (num_lists, D)."""
     sample = descriptors[:: 1 + len(descriptors) // SAMPLE]
     if len(sample) == 0:
@@ -163,7 +160,7 @@ def list_middles(descriptors: NDArray[np.int8], num_lists: int) -> NDArray[np.in
 
 
 def find_features(
-    octree: Octree, centers: NDArray[np.float64], workers: Workers
+    octree: Octree, centers: Array, workers: Workers
 ) -> tuple[FeaturesOfView, NDArray[np.uint16]]:
     """Find the features seen from centres (N, 3) [m]; return them and the index (F,) of the view of each."""
     views = list(workers.map(lambda c: extract_view_features(octree, c), list(centers), "find features"))
@@ -179,8 +176,8 @@ def num_lists(num_features: int) -> int:
 
 def put_in_lists(
     of_points: Sequence[NDArray[Any]],
-    of_all: tuple[NDArray[np.float64], NDArray[np.int16], NDArray[np.int8]],
-    middles: NDArray[np.int8],
+    of_all: tuple[Array, NDArray[np.int16], Int8s],
+    middles: Int8s,
     workers: Workers,
 ) -> FeatureMap:
     """Sort features into the lists that have these middles; return the map.
@@ -200,7 +197,7 @@ def put_in_lists(
     return FeatureMap(*arrays)
 
 
-def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Workers) -> FeatureMap:
+def make_feature_map(octree: Octree, centers: Array, workers: Workers) -> FeatureMap:
     """Make the map of the features seen from centres (N, 3) [m]."""
     found, views = find_features(octree, centers, workers)
     mean, components = principal_components(found.descriptors[:: 1 + len(found.points) // SAMPLE])
@@ -212,11 +209,7 @@ def make_feature_map(octree: Octree, centers: NDArray[np.float64], workers: Work
 
 
 def extend_feature_map(
-    old: FeatureMap,
-    is_kept: NDArray[np.bool_],
-    octree: Octree,
-    centers: NDArray[np.float64],
-    workers: Workers,
+    old: FeatureMap, is_kept: Mask, octree: Octree, centers: Array, workers: Workers
 ) -> FeatureMap:
     """Keep the features of some of the views (V,), and add those seen from more centres (N, 3) [m].
 
@@ -241,13 +234,7 @@ def extend_feature_map(
 
 @kernel
 def next_unseen(
-    order: NDArray[np.int64],
-    begin: int,
-    centers: Array,
-    kept: NDArray[np.int64],
-    ranges: NDArray[np.float32],
-    cells: NDArray[np.int32],
-    spacing: float,
+    order: Int64s, begin: int, centers: Array, kept: Int64s, ranges: Array32, cells: Int32s, spacing: float
 ) -> int:
     """Return the first place in `order`, from `begin`, whose position none of the kept ones (k,) sees nearby.
 
@@ -273,13 +260,13 @@ def next_unseen(
     return len(order)
 
 
-def cell_table(num_rings: int) -> NDArray[np.int32]:
+def cell_table(num_rings: int) -> Int32s:
     """Return the grid cell (h, 2 h) at each pixel of an equirectangular table of directions."""
     rays = pixel_rays(2 * TABLE_HEIGHT).astype(np.float32)
     return find_cell(rays.reshape(-1, 3), num_rings).reshape(rays.shape[:2])
 
 
-def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 0) -> NDArray[np.int64]:
+def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 0) -> Int64s:
     """Choose the candidates (N, 3) [m] from which features are taken; return at most MAX_VIEWS indices.
 
     The first `num_known` have features already: they are not returned. `look` returns the ranges that a
@@ -301,13 +288,8 @@ def view_positions(centers: Array, look: Look, num_rings: int, num_known: int = 
 
 
 def choose(
-    order: NDArray[np.int64],
-    centers: Array,
-    num_known: int,
-    look: Look,
-    cells: NDArray[np.int32],
-    spacing: float,
-) -> NDArray[np.int64] | None:
+    order: Int64s, centers: Array, num_known: int, look: Look, cells: Int32s, spacing: float
+) -> Int64s | None:
     """Choose, in order, each position that no known or chosen one sees; None if they exceed MAX_VIEWS."""
     room = num_known + MAX_VIEWS
     kept = np.arange(room)

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int64s, Mask
 from ..geometry.nearness import MATCHED, VOTED
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
@@ -142,14 +143,7 @@ def write_turned(m: Matches, j: int, R: Array) -> None:
 
 
 @inline_kernel
-def find_near(
-    points: NDArray[np.float32],
-    rays: NDArray[np.float32],
-    R: Array,
-    t: Array,
-    cos2: np.float32,
-    is_near: NDArray[np.bool_],
-) -> None:
+def find_near(points: Array32, rays: Array32, R: Array, t: Array, cos2: np.float32, is_near: Mask) -> None:
     """Write the mask (M,) of the matches whose points (3, M) a pose puts near their rays (3, M).
 
     This rules out most matches, in float32. The squared cosine `cos2` is a little below that of the exact
@@ -163,7 +157,7 @@ def find_near(
 
 
 @inline_kernel
-def agreeing_weight(m: Matches, is_near: NDArray[np.bool_], R: Array, t: Array) -> Scalar:
+def agreeing_weight(m: Matches, is_near: Mask, R: Array, t: Array) -> Scalar:
     """Sum, over the photo's features, the largest weight of a match that roughly agrees with a pose."""
     total: Scalar = 0.0
     last = -1
@@ -183,7 +177,7 @@ def agreeing_weight(m: Matches, is_near: NDArray[np.bool_], R: Array, t: Array) 
 @kernel
 def rough_poses(
     matches: Matches,
-    columns: tuple[NDArray[np.float32], NDArray[np.float32]],
+    columns: tuple[Array32, Array32],
     voters: NDArray[np.intp],
     R_cam_from_level: Array,
     is_upright: bool,
@@ -212,14 +206,7 @@ def rough_poses(
 
 
 @inline_kernel
-def count_exact(
-    m: Matches,
-    members: NDArray[np.int64],
-    columns: NDArray[np.float32],
-    is_near: NDArray[np.bool_],
-    R: Array,
-    t: Array,
-) -> int:
+def count_exact(m: Matches, members: Int64s, columns: Array32, is_near: Mask, R: Array, t: Array) -> int:
     """Count the photo's features of which a match among `members` (n,) agrees with a pose within a degree.
 
     `columns` (6, n) are the members' points and rays; `is_near` (n,) is overwritten.
@@ -238,8 +225,8 @@ def count_exact(
 @kernel
 def sample_poses(
     matches: Matches,
-    members: NDArray[np.int64],
-    columns: NDArray[np.float32],
+    members: Int64s,
+    columns: Array32,
     up_cam: Array,
     cos_tilt: float,
     R_best: Array,
@@ -279,11 +266,11 @@ def sample_poses(
 @kernel
 def list_members(
     matches: Matches,
-    columns: tuple[NDArray[np.float32], NDArray[np.float32]],
+    columns: tuple[Array32, Array32],
     R_cam_from_map: Array,
     center_map: Array,
     cos_rough: float,
-    members: NDArray[np.int64],
+    members: Int64s,
 ) -> int:
     """Write the indices of the matches that agree with a pose; return their number.
 
@@ -299,12 +286,12 @@ def list_members(
     return count
 
 
-def transpose_matches(matches: Matches) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def transpose_matches(matches: Matches) -> tuple[Array32, Array32]:
     """Return the matches' points and rays, transposed to (3, M) each."""
     return np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
 
 
-def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> NDArray[np.int64]:
+def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> Int64s:
     """Return the indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
     R = pose.R_cam_from_world
@@ -364,7 +351,7 @@ def propose_poses(
     order = np.argsort(-votes, kind="stable")
     kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
 
-    def exact_ones(clusters: NDArray[np.int64]) -> list[MatchedPose]:
+    def exact_ones(clusters: Int64s) -> list[MatchedPose]:
         rough = [Pose(rotations[k], centers[k]) for k in clusters]
         ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
         return [end for end in ends if end]

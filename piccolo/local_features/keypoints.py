@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes, Int64s, Mask
 from ..jobs.threads import Workers
 from .perspective_view import PerspectiveView
 
@@ -18,12 +18,12 @@ ALONE = Workers()
 class Keypoints(NamedTuple):
     """Keypoints of one sphere, in the axes of its picture."""
 
-    rays: NDArray[np.float32]  # (N, 3) unit directions
-    tangents: NDArray[np.float32]  # (N, 3) unit directions across the ray in which the keypoint points
-    sizes: NDArray[np.float32]  # (N,) diameter [rad]
-    descriptors: NDArray[np.uint8]  # (N, 128) RootSIFT (Arandjelovic, Zisserman 2012), times 255
+    rays: Array32  # (N, 3) unit directions
+    tangents: Array32  # (N, 3) unit directions across the ray in which the keypoint points
+    sizes: Array32  # (N,) diameter [rad]
+    descriptors: Bytes  # (N, 128) RootSIFT (Arandjelovic, Zisserman 2012), times 255
 
-    def take(self, indices: NDArray[np.int64]) -> "Keypoints":
+    def take(self, indices: Int64s) -> "Keypoints":
         """Return the keypoints at `indices`."""
         taken: list[Any] = [values[indices] for values in self]
         return Keypoints(*taken)
@@ -37,10 +37,7 @@ class Keypoints(NamedTuple):
 
 
 def find_keypoints(
-    gray: NDArray[np.uint8],
-    is_valid: NDArray[np.bool_],
-    views: Sequence[PerspectiveView],
-    workers: Workers = ALONE,
+    gray: Bytes, is_valid: Mask, views: Sequence[PerspectiveView], workers: Workers = ALONE
 ) -> Keypoints:
     """Find the keypoints of the valid part of an equirectangular picture (H, W), W = 2 H, in some views."""
 
@@ -51,7 +48,7 @@ def find_keypoints(
     return join_keypoints(list(workers.map(find, views, "find keypoints")))
 
 
-def find_in_view(image: NDArray[np.uint8], shown: NDArray[np.uint8], view: PerspectiveView) -> Keypoints:
+def find_in_view(image: Bytes, shown: Bytes, view: PerspectiveView) -> Keypoints:
     """Find the keypoints in a picture (h, w) of a view where `shown` (h, w) is not 0."""
     inner = cv2.bitwise_and(cv2.erode(shown, np.ones((3, 3), np.uint8)), view.is_own)
     if not inner.any():
@@ -72,9 +69,7 @@ def _nothing() -> Keypoints:
     return Keypoints(three, three, np.empty(0, np.float32), np.empty((0, DESCRIPTOR_SIZE), np.uint8))
 
 
-def _on_sphere(
-    found: Sequence[cv2.KeyPoint], shares: NDArray[np.float32], view: PerspectiveView
-) -> Keypoints:
+def _on_sphere(found: Sequence[cv2.KeyPoint], shares: Array32, view: PerspectiveView) -> Keypoints:
     """Convert a view's keypoints to rays, and their SIFT descriptors (N, 128) to RootSIFT."""
     height, width = view.rows.shape
     per_px = view.pixel

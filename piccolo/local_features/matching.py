@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array32, Int8s, Int32s, Mask
 from ..geometry.vectors import dot, minus, row
 from ..jobs.threads import Workers
 from ..kernels.jit import inline_kernel, kernel
@@ -24,17 +25,17 @@ FAR = np.int32(2147483647)
 class Matches(NamedTuple):
     """Pairs of a feature of the photo and one of the map, in the order of the photo's features."""
 
-    query: NDArray[np.int32]  # (M,) index of the photo's feature
-    rays: NDArray[np.float32]  # (M, 3) in the camera's frame
-    ray_tangents: NDArray[np.float32]  # (M, 3)
-    angles: NDArray[np.float32]  # (M,) diameter [rad]
-    points: NDArray[np.float32]  # (M, 3) [m] in the map's frame
-    directions: NDArray[np.float32]  # (M, 3) from which the map knows it, camera to point
-    tangents: NDArray[np.float32]  # (M, 3)
-    sizes: NDArray[np.float32]  # (M,) diameter [m]
-    weights: NDArray[np.float32]  # (M,) 1 of a distinct one, else LEAST_WEIGHT
+    query: Int32s  # (M,) index of the photo's feature
+    rays: Array32  # (M, 3) in the camera's frame
+    ray_tangents: Array32  # (M, 3)
+    angles: Array32  # (M,) diameter [rad]
+    points: Array32  # (M, 3) [m] in the map's frame
+    directions: Array32  # (M, 3) from which the map knows it, camera to point
+    tangents: Array32  # (M, 3)
+    sizes: Array32  # (M,) diameter [m]
+    weights: Array32  # (M,) 1 of a distinct one, else LEAST_WEIGHT
 
-    def take(self, kept: NDArray[np.integer] | NDArray[np.bool_]) -> "Matches":
+    def take(self, kept: NDArray[np.integer] | Mask) -> "Matches":
         """Return the matches at indices, or of a mask (M,)."""
         taken: list[Any] = [values[kept] for values in self]
         return Matches(*taken)
@@ -46,13 +47,7 @@ NO_MATCHES = Matches(np.empty(0, np.int32), _ROWS, _ROWS, _NUMBERS, _ROWS, _ROWS
 
 
 @inline_kernel
-def place_taken(
-    points: NDArray[np.float32],
-    f: int,
-    total: np.int32,
-    found: NDArray[np.int32],
-    distances: NDArray[np.int32],
-) -> int:
+def place_taken(points: Array32, f: int, total: np.int32, found: Int32s, distances: Int32s) -> int:
     """Return the index, among the features kept (K,), that feature `f` replaces; -1 if it replaces none.
 
     It competes with one within APART of it, and replaces that if it is nearer, `total` being its squared
@@ -68,9 +63,7 @@ def place_taken(
 
 
 @inline_kernel
-def put_in_order(
-    at: int, value: int, total: np.int32, values: NDArray[np.int32], totals: NDArray[np.int32]
-) -> None:
+def put_in_order(at: int, value: int, total: np.int32, values: Int32s, totals: Int32s) -> None:
     """Replace the value at `at` by another, moved forward past all (K,) with a larger total."""
     while at > 0 and totals[at - 1] > total:
         values[at] = values[at - 1]
@@ -82,13 +75,13 @@ def put_in_order(
 
 @kernel
 def search_lists(
-    descriptors: NDArray[np.int8],
-    probes: NDArray[np.int32],
-    map_descriptors: NDArray[np.int8],
-    list_start: NDArray[np.int32],
-    points: NDArray[np.float32],
-    found: NDArray[np.int32],
-    distances: NDArray[np.int32],
+    descriptors: Int8s,
+    probes: Int32s,
+    map_descriptors: Int8s,
+    list_start: Int32s,
+    points: Array32,
+    found: Int32s,
+    distances: Int32s,
 ) -> None:
     """Write the nearest features (N, K) of the map, of one place only the nearest, and squared distances.
 
@@ -109,9 +102,7 @@ def search_lists(
 
 
 @kernel
-def nearest_lists(
-    descriptors: NDArray[np.int8], middles: NDArray[np.int8], probes: NDArray[np.int32]
-) -> None:
+def nearest_lists(descriptors: Int8s, middles: Int8s, probes: Int32s) -> None:
     """Write the indices (N, P) of the middles nearest to each descriptor, nearest first."""
     best = np.empty(probes.shape[1], np.int32)
     for i in range(len(descriptors)):

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from ..geometry.pose import Array
+from ..arrays import Array
 from ..geometry.vectors import Triple, Vector, cross, dot, minus, row
 from ..kernels.jit import Scalar, inline_kernel, kernel
 

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..arrays import Array, Array32, Bytes, Floats, Int64s, Mask
 from ..geometry.sphere import compute_pixels, pixel_rays
 
 FIELD_DEG = 65.0  # of a view of the set, across
@@ -27,9 +26,9 @@ class PerspectiveView(NamedTuple):
 
     R_sphere_from_view: Array  # (3, 3), +x the view's middle, +y left, +z up
     pixel: float  # width of a pixel, at a distance of 1
-    columns: NDArray[np.float32]  # (h, w) of each pixel in the sphere's picture with its margin
-    rows: NDArray[np.float32]
-    is_own: NDArray[np.uint8]  # (h, w) 255 where no other view's middle is nearer, and a little beyond
+    columns: Array32  # (h, w) of each pixel in the sphere's picture with its margin
+    rows: Array32
+    is_own: Bytes  # (h, w) 255 where no other view's middle is nearer, and a little beyond
     middles: Array  # (N, 3) of the views of the set
     place: int  # of this one among them
 
@@ -38,20 +37,20 @@ class PerspectiveView(NamedTuple):
         """Focal length [px]."""
         return 1.0 / self.pixel
 
-    def cut(self, picture: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    def cut(self, picture: Bytes) -> Bytes:
         """Cut the view (h, w) out of a sphere's picture (H, W)."""
         return np.asarray(cv2.remap(add_margin(picture), self.columns, self.rows, cv2.INTER_LINEAR), np.uint8)
 
-    def cut_mask(self, is_valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    def cut_mask(self, is_valid: Mask) -> Bytes:
         """Cut the view (h, w) out of a sphere's mask (H, W): 255 where it is valid."""
         mask = add_margin(is_valid.view(np.uint8) * np.uint8(255))
         return np.asarray(cv2.remap(mask, self.columns, self.rows, cv2.INTER_NEAREST), np.uint8)
 
-    def find_own(self, rays: NDArray[np.floating]) -> NDArray[np.int64]:
+    def find_own(self, rays: Floats) -> Int64s:
         """Return the indices of the directions (N, 3) that are nearer to this middle than to any other."""
         return np.flatnonzero(np.argmax(rays @ self.middles.T, axis=1) == self.place)
 
-    def project(self, rays: NDArray[np.floating]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def project(self, rays: Floats) -> tuple[Int64s, Int64s]:
         """Return rows and columns (N,) of the pixels that contain directions (N, 3) of the sphere."""
         height, width = self.is_own.shape
         x, y, z = (rays @ self.R_sphere_from_view).T
@@ -74,7 +73,7 @@ def cover_sphere(width: int) -> list[PerspectiveView]:
     return [make_view(R, pixel, (side, side), width, middles, k) for k, R in enumerate(turns)]
 
 
-def view_around(is_valid: NDArray[np.bool_], focal: float, width: int) -> PerspectiveView | None:
+def view_around(is_valid: Mask, focal: float, width: int) -> PerspectiveView | None:
     """Return a view of all that a mask (H, W) of the sphere shows, None if that is too wide for a picture.
 
     The view is one of a sphere's picture of `width`, and has a focal length [px] of its own.
@@ -114,6 +113,6 @@ def centers_of_pixels(count: int, pixel: float) -> Array:
     return np.asarray(0.5 * pixel * count * (1.0 - (2.0 * np.arange(count) + 1.0) / count))
 
 
-def add_margin(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def add_margin(image: Bytes) -> Bytes:
     """Pad a picture by MARGIN: columns wrap at the seam, the first and the last row are repeated."""
     return np.pad(np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap"), ((MARGIN, MARGIN), (0, 0)), "edge")

@@ -5,10 +5,10 @@ from typing import Any, Literal, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Floats, Mask
 from ..cloud.octree import Octree, collect, find_level
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import direction_to_pixel
 from ..geometry.vectors import rotate
 from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
@@ -26,15 +26,14 @@ FILL_LEVELS = 4  # gaps up to 16 px are filled
 LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
 NOTHING = np.float32(1e30)
 NEAREST = np.float32(0.1)  # cosine of the angle between a pinhole's axis and what it shows, at least
-Floats = NDArray[np.floating[Any]]
 
 
 class ViewImage(NamedTuple):
     """The scan seen from a pose: a sphere's or a pinhole's picture, in the camera's axes."""
 
-    gray: NDArray[np.uint8]  # (H, W)
-    is_filled: NDArray[np.bool_]  # (H, W) where the grey means something
-    ranges: NDArray[np.float32]  # (H, W) [m], 0 where nothing is seen
+    gray: Bytes  # (H, W)
+    is_filled: Mask  # (H, W) where the grey means something
+    ranges: Array32  # (H, W) [m], 0 where nothing is seen
 
 
 @inline_kernel
@@ -58,12 +57,7 @@ def project(
 
 @kernel
 def project_voxels(
-    tree: Octree,
-    center: Array,
-    R_cam_from_map: NDArray[np.float32],
-    focal: np.float32,
-    is_drawn: NDArray[np.bool_],
-    scratch: Scratch,
+    tree: Octree, center: Array, R_cam_from_map: Array32, focal: np.float32, is_drawn: Mask, scratch: Scratch
 ) -> int:
     """Project the voxels whose middles a mask (H, W) of the picture shows, and return their number.
 
@@ -101,12 +95,7 @@ def project_voxels(
 
 @kernel
 def draw_voxels(
-    tree: Octree,
-    scratch: Scratch,
-    count: int,
-    wraps: bool,
-    ranges: NDArray[np.float32],
-    sums: NDArray[np.float32],
+    tree: Octree, scratch: Scratch, count: int, wraps: bool, ranges: Array32, sums: Array32
 ) -> None:
     """Write the nearest range (H, W), and sums (H, W, 2) of weighted grey and of weights near that range.
 
@@ -146,7 +135,7 @@ def draw_voxels(
                         sums[i, j, 1] += weight
 
 
-def is_in_front(ranges: NDArray[np.float32], wraps: bool = True) -> NDArray[np.bool_]:
+def is_in_front(ranges: Array32, wraps: bool = True) -> Mask:
     """Return the mask (H, W) of the pixels that are not seen through a gap in a nearer surface.
 
     `ranges` (H, W) are the nearest, NOTHING where there is none. A pixel is seen through a gap if every wider
@@ -162,7 +151,7 @@ def is_in_front(ranges: NDArray[np.float32], wraps: bool = True) -> NDArray[np.b
     return np.asarray((ranges < NOTHING) & (ranges <= limit * BEHIND))
 
 
-def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+def fill_gaps(gray: Floats, weight: Floats) -> tuple[Floats, Mask]:
     """Fill the gaps of a weighted grey picture (H, W) from around them; return also the mask of known grey.
 
     Pull and push over a pyramid of means (Gortler et al., "The Lumigraph", SIGGRAPH 1996, section 3.4.2).
@@ -189,7 +178,7 @@ def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
-def render_gray(octree: Octree, pose: Pose, is_drawn: NDArray[np.bool_], focal: float = 0.0) -> ViewImage:
+def render_gray(octree: Octree, pose: Pose, is_drawn: Mask, focal: float = 0.0) -> ViewImage:
     """Draw the scan at a pose in the map, where the mask (H, W) says so, and a little beyond.
 
     The picture is a pinhole's with the focal length `focal` [px], or the sphere's, W = 2 H, if it is 0. Sides

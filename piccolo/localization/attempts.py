@@ -22,7 +22,7 @@ from .beam import brief_query, refine_matches, refine_starts, score_mirror, scor
 from .comparison import score_pose
 from .prior import contradictions
 from .query import Query
-from .search import SearchedGravity, search_poses
+from .search import Tilts, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
 from .verification import verify
@@ -60,10 +60,10 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
         attempts.append((query, search_matches))
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
-        upright: SearchedGravity = "level" if is_partial and not query.photo.has_tilt else "known"
-        attempts.append((query, partial(search_views, gravity=upright)))
+        upright: Tilts = "level" if is_partial and not query.photo.has_tilt else "known"
+        attempts.append((query, partial(search_views, tilts=upright)))
     if method.uses_search and query.settings.gravity != "known":
-        attempts.append((query, partial(search_views, gravity="unknown", is_brief=looks_first)))
+        attempts.append((query, partial(search_views, tilts="any", is_brief=looks_first)))
     return attempts
 
 
@@ -116,13 +116,13 @@ def search_views(
     query: Query,
     known: list[Hypothesis],
     watch: Stopwatch,
-    gravity: SearchedGravity,
+    tilts: Tilts,
     is_brief: bool = False,
 ) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
-    asked = tilt_query(query) if is_brief else query
+    asked = thin_query(query) if is_brief else query
     with watch.stage("search"):
-        starts = search_poses(asked, gravity)
+        starts = search_poses(asked, tilts)
     with watch.stage("refine"):
         found = refine_starts(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         found = known + add_verified(query, found)
@@ -168,7 +168,7 @@ def is_whole(query: Query) -> bool:
     return query.settings.gravity != "unknown" and not query.photo.is_partial
 
 
-def tilt_query(query: Query) -> Query:
+def thin_query(query: Query) -> Query:
     """Return a brief query with any tilt, for a whole photo that was searched as upright.
 
     It searches every other cell of the grid, with few rotations. That finds tilted photos without occluders;

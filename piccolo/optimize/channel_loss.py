@@ -8,9 +8,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..arrays import Array, Array32, Int32s, Int64s
 from ..geometry.sphere import BLOCK_RINGS, make_grid
 from ..kernels.jit import F1, HALF, Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
@@ -33,8 +32,6 @@ FLAT = 6.0  # [levels] a smaller deviation of a block's channels counts as this
 CHANCE = 0.35  # a block's correlation that wrong poses reach
 ZERO = np.float32(ZERO_LEVEL)
 
-Array32 = NDArray[np.float32]
-
 
 class ChannelProblem(NamedTuple):
     """Points with channels, and the image that they are compared with."""
@@ -42,7 +39,7 @@ class ChannelProblem(NamedTuple):
     points: Array32  # (3, N) [m]
     channels: Array32  # (3, N) [8-bit levels]
     weights: Array32  # (N,)
-    texels: NDArray[np.int32]  # of the panorama's channels
+    texels: Int32s  # of the panorama's channels
     width: int  # [px] of the panorama
     scale: float  # of the loss [levels]
 
@@ -90,11 +87,7 @@ def channel_equations(
 
 @kernel
 def equations_by_part(
-    problem: ChannelProblem,
-    R_cam_from_world: Array,
-    center_world: Array,
-    begins: NDArray[np.int64],
-    sums: Array,
+    problem: ChannelProblem, R_cam_from_world: Array, center_world: Array, begins: Int64s, sums: Array
 ) -> None:
     """Write the sums (parts, 29) of `channel_equations` for each part of a problem's points.
 
@@ -119,8 +112,8 @@ def correlate(
     points: Array32,
     channels: Array32,
     weights: Array32,
-    blocks: NDArray[np.int32],
-    texels: NDArray[np.int32],
+    blocks: Int32s,
+    texels: Int32s,
     width: int,
     R_cam_from_world: Array,
     center_world: Array,
@@ -173,8 +166,8 @@ def score(
     points: Array32,
     channels: Array32,
     weights: Array32,
-    blocks: NDArray[np.int32],
-    texels: NDArray[np.int32],
+    blocks: Int32s,
+    texels: Int32s,
     width: int,
     R_cam_from_world: Array,
     center_world: Array,

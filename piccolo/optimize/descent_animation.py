@@ -7,8 +7,8 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 
+from ..arrays import Bytes
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose, step
 from ..jobs.threads import Workers
@@ -24,8 +24,6 @@ MAX_SURFELS = 150_000  # about one a pixel
 MAX_FRAMES = 60  # if there are more poses, this many are drawn, evenly spaced
 FRAMES_PER_S = 8
 NUM_LAST = 12  # repetitions of the last frame
-
-Image = NDArray[np.uint8]  # (H, W, 3) RGB
 
 
 class Iterate(NamedTuple):
@@ -64,7 +62,7 @@ def refine_with_history(
 
 def frames_of(
     points: PackedPoints, panorama: Panorama, history: Sequence[Iterate], width: int, workers: Workers
-) -> list[Image]:
+) -> list[Bytes]:
     """Draw an image for each pose, with iteration and loss on top; the last one is repeated."""
     at_start = visible_indices(points, history[0].pose.center_world)
     at_end = visible_indices(points, history[-1].pose.center_world)
@@ -72,7 +70,7 @@ def frames_of(
     photo = resize_rgb(panorama, width)
     chosen = np.unique(np.linspace(0, len(history) - 1, min(MAX_FRAMES, len(history))).astype(int))
 
-    def frame(k: int) -> Image:
+    def frame(k: int) -> Bytes:
         view = render_surfels(surfels, history[k].pose, width, Workers(1))
         bar = np.zeros((TEXT_HEIGHT, width, 3), np.uint8)
         text = f"iteration {history[k].iteration}   loss {history[k].loss:.4f}"
@@ -83,7 +81,7 @@ def frames_of(
     return [*frames, *[frames[-1]] * NUM_LAST]
 
 
-def encode_gif(frames: Sequence[Image]) -> bytes:
+def encode_gif(frames: Sequence[Bytes]) -> bytes:
     """Encode frames as an animated GIF."""
     file = BytesIO()
     first, *others = map(PIL.Image.fromarray, frames)

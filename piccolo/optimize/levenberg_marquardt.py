@@ -6,7 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..geometry.pose import Array
+from ..arrays import Array
 from ..kernels.jit import copy_to, kernel
 from .normal_equations import GRADIENT, LOSS, MATRIX, NUM_SUMS
 
@@ -106,11 +106,7 @@ def levenberg_marquardt(
     """
 
     def descend(
-        problem: Problem,
-        num_iterations: int,
-        tolerance: float,
-        R_cam_from_world: Array,
-        center_world: Array,
+        problem: Problem, num_iterations: int, tolerance: float, R_cam_from_world: Array, center_world: Array
     ) -> float:
         R = R_cam_from_world
         t = center_world

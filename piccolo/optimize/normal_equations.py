@@ -10,9 +10,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..arrays import Array, Array32, Int32s
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
 from ..panorama.texels import (
@@ -33,8 +32,8 @@ GRADIENT = 2
 MATRIX = 8
 
 Colors = TypeVar("Colors")
-Coordinates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]  # x, y, z (N,)
-Adder = Callable[[Coordinates, Colors, NDArray[np.int32], int, Array, Array, Scalar, Array], None]
+Coordinates = tuple[Array32, Array32, Array32]  # x, y, z (N,)
+Adder = Callable[[Coordinates, Colors, Int32s, int, Array, Array, Scalar, Array], None]
 
 
 def block_adder(
@@ -51,13 +50,7 @@ def block_adder(
 
     @inline_kernel
     def add_chunk(
-        points: Projected,
-        count: int,
-        colors: Colors,
-        first: int,
-        width: Scalar,
-        scale: Scalar,
-        sums: Array,
+        points: Projected, count: int, colors: Colors, first: int, width: Scalar, scale: Scalar, sums: Array
     ) -> None:
         a00 = a01 = a02 = a03 = a04 = a05 = a11 = a12 = a13 = a14 = a15 = a22 = a23 = a24 = a25 = F0
         a33 = a34 = a35 = a44 = a45 = a55 = g0 = g1 = g2 = g3 = g4 = g5 = total = loaded = F0
@@ -148,7 +141,7 @@ def block_adder(
     def add_points(
         xyz: Coordinates,
         colors: Colors,
-        texels: NDArray[np.int32],
+        texels: Int32s,
         width: int,
         R_cam_from_world: Array,
         center_world: Array,

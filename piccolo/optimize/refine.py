@@ -7,8 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from ..arrays import Array
 from ..cloud.soa import PackedPoints
-from ..geometry.pose import Array, Pose, exp_so3, left_jacobian, orthonormal, step
+from ..geometry.pose import Pose, exp_so3, left_jacobian, orthonormal, step
 from ..panorama.texels import Texels
 from ..views.zbuffer import visible_points
 from .levenberg_marquardt import levenberg_marquardt

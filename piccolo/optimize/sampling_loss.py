@@ -13,10 +13,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s
 from ..cloud.soa import FARTHEST, PackedPoints
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import (
@@ -43,13 +43,13 @@ TO_UNIT = 1.0 / 255.0
 
 @kernel
 def loss_blocks(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    z: NDArray[np.float32],
-    rgbx: NDArray[np.int32],
+    x: Array32,
+    y: Array32,
+    z: Array32,
+    rgbx: Int32s,
     R_cam_from_world: Array,
     center_world: Array,
-    texels: NDArray[np.int32],
+    texels: Int32s,
     width: int,
     first_block: int,
     sums: Array,
@@ -81,7 +81,7 @@ def loss_blocks(
 
 
 @inline_kernel
-def read_packed(rgbx: NDArray[np.int32], i: np.uintp) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+def read_packed(rgbx: Int32s, i: np.uintp) -> tuple[Scalar, Scalar, Scalar, Scalar]:
     """Return channels [8-bit levels] and weight of a point of packed colour."""
     c = rgbx[i]
     return channel(c, 0), channel(c, 8), channel(c, 16), F1
@@ -102,13 +102,13 @@ add_packed = block_adder(read_packed, norm)
 
 @kernel
 def normal_blocks(
-    x: NDArray[np.float32],
-    y: NDArray[np.float32],
-    z: NDArray[np.float32],
-    rgbx: NDArray[np.int32],
+    x: Array32,
+    y: Array32,
+    z: Array32,
+    rgbx: Int32s,
     R_cam_from_world: Array,
     center_world: Array,
-    texels: NDArray[np.int32],
+    texels: Int32s,
     width: int,
     first_block: int,
     sums: Array,
@@ -157,7 +157,7 @@ def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads:
 
 def sampling_equations(
     points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1
-) -> tuple[float, Array, NDArray[np.float64]]:
+) -> tuple[float, Array, Array]:
     """Compute loss, gradient (6,) and matrix (6, 6) of iteratively reweighted least squares at `pose`.
 
     The matrix is (1 / N') sum_i J_i^T J_i / ||e_i||; -inverse(matrix) @ gradient is the Gauss-Newton step.

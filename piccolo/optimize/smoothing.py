@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.pose import Array
+from ..arrays import Array
 from ..geometry.pose_gaussian import PoseGaussian, add
 
 

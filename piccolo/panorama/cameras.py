@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..camera import Calibration, Mount
 from ..camera.files import find_calibration
 from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
@@ -23,7 +23,7 @@ from .picture import Picture
 
 # By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many
 # quarter turns to the left take it back to the stored one.
-TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
+TURNED: dict[object, tuple[Array, int]] = {
     6: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1),
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
@@ -110,7 +110,7 @@ def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[
 
 
 def read_views(
-    path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: NDArray[np.bool_]
+    path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: Mask
 ) -> tuple[list[View], tuple[str, ...]]:
     """Return each camera with its part of a picture, black borders masked, and notes for the user.
 

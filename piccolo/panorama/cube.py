@@ -14,8 +14,8 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes, Mask
 from ..errors import InputError
 from ..geometry.sphere import pixel_rays
 from .gpano import Pixels
@@ -34,7 +34,7 @@ R_FACE_FROM_CAM = {
         "b": ((0, 1, 0), (0, 0, -1), (-1, 0, 0)),
     }.items()
 }
-Faces = dict[str, NDArray[np.uint8]]  # by letter, (size, size, 4): RGB and 255 where valid
+Faces = dict[str, Bytes]  # by letter, (size, size, 4): RGB and 255 where valid
 SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".heif", ".insp")
 MIN_FACE = 32  # [px]
 MAX_FACE = MAX_WIDTH // 4
@@ -54,7 +54,7 @@ CROSSES = (("-u--", "lfrb", "-d--"), ("-u-", "lfr", "-d-", "-B-"))
 WANTED = "wanted six faces of a cube named as skybox0..5, px nx py ny pz nz or right left up down front back"
 
 
-def face_pixels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def face_pixels(rgb: Bytes, is_valid: Mask) -> Bytes:
     """Return a face (size, size, 4) with its validity as alpha, to be resampled."""
     return np.dstack([rgb, is_valid.astype(np.uint8) * 255])
 
@@ -79,7 +79,7 @@ def equirectangular(faces: Faces) -> Pixels:
     return rgb, is_valid
 
 
-def _pad_face(faces: Faces, letter: str) -> NDArray[np.uint8]:
+def _pad_face(faces: Faces, letter: str) -> Bytes:
     """Return a face with a rim of one pixel from the faces around it, for interpolation across the edge."""
     size = len(faces[letter])
     padded = cv2.copyMakeBorder(faces[letter], 1, 1, 1, 1, cv2.BORDER_CONSTANT)
@@ -93,7 +93,7 @@ def _pad_face(faces: Faces, letter: str) -> NDArray[np.uint8]:
     return np.asarray(padded)
 
 
-def _sample_faces(faces: Faces, directions: NDArray[np.float32], rim: int) -> NDArray[np.uint8]:
+def _sample_faces(faces: Faces, directions: Array32, rim: int) -> Bytes:
     """Sample pixels (H, W, 4) along directions (H, W, 3), each from the face that it meets.
 
     The faces have a rim of `rim` pixels.
@@ -201,13 +201,13 @@ def _cross(picture: Picture, layout: tuple[str, ...]) -> Faces | None:
     return faces
 
 
-def _cell(picture: Picture, size: int, row: int, column: int) -> NDArray[np.uint8]:
+def _cell(picture: Picture, size: int, row: int, column: int) -> Bytes:
     """Return the square cell (size, size, 4) in a row and column of a picture."""
     place = slice(row * size, (row + 1) * size), slice(column * size, (column + 1) * size)
     return face_pixels(picture.rgb[place], picture.is_valid[place])
 
 
-def _is_empty(pixels: NDArray[np.uint8]) -> bool:
+def _is_empty(pixels: Bytes) -> bool:
     """Return True for a cell of one colour or of alpha 0 only.
 
     A thin rim is ignored, as it may show a little of the neighbours.

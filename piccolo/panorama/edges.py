@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Mask
 from ..geometry.colors import colors_of_edges
-from ..geometry.pose import Array
 from ..geometry.sphere import pixel_rays
 from .model import Panorama, resize
 
@@ -51,7 +51,7 @@ def soften(panorama: Panorama, sigma: float) -> Panorama:
     return replace(panorama, rgb=blur(panorama.rgb, sigma))
 
 
-def gradients(panorama: Panorama) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def gradients(panorama: Panorama) -> tuple[Array32, Array32]:
     """Return the derivatives (H, W) of the grey's logarithm, right and down, by pixels of the equator."""
     gray = np.log(mean_level(panorama) + np.float32(DARK))
     smooth = cv2.GaussianBlur(wrap(gray), (0, 0), SMOOTHING)
@@ -62,7 +62,7 @@ def gradients(panorama: Panorama) -> tuple[NDArray[np.float32], NDArray[np.float
     return right, down
 
 
-def mean_level(panorama: Panorama) -> NDArray[np.float32]:
+def mean_level(panorama: Panorama) -> Array32:
     """Return the mean (H, W) of the three colours [levels]."""
     red, green, blue = np.moveaxis(panorama.rgb.astype(np.float32), -1, 0)
     return np.asarray((red + green + blue) / np.float32(3.0), np.float32)
@@ -73,7 +73,7 @@ def row_cosines(height: int) -> Array:
     return np.asarray(np.cos((0.5 - (np.arange(height) + 0.5) / height) * np.pi))
 
 
-def find_inner(panorama: Panorama) -> NDArray[np.bool_]:
+def find_inner(panorama: Panorama) -> Mask:
     """Return the mask (H, W) of the pixels whose gradient no masked pixel touches."""
     return np.asarray(cv2.erode(panorama.is_valid.view(np.uint8), np.ones((5, 5), np.uint8)) > 0)
 

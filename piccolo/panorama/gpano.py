@@ -12,10 +12,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bytes, Mask
 from ..errors import InputError
-from ..geometry.pose import Array
 from .model import GPano
 from .picture import MAX_WIDTH
 
@@ -29,7 +28,7 @@ CROP_FIELDS = tuple(f"{name}Pixels" for name in f"{CROP_NAMES} FullPanoWidth Ful
 ASPECT_TOLERANCE = 0.01
 MIN_REGION = 0.02  # of the sphere's picture: less would take much memory to show nearly nothing
 
-Pixels = tuple[NDArray[np.uint8], NDArray[np.bool_]]  # rgb (H, W, 3), is_valid (H, W)
+Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
 
 
 @dataclass(frozen=True)
@@ -155,7 +154,7 @@ def full_size(path: Path, region: CropRegion, size: tuple[int, int]) -> tuple[in
     return 2 * full_height, full_height
 
 
-def embed_crop(path: Path, rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], region: CropRegion) -> Pixels:
+def embed_crop(path: Path, rgb: Bytes, is_valid: Mask, region: CropRegion) -> Pixels:
     """Return the picture at its place in the full sphere, the rest not valid.
 
     Edges are rounded to whole pixels, so the picture moves by half a pixel at most. It may cross the seam.

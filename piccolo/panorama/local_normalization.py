@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s, Mask
 from ..geometry.sphere import pixel_rays, solid_angles
 from ..geometry.vectors import row
 from ..kernels.jit import F0, F1, HALF, Scalar, copy_to, inline_kernel, kernel
@@ -58,7 +59,7 @@ def mean_and_inverse_std(total: Scalar, squares: Scalar, per: Scalar) -> tuple[S
 
 
 @lru_cache(maxsize=8)
-def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float64]:
+def sphere_gaussian(width: int, sigma_deg: float) -> Array:
     """Compute spectra over azimuth (W / 2 + 1, H, H) of Gaussian weights between rows, times solid angle."""
     rays = pixel_rays(width)
     sigma = np.radians(sigma_deg)
@@ -68,7 +69,7 @@ def sphere_gaussian(width: int, sigma_deg: float) -> NDArray[np.float64]:
     return np.ascontiguousarray(np.fft.rfft(weight, axis=2).real.transpose(2, 0, 1))
 
 
-def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.float32]:
+def blur_sphere(image: Array32, sigma_deg: float) -> Array32:
     """Return the Gaussian weighted sums (H, W, C) over the sphere of an equirectangular image (H, W, C).
 
     It computes in float64, so that rounding to float32 removes the differences between BLAS libraries.
@@ -81,9 +82,7 @@ def blur_sphere(image: NDArray[np.float32], sigma_deg: float) -> NDArray[np.floa
 
 
 @kernel
-def block_moments(
-    channels: NDArray[np.float32], weight: NDArray[np.float32], moments: NDArray[np.float32]
-) -> None:
+def block_moments(channels: Array32, weight: Array32, moments: Array32) -> None:
     """Write (h, w, 7): weighted sums of 1, the channels and their squares over equal blocks of the image."""
     step = channels.shape[0] // moments.shape[0]
     for i in range(moments.shape[0]):
@@ -106,9 +105,7 @@ def block_moments(
 
 
 @inline_kernel
-def interpolation_along(
-    num: int, num_wider: int
-) -> tuple[NDArray[np.uintp], NDArray[np.uintp], NDArray[np.float32]]:
+def interpolation_along(num: int, num_wider: int) -> tuple[NDArray[np.uintp], NDArray[np.uintp], Array32]:
     """Locate a row's `num` pixels between wider ones: left and right neighbours (num,), and fractions."""
     left = np.empty(num, np.uintp)
     right = np.empty(num, np.uintp)
@@ -131,12 +128,7 @@ def as_texel_channel(value: Scalar, mean: Scalar, gain: Scalar, shift: int) -> n
 
 
 @kernel
-def pack_normalized(
-    channels: NDArray[np.float32],
-    weight: NDArray[np.float32],
-    stats: NDArray[np.float32],
-    texels: NDArray[np.int32],
-) -> None:
+def pack_normalized(channels: Array32, weight: Array32, stats: Array32, texels: Int32s) -> None:
     """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
 
     Means and 1 / standard deviations are interpolated bilinearly in `stats` (h, w, 6). On each side a column
@@ -173,7 +165,7 @@ def pack_normalized(
 
 
 @kernel
-def finish_statistics(sums: NDArray[np.float32]) -> None:
+def finish_statistics(sums: Array32) -> None:
     """Turn weighted sums (h, w, 7) of 1, channels, squares into means and 1 / deviations (h, w, 1:7)."""
     for i in range(sums.shape[0]):
         for j in range(sums.shape[1]):
@@ -183,14 +175,12 @@ def finish_statistics(sums: NDArray[np.float32]) -> None:
                 s[1 + c], s[4 + c] = mean_and_inverse_std(s[1 + c], s[4 + c], per)
 
 
-def opponent_channels(rgb: NDArray[np.float32]) -> NDArray[np.float32]:
+def opponent_channels(rgb: Array32) -> Array32:
     """Convert an image (H, W, 3) to luminance and two opponent colours (H, W, 3)."""
     return np.asarray(cv2.transform(rgb, OPPONENT))
 
 
-def local_statistics(
-    channels: NDArray[np.float32], weight: NDArray[np.float32], width: int, sigma_deg: float
-) -> NDArray[np.float32]:
+def local_statistics(channels: Array32, weight: Array32, width: int, sigma_deg: float) -> Array32:
     """Compute local means and 1 / standard deviations (width / 2, width, 6) of channels (H, W, 3).
 
     They are taken over a Gaussian on the sphere, weighted by `weight` (H, W) and the solid angle; W is a
@@ -203,9 +193,7 @@ def local_statistics(
     return np.asarray(sums[..., 1:])
 
 
-def normalize_locally(
-    rgb: NDArray[np.float32], counts: NDArray[np.bool_], sigma_deg: float
-) -> NDArray[np.float32]:
+def normalize_locally(rgb: Array32, counts: Mask, sigma_deg: float) -> Array32:
     """Return opponent channels (H, W, 3), locally normalised over the pixels that count; elsewhere 0."""
     channels = opponent_channels(rgb)
     weight = counts.astype(np.float32)
@@ -233,12 +221,7 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
 
 @kernel
 def sample_channels(
-    texels: NDArray[np.int32],
-    width: int,
-    directions: NDArray[np.float32],
-    rotations: NDArray[np.float32],
-    samples: NDArray[np.float32],
-    validity: NDArray[np.float32],
+    texels: Int32s, width: int, directions: Array32, rotations: Array32, samples: Array32, validity: Array32
 ) -> None:
     """Write channels (rotations, 3, cells), minus the zero level, and validity in turned directions."""
     p = make_projected()

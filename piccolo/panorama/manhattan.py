@@ -6,7 +6,7 @@ most gradients (Coughlan and Yuille, "Manhattan World", ICCV 1999).
 
 import numpy as np
 
-from ..geometry.pose import Array
+from ..arrays import Array
 from ..geometry.sphere import make_grid
 from .edges import find_inner, gradients, row_cosines, tangent_axes
 from .model import Panorama, resize

@@ -12,8 +12,8 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes, Int64s, Mask
 from ..errors import InputError
 from .cube import SUFFIXES
 from .gpano import ASPECT_TOLERANCE
@@ -50,9 +50,7 @@ MIN_MASK = (16, 8)  # [px]
 WHITE = 128  # and above is to be ignored
 
 
-def black_borders(
-    rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], is_full: bool
-) -> NDArray[np.bool_] | None:
+def black_borders(rgb: Bytes, is_valid: Mask, is_full: bool) -> Mask | None:
     """Return a mask (H, W) of unfilled pixels that are valid so far; None if there are none.
 
     From each edge that is near black it takes the pixels inwards up to the first that is not near black. In a
@@ -78,13 +76,13 @@ def black_borders(
     return found if found.any() else None
 
 
-def _filter_depths(which: Callable[..., Any], depth: NDArray[np.int64]) -> NDArray[np.int64]:
+def _filter_depths(which: Callable[..., Any], depth: Int64s) -> Int64s:
     """Return the least (cv2.erode) or largest (cv2.dilate) of the depths (columns,) within RIM of each."""
     column = depth[:, None].astype(np.float32)  # whole numbers that small are exact
     return np.asarray(which(column, np.ones((2 * RIM + 1, 1), np.uint8))[:, 0], np.int64)
 
 
-def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _depth_of_black(inwards: Bytes, is_black: Mask) -> Int64s:
     """Return the number of near black pixels from the edge (row 0) inwards, in columns black there."""
     depth = np.zeros(len(is_black), dtype=np.int64)
     for begin in range(0, len(inwards), BAND):
@@ -98,7 +96,7 @@ def _depth_of_black(inwards: NDArray[np.uint8], is_black: NDArray[np.bool_]) -> 
     return depth
 
 
-def _black_fraction(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> float:
+def _black_fraction(inwards: Bytes, depth: Int64s) -> float:
     """Return the fraction of BLACK pixels among those within `depth` (columns,) of the edge."""
     num_black = 0
     for begin in range(0, int(depth.max()), BAND):
@@ -108,7 +106,7 @@ def _black_fraction(inwards: NDArray[np.uint8], depth: NDArray[np.int64]) -> flo
     return num_black / float(depth.sum())
 
 
-def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -> float:
+def polar_disc(rgb: Bytes, is_valid: Mask, pole: str) -> float:
     """Return the half angle [deg] of a disc over the `pole` of a full sphere; 0 if there is none.
 
     The pole is zenith or nadir. The border is a circle of latitude that is an edge in 90 % of all directions
@@ -126,7 +124,7 @@ def polar_disc(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], pole: str) -
     return (num_inside + 1) / ROWS_PER_DEG if num_inside else 0.0
 
 
-def _edge_circle(cap: NDArray[np.float32]) -> int:
+def _edge_circle(cap: Array32) -> int:
     """Return the number of rows from the pole (row 0) to the outermost circle that is an edge, or 0."""
     pairs = (cap[1:] + cap[:-1]) / 2.0
     is_step = (cv2.absdiff(pairs[2:], pairs[:-2]) > MIN_STEP) @ np.ones(3, np.bool_)
@@ -139,7 +137,7 @@ def _edge_circle(cap: NDArray[np.float32]) -> int:
 
 
 @lru_cache(maxsize=1)
-def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _neighbors_around() -> tuple[Int64s, Int64s]:
     """Return flat indices (NUM_ROWS, DISC_WIDTH) of the pixels DETAIL_DEG east and west of each."""
     around = np.sin(np.radians((np.arange(NUM_ROWS) + 0.5) / ROWS_PER_DEG))
     spacing = np.clip(np.round(DETAIL_DEG * ROWS_PER_DEG / around), 1, DISC_WIDTH // 8).astype(int)
@@ -149,7 +147,7 @@ def _neighbors_around() -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return rows * DISC_WIDTH + east, rows * DISC_WIDTH + west
 
 
-def _detail_circle(cap: NDArray[np.float32]) -> int:
+def _detail_circle(cap: Array32) -> int:
     """Return the number of rows from the pole (row 0) to the outermost circle where all detail ends, or 0."""
     grey = cv2.transform(cap, np.full((1, 3), 1.0 / 3.0))
     east, west = _neighbors_around()
@@ -167,7 +165,7 @@ def _detail_circle(cap: NDArray[np.float32]) -> int:
     return 0
 
 
-def is_dual_fisheye(rgb: NDArray[np.uint8]) -> bool:
+def is_dual_fisheye(rgb: Bytes) -> bool:
     """Return True if a picture is black outside the two circles inscribed in its halves, but not in them.
 
     A panorama with black poles is black within the circles' upper and lower parts too; a dark one is dark all
@@ -197,7 +195,7 @@ def find_mask(mask: Path, pano: Path) -> Path | None:
     return next((file for suffix in SUFFIXES if (file := mask / (pano.stem + suffix)).is_file()), None)
 
 
-def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np.bool_]]:
+def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, Mask]:
     """Return the index of the size (width, height) whose shape a mask has, and its pixels that count (H, W).
 
     A larger mask masks a pixel if any of its own pixels there is white, a smaller one is enlarged.
@@ -216,7 +214,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, NDArray[np
     raise InputError(f"{path}: found a mask of {width} x {height}, wanted the shape of {wanted}")
 
 
-def mask_pole(is_valid: NDArray[np.bool_], pole: str, half_angle_deg: float) -> NDArray[np.bool_]:
+def mask_pole(is_valid: Mask, pole: str, half_angle_deg: float) -> Mask:
     """Return validity (H, W) without the rows whose centre is within `half_angle_deg` of the `pole`."""
     height = len(is_valid)
     from_zenith = (np.arange(height) + 0.5) * 180.0 / height

@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat, cast
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 
+from ..arrays import Bytes
 from ..camera import Calibration
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
@@ -74,7 +74,7 @@ def _digest(files: list[Path]) -> str:
     return digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def read_photo_facts(photo: File | NDArray[np.uint8] | Photo) -> PhotoFacts:
+def read_photo_facts(photo: File | Bytes | Photo) -> PhotoFacts:
     """Return the facts that a photo's file gives, or the first file of a folder of cube faces or of a rig.
 
     Pixels (H, W, 3) have a digest and a size. InputError if the file is missing or no picture. Metadata that

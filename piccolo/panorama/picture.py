@@ -15,7 +15,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.Image import Transpose
@@ -25,6 +24,7 @@ from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
+from ..arrays import Bytes, Mask
 from ..errors import InputError, ResourceError
 from ..files.json_file import read_bytes
 from ..geometry.colors import Labels, label_colors
@@ -83,8 +83,8 @@ warnings.filterwarnings("ignore", module=r"PIL\.")
 class Picture:
     """The pixels of a file, of any shape."""
 
-    rgb: NDArray[np.uint8]  # (H, W, 3)
-    is_valid: NDArray[np.bool_]  # (H, W), False where alpha is 0
+    rgb: Bytes  # (H, W, 3)
+    is_valid: Mask  # (H, W), False where alpha is 0
     xmp: bytes = b""
     warnings: tuple[str, ...] = ()
     exif: Mapping[int, object] = field(default_factory=dict)  # of the camera, by tag; empty if damaged

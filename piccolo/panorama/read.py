@@ -4,8 +4,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bytes, Mask
 from ..camera import Calibration, Mount
 from ..camera.resampling import View, make_sphere, sphere_width
 from ..camera.rig import MAX_OFFSET
@@ -46,7 +46,7 @@ LIKE_A_PHOTO = (
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
 
-def read_panorama(photo: File | NDArray[np.uint8] | Photo, labels: Labels | None = None) -> Panorama:
+def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> Panorama:
     """Return the full sphere of a JPEG, PNG, TIFF, WebP or HEIC file, a folder of six cube faces or an array.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
@@ -102,7 +102,7 @@ def _read_picture(photo: Photo) -> Panorama:
     return _embed_and_mask(photo, picture, region, gpano)
 
 
-def _read_array(photo: Photo, rgb: NDArray[np.uint8]) -> Panorama:
+def _read_array(photo: Photo, rgb: Bytes) -> Panorama:
     """Return the panorama of an image (H, W, 3), of the photo's camera or a full sphere."""
     rgb = np.ascontiguousarray(rgb)
     is_valid = ~photo.mask if isinstance(photo.mask, np.ndarray) else np.ones(rgb.shape[:2], np.bool_)
@@ -244,7 +244,7 @@ def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, gpano: G
     return _mask(photo, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0))
 
 
-def _mask(photo: Photo, panorama: Panorama, counts: NDArray[np.bool_] | None) -> Panorama:
+def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:
     """Return the panorama without pixels removed by a mask of its size or the option for the nadir."""
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
     is_valid = mask_pole(is_valid, "nadir", photo.mask_nadir_deg)
@@ -253,9 +253,7 @@ def _mask(photo: Photo, panorama: Panorama, counts: NDArray[np.bool_] | None) ->
     return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
 
 
-def _user_masks(
-    path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: list[str]
-) -> dict[int, NDArray[np.bool_]]:
+def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: list[str]) -> dict[int, Mask]:
     """Return the user's mask, True where pixels count, by the index of the size whose shape it has."""
     if photo.mask is None or isinstance(photo.mask, np.ndarray):
         return {}
@@ -267,7 +265,7 @@ def _user_masks(
     return {index: counts}
 
 
-def _sphere_fraction(is_there: NDArray[np.bool_], region: CropRegion) -> float:
+def _sphere_fraction(is_there: Mask, region: CropRegion) -> float:
     """Return the fraction of the sphere that a part (H, W) of a picture of `region` covers."""
     rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
     per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)

@@ -6,11 +6,11 @@ nothing. The arrays of a chunk fit the first-level cache.
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes, Floats, Int32s, Mask
 from ..geometry.colors import pack_rgbx
 from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import F1, HALF, Scalar, inline_kernel, whole
@@ -28,7 +28,7 @@ Pose32 = tuple[
 class Texels(NamedTuple):
     """An equirectangular image for gathering: a column is wrapped and a row clamped on each side."""
 
-    rgbx: NDArray[np.int32]  # ((H + 2) * (W + 2),) R, G, B from the lowest byte up, X = 1 where valid
+    rgbx: Int32s  # ((H + 2) * (W + 2),) R, G, B from the lowest byte up, X = 1 where valid
     width: int  # W [px], H = W / 2
     valid_share: float = 1.0  # of the sphere
 
@@ -38,7 +38,7 @@ class Texels(NamedTuple):
         return self._replace(rgbx=np.ascontiguousarray(rows[:, ::-1]).reshape(-1))
 
 
-def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = None) -> Texels:
+def pack_texels(rgb: Bytes, is_valid: Mask | None = None) -> Texels:
     """Pack an image (H, W, 3), W = 2 H, into texels; those of `is_valid` (H, W) count, all if it is None."""
     height, width = rgb.shape[:2]
     padded = np.empty((height + 2, width + 2), np.int32)
@@ -49,7 +49,7 @@ def pack_texels(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_] | None = Non
     return Texels(padded.reshape(-1), width, share)
 
 
-def find_valid(image: Texels) -> NDArray[np.bool_]:
+def find_valid(image: Texels) -> Mask:
     """Return the mask (H, W) of the pixels that count."""
     padded = image.rgbx.reshape(-1, image.width + 2)
     return np.asarray((padded[1:-1, 1:-1] >> 24) & 1 == 1)
@@ -115,16 +115,16 @@ def blend_with_gradient(
 class Projected(NamedTuple):
     """A chunk of projected points, and the texels around each; arrays (CHUNK,)."""
 
-    x: NDArray[np.float32]  # camera coordinates
-    y: NDArray[np.float32]
-    z: NDArray[np.float32]
-    fu: NDArray[np.float32]  # fraction beyond the upper left of four texels
-    fv: NDArray[np.float32]
-    texel: NDArray[np.int32]  # index of this texel
-    t00: NDArray[np.int32]  # the four texels
-    t10: NDArray[np.int32]
-    t01: NDArray[np.int32]
-    t11: NDArray[np.int32]
+    x: Array32  # camera coordinates
+    y: Array32
+    z: Array32
+    fu: Array32  # fraction beyond the upper left of four texels
+    fv: Array32
+    texel: Int32s  # index of this texel
+    t00: Int32s  # the four texels
+    t10: Int32s
+    t01: Int32s
+    t11: Int32s
 
 
 @inline_kernel
@@ -136,9 +136,7 @@ def make_projected() -> Projected:
 
 
 @inline_kernel
-def pose_float32(
-    R_cam_from_world: NDArray[np.floating[Any]], center_world: NDArray[np.floating[Any]]
-) -> Pose32:
+def pose_float32(R_cam_from_world: Floats, center_world: Floats) -> Pose32:
     """Return a pose's rotation (3, 3), row by row, and centre (3,), as twelve float32 for registers."""
     f = np.float32
     R = R_cam_from_world
@@ -154,20 +152,16 @@ def in_camera(x: Scalar, y: Scalar, z: Scalar, pose: Pose32) -> tuple[Scalar, Sc
     """Transform a point to camera coordinates, by a pose of `pose_float32`."""
     r00, r01, r02, r10, r11, r12, r20, r21, r22, tx, ty, tz = pose
     dx, dy, dz = x - tx, y - ty, z - tz
-    return (
-        r00 * dx + r01 * dy + r02 * dz,
-        r10 * dx + r11 * dy + r12 * dz,
-        r20 * dx + r21 * dy + r22 * dz,
-    )
+    return (r00 * dx + r01 * dy + r02 * dz, r10 * dx + r11 * dy + r12 * dz, r20 * dx + r21 * dy + r22 * dz)
 
 
 @inline_kernel
 def project(
-    X: NDArray[np.float32],
-    Y: NDArray[np.float32],
-    Z: NDArray[np.float32],
-    R_cam_from_world: NDArray[np.floating[Any]],
-    center_world: NDArray[np.floating[Any]],
+    X: Array32,
+    Y: Array32,
+    Z: Array32,
+    R_cam_from_world: Floats,
+    center_world: Floats,
     width: int,
     projected: Projected,
 ) -> None:
@@ -189,7 +183,7 @@ def texels_around(projected: Projected, n: int) -> Four:
 
 
 @inline_kernel
-def gather(texels: NDArray[np.int32], width: int, projected: Projected, count: int) -> None:
+def gather(texels: Int32s, width: int, projected: Projected, count: int) -> None:
     """Write the four texels around each of `count` projected points."""
     p = projected
     stride = np.int32(width + 2)

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bytes
 from ..errors import InputError
 from ..jobs.memory import check_memory
 from ..optional import import_optional
@@ -31,7 +31,7 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
 
     InputError if the file is no video or is damaged, or PyAV is not there.
     """
-    best: tuple[float, float, NDArray[np.uint8]] | None = None  # sharpness, time, RGB
+    best: tuple[float, float, Bytes] | None = None  # sharpness, time, RGB
     slot = 0
     for time, frame in _decode(video):
         while time > (slot + NEIGHBORHOOD) * every:
@@ -62,7 +62,7 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
             return
 
 
-def measure_sharpness(rgb: NDArray[np.uint8]) -> float:
+def measure_sharpness(rgb: Bytes) -> float:
     """Measure the sharpness of an image (H, W, 3): the variance of the Laplacian of a small copy.
 
     The measure is that of Pech-Pacheco et al. (2000).
@@ -95,7 +95,7 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
         raise InputError(f"{video}: found {error.strerror}, {WANTED}") from error
 
 
-def _write_frame(video: Path, folder: Path, time: float, rgb: NDArray[np.uint8]) -> VideoFrame:
+def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFrame:
     path = folder / f"{video.stem}_{round(1000.0 * time):08d}.jpg"
     if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
         raise OSError(f"{path}: can't be written")

@@ -15,15 +15,15 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bytes, Mask
 from ..camera.model import pinhole
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
 from ..confidence.occlusion import occlusion_mask
 from ..errors import InputError
 from ..files.temporary import temporary_folder
-from ..geometry.pose import Array, Pose, yaw_rotation
+from ..geometry.pose import Pose, yaw_rotation
 from ..jobs.threads import Workers
 from ..opened_scan import labels_of, photo_of
 from ..panorama import Panorama, read_panorama
@@ -89,7 +89,7 @@ def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
     return render_surfels(visible, pose, width, Workers())
 
 
-def measure_reach(view: View) -> NDArray[np.uint8]:
+def measure_reach(view: View) -> Bytes:
     """Return the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned."""
     tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
     return np.asarray(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA), np.uint8)
@@ -101,7 +101,7 @@ def scan_picture(view: View) -> bytes:
     return encode_image(_grey_where_unscanned(rgb, view.is_seen), ".jpg", QUALITY)
 
 
-def _grey_where_unscanned(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def _grey_where_unscanned(rgb: Bytes, is_seen: Mask) -> Bytes:
     """Return a sphere (H, W, 3) whose larger gaps (H, W) are dimmed towards grey."""
     size = 2 * math.ceil(GAP * rgb.shape[1]) + 1
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (size, size))

@@ -10,13 +10,12 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Bytes, Int64s, Mask
 from ..cloud.soa import PackedPoints
 from ..errors import InputError
 from ..files.json_file import read_text
 from ..geometry.colors import unpack_rgb
-from ..geometry.pose import Array
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import fill_holes
@@ -49,7 +48,7 @@ LEAST_SPREAD = 1e-6  # of the control points, by their distance: less is one poi
 class PlanImage(NamedTuple):
     """A plan in pixels."""
 
-    pixels: NDArray[np.uint8]  # (H, W, 4) RGBA, transparent where nothing is; or (H, W, 3)
+    pixels: Bytes  # (H, W, 4) RGBA, transparent where nothing is; or (H, W, 3)
     # a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m, map], of pixels (u, v)
     matrix: tuple[float, ...]
 
@@ -77,7 +76,7 @@ def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage |
 
 def _of_storey(
     points: PackedPoints, places: Array, floors: Array
-) -> tuple[Array, Array, Array, NDArray[np.uint8]] | None:
+) -> tuple[Array, Array, Array, Bytes] | None:
     """X, y and height above the floor [m] of a storey's points below the cut, and their colours (N, 3)."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no plan need not wait for it
 
@@ -98,13 +97,8 @@ def _of_storey(
 
 
 def _paint(
-    columns: NDArray[np.int64],
-    rows: NDArray[np.int64],
-    above: Array,
-    rgb: NDArray[np.uint8],
-    shape: tuple[int, int],
-    pixel: float,
-) -> NDArray[np.uint8]:
+    columns: Int64s, rows: Int64s, above: Array, rgb: Bytes, shape: tuple[int, int], pixel: float
+) -> Bytes:
     """Return the picture (H, W, 4): the highest points below the cut, gaps closed, walls with shadows."""
     order = np.argsort(above, kind="stable")  # what is higher is written later
     color = np.zeros((*shape, 3), np.uint8)
@@ -126,7 +120,7 @@ def _paint(
     return np.dstack([np.rint(filled).astype(np.uint8), np.where(is_wall, 255, smooth)])
 
 
-def _holes(is_drawn: NDArray[np.bool_], pixel: float) -> NDArray[np.bool_]:
+def _holes(is_drawn: Mask, pixel: float) -> Mask:
     """(H, W), true in gaps that what is drawn encloses: floor that no scanner saw."""
     _, labels, stats, _ = cv2.connectedComponentsWithStats((~is_drawn).astype(np.uint8), connectivity=4)
     is_hole = stats[:, cv2.CC_STAT_AREA] * pixel**2 < LARGEST_HOLE
@@ -135,9 +129,7 @@ def _holes(is_drawn: NDArray[np.bool_], pixel: float) -> NDArray[np.bool_]:
     return np.asarray(is_hole[labels])
 
 
-def _walls(
-    columns: NDArray[np.int64], rows: NDArray[np.int64], above: Array, shape: tuple[int, int]
-) -> NDArray[np.bool_]:
+def _walls(columns: Int64s, rows: Int64s, above: Array, shape: tuple[int, int]) -> Mask:
     """(H, W), true where most heights of a person are filled, small gaps closed."""
     bins = np.floor((above - WALL_FROM) / WALL_BIN).astype(np.int64)
     is_in = (bins >= 0) & (bins < WALL_BINS)
@@ -197,7 +189,7 @@ def own_plan(image: Path, control_points: Path, scan_map: ScanMap) -> PlanImage:
     points = read_control_points(control_points)
     world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
     places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]
-    rgb: NDArray[np.uint8] = read_picture(image).rgb
+    rgb: Bytes = read_picture(image).rgb
     scale = min(1.0, MAX_OWN_SIDE / max(rgb.shape[:2]))
     size = math.ceil(rgb.shape[1] * scale), math.ceil(rgb.shape[0] * scale)
     if scale < 1.0:

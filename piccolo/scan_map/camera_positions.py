@@ -4,11 +4,10 @@ import time
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Floats, Int64s, Mask
 from ..cloud.octree import Octree
 from ..errors import InputError
-from ..geometry.pose import Array
 from ..geometry.sphere import whole_areas
 from ..jobs.threads import Workers
 from ..views.view import BLOCK, ViewConfig, ranges_around
@@ -36,7 +35,7 @@ LONG = 60.0  # [s] a warning says how long the views take, if more
 COST_OF_VIEW = 4.0  # time of a position's coverage and view, relative to its coverage
 
 
-def top_surfaces(octree: Octree) -> NDArray[np.float32]:
+def top_surfaces(octree: Octree) -> Array32:
     """Return the voxel means (N, 3) above which the next two voxels are empty."""
     xyz = octree.level(SURFACE_VOXEL)[:, :3]
     ijk = np.floor(xyz / SURFACE_VOXEL).astype(np.int64)
@@ -53,7 +52,7 @@ class Ball(NamedTuple):
     center: Array
     radius: float
 
-    def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
+    def holds(self, points: Floats, margin: float = 0.0) -> Mask:
         """Return a mask (N,) of points (N, 3) or (N, 2) inside, or at most a margin [m] outside."""
         distance = np.linalg.norm(points - self.center[: points.shape[1]], axis=1)
         return np.asarray(distance <= self.radius + margin)
@@ -65,7 +64,7 @@ class Box(NamedTuple):
     low: Array
     high: Array
 
-    def holds(self, points: NDArray[np.floating[Any]], margin: float = 0.0) -> NDArray[np.bool_]:
+    def holds(self, points: Floats, margin: float = 0.0) -> Mask:
         """Return a mask (N,) of points (N, 3) or (N, 2) inside, or at most a margin [m] outside."""
         k = points.shape[1]
         is_inside = (points >= self.low[:k] - margin) & (points <= self.high[:k] + margin)
@@ -79,9 +78,7 @@ class TooManyPositionsError(InputError):
         super().__init__(f"the scan: {what} leave more than {MAX_POSITIONS} camera positions, {ADVICE}")
 
 
-def find_supported_cells(
-    surfaces: NDArray[np.float32], within: Ball | Box | None = None
-) -> NDArray[np.int64]:
+def find_supported_cells(surfaces: Array32, within: Ball | Box | None = None) -> Int64s:
     """Return cells (N, 3) of the coarse grid with centres at a camera's height above a surface (M, 3).
 
     Only cells `within` a part of the scan are returned, with a margin of a grid spacing.
@@ -117,11 +114,11 @@ def find_supported_cells(
     return np.asarray(np.stack(np.unravel_index(found, shape), axis=1) + low)
 
 
-def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
+def coverage(octree: Octree, centers: Floats, workers: Workers) -> Array:
     """Return the filled fraction of the sphere (N,) around each centre (N, 3), at a low resolution."""
     area = whole_areas(FREE_SPACE_VIEW.num_rings).astype(np.int64)
 
-    def glance(lo: int) -> NDArray[np.float64]:
+    def glance(lo: int) -> Array:
         is_filled = ranges_around(octree, centers[lo : lo + BLOCK], FREE_SPACE_VIEW) > 0.0
         return np.asarray(is_filled @ area / area.sum())
 
@@ -129,7 +126,7 @@ def coverage(octree: Octree, centers: NDArray[np.floating[Any]], workers: Worker
     return np.concatenate([np.empty(0), *parts])
 
 
-def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Workers) -> NDArray[np.float64]:
+def nearest_distances(tree: Any, centers: Floats, workers: Workers) -> Array:
     """Return the distance (N,) [m] of each centre (N, 3) from the nearest point of a cKDTree.
 
     It uses own threads: if a signal ends the work, the tree's threads would go on running in freed memory.
@@ -140,7 +137,7 @@ def nearest_distances(tree: Any, centers: NDArray[np.floating[Any]], workers: Wo
     return np.concatenate([np.empty(0), *parts])
 
 
-def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Workers) -> None:
+def warn_if_long(octree: Octree, centers: Floats, workers: Workers) -> None:
     """Estimate from a sample the time to render views from the centres (N, 3); warn if it is long."""
     sample = centers[:: 1 + len(centers) // BLOCK]
     alone = Workers()
@@ -153,9 +150,7 @@ def warn_if_long(octree: Octree, centers: NDArray[np.floating[Any]], workers: Wo
         workers.warn(f"the scan: {len(centers)} camera positions, about {minutes:.0f} min to prepare, once")
 
 
-def candidate_centers(
-    octree: Octree, workers: Workers, within: Ball | Box | None = None
-) -> NDArray[np.float64]:
+def candidate_centers(octree: Octree, workers: Workers, within: Ball | Box | None = None) -> Array:
     """Find positions (N, 3) [m] in free space, 0.6 m apart, or 0.3 m where surfaces are near.
 
     `within` and TooManyPositionsError are as of `find_supported_cells`.
@@ -192,7 +187,7 @@ def candidate_centers(
     return np.concatenate([kept, middle[coverage(octree, middle, workers) > min_coverage]])
 
 
-def heights_above_floor(octree: Octree, centers: NDArray[np.float64]) -> NDArray[np.float64]:
+def heights_above_floor(octree: Octree, centers: Array) -> Array:
     """Return heights (N,) [m] of centres (N, 3) above the floor: the lowest surface below in their storey.
 
     inf if there is none within SUPPORT_RADIUS and STOREY.

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.pose import Array
+from ..arrays import Array
 from ..jobs.threads import Workers
 from .camera_positions import CLEARANCE_VOXEL, COARSE_SPACING, MIN_CLEARANCE, nearest_distances
 from .scan_map import ScanMap

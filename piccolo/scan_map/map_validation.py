@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s
 from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
-from ..geometry.pose import Array, check_rotation
+from ..geometry.pose import check_rotation
 from ..geometry.sphere import make_grid
 from ..kernels.jit import F0, F1, inline_kernel, kernel
 from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS
@@ -68,7 +69,7 @@ MAX_WARNING = 5000  # characters of a line
 
 
 @inline_kernel
-def is_in_range(node: NDArray[np.float32], reach: float) -> bool:
+def is_in_range(node: Array32, reach: float) -> bool:
     """Return True if a node (6,) is within `reach` of zero along each axis and has a valid colour."""
     is_one = True
     for k in range(3):
@@ -78,12 +79,7 @@ def is_in_range(node: NDArray[np.float32], reach: float) -> bool:
 
 @kernel
 def first_misplaced(
-    nodes: NDArray[np.float32],
-    first_child: NDArray[np.int32],
-    level_start: NDArray[np.int32],
-    origin: Array,
-    leaf_size: float,
-    reach: float,
+    nodes: Array32, first_child: Int32s, level_start: Int32s, origin: Array, leaf_size: float, reach: float
 ) -> int:
     """Return the first node outside its parent's voxel, beyond `reach` [m] or without valid colour, or -1.
 

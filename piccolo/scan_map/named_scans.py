@@ -4,11 +4,11 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..confidence.localization import Localization
 from ..errors import InputError
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from .scan_map import ScanMap
 
 MAX_NAME = 100  # characters
@@ -53,7 +53,7 @@ def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
             raise InputError(f"`within`: found {name!r}, wanted of {_list_names(names)}")
 
 
-def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> NDArray[np.bool_]:
+def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> Mask:
     """Return a mask (N,) of the candidates in the scans of these names."""
     named_so = [k for k, name in enumerate(scan_map.scan_names) if name in within]
     return np.isin(scan_map.scan_of_candidate, named_so)

@@ -10,11 +10,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Int64s, Mask
 from ..cloud.octree import Octree, build_octree
 from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
-from ..geometry.pose import Array
 from ..geometry.sphere import whole_areas
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -38,13 +38,13 @@ COARSE_VOXEL = 2.56  # [m]
 class Candidates(NamedTuple):
     """Candidates of a map and a new scan: the map's own that stay, then new ones."""
 
-    rows: NDArray[np.int64]  # (S,) of the map's candidates, those that stay
-    centers: NDArray[np.float64]  # (N, 3) [m]
+    rows: Int64s  # (S,) of the map's candidates, those that stay
+    centers: Array  # (N, 3) [m]
     fraction: Array  # (N,) of the sphere in which the new scan is in front; of new ones 1
-    is_new: NDArray[np.bool_]  # (N,) more of the sphere shows the new scan in front than the others
+    is_new: Mask  # (N,) more of the sphere shows the new scan in front than the others
 
     @property
-    def rows_to_render(self) -> NDArray[np.int64]:
+    def rows_to_render(self) -> Int64s:
         """Indices of the candidates whose views must be made again."""
         return np.flatnonzero(self.fraction > LEAST_CHANGED)
 
@@ -147,7 +147,7 @@ def compare_ranges(new: Octree, old: Octree, centers: Array, workers: Workers) -
 
 
 def join_views(
-    old: ScanMap, octree: Octree, found: Candidates, sparse: NDArray[np.int64], workers: Workers
+    old: ScanMap, octree: Octree, found: Candidates, sparse: Int64s, workers: Workers
 ) -> WideViews:
     """Join wide views of the sparse candidates: render those that have changed or that the map lacks."""
     known = np.full(len(old.centers), -1)  # row among the map's views

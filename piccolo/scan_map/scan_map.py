@@ -9,13 +9,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Bytes, Int8s, Int64s, Mask
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.shape import paint_shape
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import Voxels
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Workers
@@ -69,11 +70,11 @@ class ScanMap:
     R_map_from_world: Array  # (3, 3), identity where the cloud's z is up
     origin_world: Array  # (3,) [m] middle of the leaves' box, in whole metres along the map's axes
     surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
-    centers: NDArray[np.float64]  # (candidates, 3) [m]
+    centers: Array  # (candidates, 3) [m]
     scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
-    sparse: NDArray[np.int64]  # candidates that are searched: no two share a cell of the coarse grid
-    wide_features: NDArray[np.int8]  # (sparse, 3 * wide cells) what is seen from them, channels in levels
-    wide_seen: NDArray[np.uint8]  # (sparse, wide cells) fraction seen of each, 255 for all
+    sparse: Int64s  # candidates that are searched: no two share a cell of the coarse grid
+    wide_features: Int8s  # (sparse, 3 * wide cells) what is seen from them, channels in levels
+    wide_seen: Bytes  # (sparse, wide cells) fraction seen of each, 255 for all
     views: CandidateViews  # of fine cells, made when they are asked for; not in files
     local_features: FeatureMap  # none of any view where they are made late; asked for by `features_now`
     has_labels: bool = False  # colours are those of labels
@@ -108,12 +109,12 @@ class ScanMap:
         return find_yaw_of_walls(self.octree)
 
     @cached_property
-    def searched_for(self) -> NDArray[np.int64]:
+    def searched_for(self) -> Int64s:
         """Index (candidates,) of the candidate searched for each one, in its cell of the coarse grid."""
         first, cell = sparse_candidates(self.centers)
         return first[cell]
 
-    def narrow(self, is_kept: NDArray[np.bool_]) -> "ScanMap":
+    def narrow(self, is_kept: Mask) -> "ScanMap":
         """Return the map with only some (sparse,) of the searched candidates."""
         return replace(
             self,
@@ -143,7 +144,7 @@ class ScanMap:
         return Pose(pose.R_cam_from_world @ self.R_map_from_world.T, center)
 
 
-def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:
     """Return indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
 
     And for each candidate (N,) the index of its cell among these.
@@ -157,7 +158,7 @@ def sparse_candidates(centers: NDArray[np.float64]) -> tuple[NDArray[np.int64], 
 
 def find_candidates(
     octree: Octree, R_map_from_world: Array, origin_world: Array, prior: Prior, workers: Workers
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+) -> tuple[Array, tuple[str, ...]]:
     """Find candidates (N, 3) [m]; in a scan too large as a whole only near the prior's place, with a warning.
 
     The map's frame is given by R_map_from_world (3, 3) and origin_world (3,) [m].
@@ -269,7 +270,7 @@ def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:
     return make_feature_map(scan_map.octree, centers[chosen], workers)
 
 
-def make_range_lookup(octree: Octree, centers: NDArray[np.float64]) -> Look:
+def make_range_lookup(octree: Octree, centers: Array) -> Look:
     """Return a function that maps an index of centres (N, 3) to the ranges seen from there."""
     return lambda k: ranges_around(octree, centers[k : k + 1], SEARCH_VIEW)[0]
 

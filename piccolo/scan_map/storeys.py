@@ -4,11 +4,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int64s, Mask
 from ..cloud.octree import Octree
 from ..cloud.soa import FARTHEST
-from ..geometry.pose import Array
 from .camera_positions import SURFACE_VOXEL
 
 HEADROOM = 11  # voxels above a surface that are empty, 1.8 m
@@ -33,7 +32,7 @@ class Storey(NamedTuple):
     """One storey, in the map's frame."""
 
     floor: float  # [m] height of its largest level
-    surfaces: NDArray[np.float32]  # (N, 3) [m] of its floor, in order of their x
+    surfaces: Array32  # (N, 3) [m] of its floor, in order of their x
 
     def nearest(self, center: Array, count: int) -> tuple[Array, Array]:
         """Return horizontal distances to the nearest `count` surfaces of a place (3,), and their heights [m].
@@ -57,7 +56,7 @@ class Storeys(NamedTuple):
 
     storeys: tuple[Storey, ...]
 
-    def at(self, centers: Array) -> tuple[NDArray[np.int64], Array]:
+    def at(self, centers: Array) -> tuple[Int64s, Array]:
         """Return the index of the storey of each place (N, 3), and its height above the floor there (N,) [m].
 
         It is the highest storey whose floor is below the place and scanned around it; -1 and NaN without
@@ -98,7 +97,7 @@ def find_storeys(octree: Octree) -> Storeys:
     return Storeys(tuple(storeys))
 
 
-def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _is_standable(ijk: Int64s) -> Mask:
     """Return a mask (N,) of the voxels (N, 3) with room for a person above them."""
     shape = ijk.max(axis=0, initial=0) + HEADROOM + 2
     code = (ijk[:, 0] * shape[1] + ijk[:, 1]) * shape[2] + ijk[:, 2]
@@ -109,7 +108,7 @@ def _is_standable(ijk: NDArray[np.int64]) -> NDArray[np.bool_]:
     return is_free
 
 
-def _find_levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, NDArray[np.bool_]]:
+def _find_levels(ijk: Int64s, tops: Int64s) -> dict[int, Mask]:
     """Find the floors by their height [voxels], ascending, with the cells (I, J) of each.
 
     `ijk` (N, 3) are all voxels, `tops` those with room above. The largest floor is taken first, then those
@@ -119,7 +118,7 @@ def _find_levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, N
         return {}
     counts = np.bincount(tops[:, 2])
     thick = np.convolve(counts, np.ones(2 * THICKNESS + 1), "same")
-    found: dict[int, NDArray[np.bool_]] = {}
+    found: dict[int, Mask] = {}
     most = LEAST_AREA / SURFACE_VOXEL**2
     while thick.max() > most:
         around = slice(max(int(thick.argmax()) - THICKNESS, 0), int(thick.argmax()) + THICKNESS + 1)
@@ -136,7 +135,7 @@ def _find_levels(ijk: NDArray[np.int64], tops: NDArray[np.int64]) -> dict[int, N
     return dict(sorted(found.items()))
 
 
-def _open_level(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> NDArray[np.bool_]:
+def _open_level(ijk: Int64s, tops: Int64s, level: int) -> Mask:
     """Return the cells (I, J) of a level on which a disc fits, small gaps closed."""
     mask = np.zeros(ijk.max(axis=0)[:2] + 2, np.uint8)
     own = tops[np.abs(tops[:, 2] - level) <= THICKNESS]
@@ -146,7 +145,7 @@ def _open_level(ijk: NDArray[np.int64], tops: NDArray[np.int64], level: int) -> 
     return np.asarray(cv2.morphologyEx(closed, cv2.MORPH_OPEN, disc) > 0)
 
 
-def _has_things_above(ijk: NDArray[np.int64], level: int, mask: NDArray[np.bool_]) -> bool:
+def _has_things_above(ijk: Int64s, level: int, mask: Mask) -> bool:
     """Return True if anything is on a floor or around it."""
     wide = cv2.dilate(mask.astype(np.uint8), np.ones((OPENING, OPENING), np.uint8))
     is_above = (ijk[:, 2] > level + THICKNESS) & (ijk[:, 2] <= level + HEADROOM)
@@ -154,14 +153,14 @@ def _has_things_above(ijk: NDArray[np.int64], level: int, mask: NDArray[np.bool_
     return bool(count >= LEAST_ABOVE * mask.sum() * SURFACE_VOXEL**2)
 
 
-def _overlap(mask: NDArray[np.bool_], other: NDArray[np.bool_]) -> float:
+def _overlap(mask: Mask, other: Mask) -> float:
     """Return the fraction of the smaller of two floors that overlaps the other or a gap in it."""
     square = np.ones((GAP, GAP), np.uint8)
     one, two = (cv2.morphologyEx(m.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0 for m in (mask, other))
     return float((one & two).sum() / max(min(one.sum(), two.sum()), 1))
 
 
-def _unite_levels(masks: dict[int, NDArray[np.bool_]]) -> list[list[int]]:
+def _unite_levels(masks: dict[int, Mask]) -> list[list[int]]:
     """Group levels into storeys: a level that hardly overlaps those below it joins their storey."""
     groups: list[list[int]] = []
     for level, mask in masks.items():

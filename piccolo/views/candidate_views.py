@@ -13,24 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Int8s, Int64s, Mask
 from ..cloud.octree import Octree
-from ..geometry.pose import Array
 from ..geometry.sphere import SEARCH_RINGS, make_grid
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, HALF, Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import LEVELS_PER_UNIT
-from .view import (
-    BLOCK,
-    Array32,
-    Mask,
-    Scratch,
-    ViewArrays,
-    ViewConfig,
-    average_nodes,
-    normalize_cells,
-    thread_scratch,
-)
+from .view import BLOCK, Scratch, ViewArrays, ViewConfig, average_nodes, normalize_cells, thread_scratch
 
 WIDE_RINGS = 12
 SEARCH_VIEW = ViewConfig(num_rings=SEARCH_RINGS, stats_rings=16, sigma_deg=22.0, voxel_per_range=1 / 15)
@@ -42,18 +32,18 @@ MOST_KEPT = 1 << 15  # views, 0.24 GB
 class Views(NamedTuple):
     """Views from some centres, as kernels read them."""
 
-    centers: NDArray[np.float64]  # (n, 3) [m]
+    centers: Array  # (n, 3) [m]
     offsets: NDArray[np.int16]  # (n, 3, cells) from the centre to what is seen, in units of
-    offset_unit: NDArray[np.float32]  # (n,) [m]
-    features: NDArray[np.int8]  # (n, 3, cells) channels in levels, 0 where nothing is seen
-    is_seen: NDArray[np.bool_]  # (n, cells)
+    offset_unit: Array32  # (n,) [m]
+    features: Int8s  # (n, 3, cells) channels in levels, 0 where nothing is seen
+    is_seen: Mask  # (n, cells)
 
 
 class WideViews(NamedTuple):
     """Views from some centres, averaged over wide cells."""
 
-    features: NDArray[np.int8]  # (n, 3 * wide cells) channels in levels
-    seen: NDArray[np.uint8]  # (n, wide cells) fraction seen of each, 255 for all
+    features: Int8s  # (n, 3 * wide cells) channels in levels
+    seen: Bytes  # (n, wide cells) fraction seen of each, 255 for all
 
 
 def empty_views(num: int, num_cells: int) -> Views:
@@ -86,7 +76,7 @@ def render_block(
     scratch: Scratch,
     offsets: NDArray[np.int16],
     unit: Array32,
-    levels: NDArray[np.int8],
+    levels: Int8s,
     is_seen: Mask,
 ) -> None:
     """Write views from several centres (n, 3) [m] in few bits: the arrays of `Views`.
@@ -122,8 +112,8 @@ def render_wide_block(
     voxel_per_range: float,
     view: ViewArrays,
     scratch: Scratch,
-    features: NDArray[np.int8],
-    seen: NDArray[np.uint8],
+    features: Int8s,
+    seen: Bytes,
 ) -> None:
     """Write views from several centres (n, 3) [m], averaged over wider cells, in few bits.
 
@@ -157,7 +147,7 @@ def render_wide_block(
             seen[k, c] = np.uint8(min(wide[c, 3] / area[c], F1) * np.float32(255) + HALF)
 
 
-def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers) -> Views:
+def render_views(octree: Octree, centers: Array, config: ViewConfig, workers: Workers) -> Views:
     """Render the views from some centres (n, 3) [m]."""
     views = empty_views(len(centers), len(make_grid(config.num_rings)))
     views.centers[:] = centers
@@ -180,9 +170,7 @@ def render_views(octree: Octree, centers: NDArray[np.float64], config: ViewConfi
     return views
 
 
-def render_wide(
-    octree: Octree, centers: NDArray[np.float64], config: ViewConfig, workers: Workers
-) -> WideViews:
+def render_wide(octree: Octree, centers: Array, config: ViewConfig, workers: Workers) -> WideViews:
     """Render the views from some centres (n, 3) [m], averaged over wide cells.
 
     Their voxels are larger than `config` says: averages need no finer ones.
@@ -214,7 +202,7 @@ class CandidateViews:
     """Views of fine cells from a map's candidates, each made when it is first asked for, by any thread."""
 
     octree: Octree
-    centers: NDArray[np.float64]  # (candidates, 3) [m]
+    centers: Array  # (candidates, 3) [m]
     config: ViewConfig = SEARCH_VIEW
     made: Views = field(init=False)  # with room for more
     num_made: int = field(init=False, default=0)
@@ -229,7 +217,7 @@ class CandidateViews:
         self.num_made = 0
         self._row = np.full(len(self.centers), -1, np.int64)
 
-    def at(self, candidates: NDArray[np.int64], workers: Workers) -> tuple[NDArray[np.int64], Views]:
+    def at(self, candidates: Int64s, workers: Workers) -> tuple[Int64s, Views]:
         """Return the rows (n,) of some candidates (n,) in the views made so far, and these views.
 
         Views of candidates that have none yet are rendered first.

@@ -6,9 +6,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Mask
 from ..camera import Camera
 from ..cloud.soa import PackedPoints
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import compute_pixels
 from ..jobs.threads import Workers
 from ..panorama import Panorama
@@ -22,7 +23,7 @@ MAX_SPHERE_WIDTH = 8192  # [px]
 UPRIGHT = np.eye(3)
 
 
-def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np.uint8]:
+def fill_holes(rgb: Bytes, is_seen: Mask) -> Bytes:
     """Fill the pixels of a picture (H, W, 3) where `is_seen` (H, W) is False from the colours around them.
 
     They come from the picture filled at half the size: the larger the hole, the smoother. All is computed in
@@ -50,7 +51,7 @@ def fill_holes(rgb: NDArray[np.uint8], is_seen: NDArray[np.bool_]) -> NDArray[np
     return np.asarray(smooth, np.uint8)
 
 
-def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
+def encode_image(image: Bytes | NDArray[np.uint16], suffix: str, quality: int = 95) -> bytes:
     """Return the file, as bytes, of an image (H, W, 3) RGB, (H, W, 4) RGBA or (H, W) gray.
 
     The suffix, such as ".png", gives the format; `quality`, up to 100, is that of a JPEG. Raises OSError if
@@ -65,13 +66,13 @@ def encode_image(image: NDArray[np.uint8] | NDArray[np.uint16], suffix: str, qua
     return content.tobytes()
 
 
-def resize_rgb(panorama: Panorama, width: int) -> NDArray[np.uint8]:
+def resize_rgb(panorama: Panorama, width: int) -> Bytes:
     """Return the panorama's colours, resized to (width / 2, width, 3)."""
     rgb = shrink(panorama, width).rgb
     return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-def checkerboard(photo: NDArray[np.uint8], cloud: NDArray[np.uint8]) -> NDArray[np.uint8]:
+def checkerboard(photo: Bytes, cloud: Bytes) -> Bytes:
     """Stack two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
     row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
     mixed = np.where(((row + column) % 2 == 0)[..., None], photo, cloud)
@@ -103,7 +104,7 @@ def sphere_width_for(camera: Camera) -> int:
     return min(2 * math.ceil(math.pi * camera.resolution), MAX_SPHERE_WIDTH)
 
 
-def cut(image: NDArray[np.uint8], camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> NDArray[np.uint8]:
+def cut(image: Bytes, camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> Bytes:
     """Return a camera's picture (height, width, 3), sampled from a sphere's (H, W, 3).
 
     Pixels that show no direction are black.
@@ -127,9 +128,7 @@ def cut_view(view: View, camera: Camera) -> View:
     return View(depth, cut(view.rgb, camera))
 
 
-def _places(
-    camera: Camera, width: int, R_lens_from_cam: Array
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+def _places(camera: Camera, width: int, R_lens_from_cam: Array) -> tuple[Array32, Array32, Mask]:
     """Return columns and rows [px] of the sphere at a camera's pixels (height, width), and which show any."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     rays, is_in = camera.rays(np.stack([u, v], axis=-1))

@@ -8,17 +8,15 @@ from functools import lru_cache, partial
 
 import numpy as np
 
+from ..arrays import Array, Array32, Int32s, Mask
 from ..cloud.octree import Octree, collect
 from ..cloud.soa import PackedPoints, pack_points
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import opponent, zscore
 from .view import (
-    Array32,
     Cells,
     Center,
-    Indices,
-    Mask,
     Scratch,
     ViewArrays,
     ViewConfig,
@@ -52,7 +50,7 @@ def node_fraction(node: int) -> np.float32:
 
 @inline_kernel
 def keep_visible(
-    tree: Octree, nodes: Indices, cells: Indices, ranges: Array32, limits: Array32
+    tree: Octree, nodes: Int32s, cells: Int32s, ranges: Array32, limits: Array32
 ) -> tuple[int, int]:
     """Move the visible nodes to the front; return their number, and that of their children.
 
@@ -69,7 +67,7 @@ def keep_visible(
 
 
 @inline_kernel
-def take_children(tree: Octree, nodes: Indices, kept: np.float32, found: Indices) -> int:
+def take_children(tree: Octree, nodes: Int32s, kept: np.float32, found: Int32s) -> int:
     """Write some children of nodes, each kept with the probability `kept`; return their number.
 
     A node without children stands for itself. A node's hash decides whether it is kept, so that a camera a

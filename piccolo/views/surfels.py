@@ -12,8 +12,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s, Int64s, Mask
 from ..cloud.soa import PackedPoints
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import compute_pixels, compute_rays
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
@@ -45,7 +46,6 @@ MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
 HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
 FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
 
-Array32 = NDArray[np.float32]
 # of a surfel in the camera's frame: centre [m], normal, product of both, 1 / radius^2, range [m]
 Disc = tuple[Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar, Scalar]
 
@@ -54,8 +54,8 @@ class Surfels(NamedTuple):
     """Coloured discs around points."""
 
     points: PackedPoints
-    normals: NDArray[np.float32]  # (N, 3) unit, of either sign; 0 without a plane: faces the camera
-    radii: NDArray[np.float32]  # (N,) [m], 0 for a surfel no larger than a pixel
+    normals: Array32  # (N, 3) unit, of either sign; 0 without a plane: faces the camera
+    radii: Array32  # (N,) [m], 0 for a surfel no larger than a pixel
 
     def take(self, indices: NDArray[np.integer]) -> "Surfels":
         """Return the surfels at `indices`, in that order."""
@@ -88,7 +88,7 @@ def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
     return Surfels(points, normals, radii).take(np.flatnonzero(is_surface))
 
 
-def planes(neighborhoods: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def planes(neighborhoods: Array32) -> tuple[Array32, Mask]:
     """Fit planes to neighbourhoods (N, K, 3); return unit normals (N, 3), and which fill a volume (N,).
 
     The normal is 0 where there is no plane.
@@ -137,7 +137,7 @@ def half_width(rise: Scalar, angle: Scalar, cosines: Scalar) -> float:
 @kernel
 def splat(
     surfels: Array32,
-    rgbx: NDArray[np.int32],
+    rgbx: Int32s,
     extents: Array,
     columns: Array32,
     rows: Array32,
@@ -187,7 +187,7 @@ def splat(
                     s[4] += weight
 
 
-def axes_of_pixels(width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def axes_of_pixels(width: int) -> tuple[Array32, Array32]:
     """Return cosine and sine of each column's azimuth (width, 2) and each row's elevation (width / 2, 2)."""
     columns = compute_rays(np.arange(width) + 0.5, width / 4.0, width)[:, :2]
     rows = compute_rays(width / 2.0, np.arange(width // 2) + 0.5, width)[:, ::2]
@@ -200,7 +200,7 @@ def render_points(points: PackedPoints, pose: Pose, width: int, workers: Workers
     return render_surfels(make_surfels(visible, workers), pose, width, workers)
 
 
-def visible_indices(points: PackedPoints, center_world: Array) -> NDArray[np.int64]:
+def visible_indices(points: PackedPoints, center_world: Array) -> Int64s:
     """Return the indices of all points but those behind a surface that goes on around them.
 
     In `visible_points` the nearest point of a cell hides the whole cell: a picture would lack a rim of two
@@ -249,7 +249,7 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
     return View(depth, rgb)
 
 
-def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[NDArray[np.float32], Array]:
+def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[Array32, Array]:
     """Return surfels (N, 9) and extents (N, 3) as `splat` reads them."""
     p = surfels.points
     x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ pose.R_cam_from_world.T

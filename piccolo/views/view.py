@@ -5,13 +5,12 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Floats, Int32s, Mask
 from ..cloud.octree import MAX_NODES, Octree, collect
-from ..geometry.pose import Array
 from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
 from ..kernels.jit import F0, F1, HALF, kernel, whole
 from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscore
@@ -20,18 +19,15 @@ from .zbuffer import VISIBLE_FACTOR
 BLOCK = 64  # views that a thread makes at a time
 FAR = np.float32(1e30)
 
-Array32 = NDArray[np.float32]
-Indices = NDArray[np.int32]
-Mask = NDArray[np.bool_]
 Center = Sequence[float] | Array
 
 
 class Cells(NamedTuple):
     """Surfaces of the scan seen from a centre, on cells of the sphere or as points."""
 
-    offsets: NDArray[np.float32]  # (3, N) [m] from the centre
-    channels: NDArray[np.float32]  # (3, N) opponent colours, locally normalised [standard deviations]
-    weights: NDArray[np.float32]  # (N,) fraction of the sphere; 0 where nothing is seen; 1 of a point
+    offsets: Array32  # (3, N) [m] from the centre
+    channels: Array32  # (3, N) opponent colours, locally normalised [standard deviations]
+    weights: Array32  # (N,) fraction of the sphere; 0 where nothing is seen; 1 of a point
     center_map: Array  # (3,) [m]
 
     def around(self, center_map: Array) -> "Cells":
@@ -43,29 +39,29 @@ class Cells(NamedTuple):
 class ViewArrays(NamedTuple):
     """A view's configuration as kernels read it."""
 
-    num_columns: NDArray[np.int32]  # (rings,) of the cells
-    first: NDArray[np.int32]  # (rings,) index of each ring's first cell
-    stats_cell: NDArray[np.int32]  # (cells,) the wider cell that each lies in
+    num_columns: Int32s  # (rings,) of the cells
+    first: Int32s  # (rings,) index of each ring's first cell
+    stats_cell: Int32s  # (cells,) the wider cell that each lies in
     num_stats: int  # wider cells
-    solid_angle: NDArray[np.float32]  # (cells,) fraction of the sphere
-    neighbor_row: NDArray[np.int32]  # (wider cells + 1,) where each wider cell's neighbours begin
-    neighbor_cell: NDArray[np.int32]  # wider cells
-    neighbor_weight: NDArray[np.float32]
-    near_stats: NDArray[np.int32]  # (cells, 4) wider cells around each cell's middle
-    near_weight: NDArray[np.float32]  # (cells, 4) of each: bilinear
+    solid_angle: Array32  # (cells,) fraction of the sphere
+    neighbor_row: Int32s  # (wider cells + 1,) where each wider cell's neighbours begin
+    neighbor_cell: Int32s  # wider cells
+    neighbor_weight: Array32
+    near_stats: Int32s  # (cells, 4) wider cells around each cell's middle
+    near_weight: Array32  # (cells, 4) of each: bilinear
     front: np.float32
     visible: np.float32
-    blocks: NDArray[np.int32]  # (cells,) the block of the sphere that each lies in, for scores
+    blocks: Int32s  # (cells,) the block of the sphere that each lies in, for scores
 
 
 class Scratch(NamedTuple):
     """Arrays that one thread needs to render."""
 
-    nodes: NDArray[np.int32]
-    directions: NDArray[np.float32]  # (3, N)
-    cells: NDArray[np.int32]
-    ranges: NDArray[np.float32]
-    turns: NDArray[np.float32]
+    nodes: Int32s
+    directions: Array32  # (3, N)
+    cells: Int32s
+    ranges: Array32
+    turns: Array32
 
 
 @dataclass(frozen=True)
@@ -105,9 +101,9 @@ def locate(
     X: Array32,
     Y: Array32,
     Z: Array32,
-    num_columns: Indices,
-    first: Indices,
-    cells: Indices,
+    num_columns: Int32s,
+    first: Int32s,
+    cells: Int32s,
     ranges: Array32,
     turns: Array32,
 ) -> None:
@@ -276,12 +272,7 @@ def normalize_cells(
 
 @kernel
 def nearest_ranges(
-    tree: Octree,
-    centers: NDArray[np.floating[Any]],
-    voxel_per_range: float,
-    view: ViewArrays,
-    scratch: Scratch,
-    ranges: Array32,
+    tree: Octree, centers: Floats, voxel_per_range: float, view: ViewArrays, scratch: Scratch, ranges: Array32
 ) -> None:
     """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
     for k in range(len(centers)):
@@ -320,16 +311,14 @@ def empty_cells(n: int, center_map: Center) -> Cells:
     return Cells(offsets, channels, np.empty(n, np.float32), np.asarray(center_map, np.float64))
 
 
-def normalize_view(sums: Array32, center_map: Center, config: ViewConfig, shown: NDArray[np.bool_]) -> Cells:
+def normalize_view(sums: Array32, center_map: Center, config: ViewConfig, shown: Mask) -> Cells:
     """Normalise a view from a centre (3,) [m], given its sums (N, 8); cells not shown (N,) weigh 0."""
     cells = empty_cells(len(sums), center_map)
     normalize_cells(sums, config.arrays, shown, *cells[:3])
     return cells
 
 
-def ranges_around(
-    octree: Octree, centers_map: NDArray[np.floating[Any]], config: ViewConfig
-) -> NDArray[np.float32]:
+def ranges_around(octree: Octree, centers_map: Floats, config: ViewConfig) -> Array32:
     """Return the range [m] of the nearest node in each cell around each centre: (n, cells), 0 for none."""
     ranges = np.empty((len(centers_map), len(make_grid(config.num_rings))), np.float32)
     centers_map = np.ascontiguousarray(centers_map)  # one kernel for all

@@ -6,13 +6,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s, Int64s, Mask
 from ..cloud.soa import PackedPoints
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import direction_to_pixel, solid_angles
 from ..kernels.jit import kernel, whole
 from ..panorama.texels import Pose32, channel, in_camera, pose_float32
 
-Coordinates = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]  # x, y, z (N,) [m]
+Coordinates = tuple[Array32, Array32, Array32]  # x, y, z (N,) [m]
 CHUNK = 4096
 
 # A point is visible if it is not farther than the nearest in its cell by this much. The factor lets grazing
@@ -31,23 +32,18 @@ MIN_SEEN_FRACTION = 0.4  # of the sphere; less is seen from outside a scan
 class View(NamedTuple):
     """A view of the cloud, on an equirectangular grid."""
 
-    depth: NDArray[np.float32]  # (H, W) range of what is nearest [m], inf where there is nothing
+    depth: Array32  # (H, W) range of what is nearest [m], inf where there is nothing
     rgb: NDArray[Any]  # (H, W, 3) mean colour of what is near that range, 0 where there is nothing
 
     @property
-    def is_seen(self) -> NDArray[np.bool_]:
+    def is_seen(self) -> Mask:
         """True where something was seen, (H, W)."""
         return np.isfinite(self.depth)
 
 
 @kernel
 def cells_and_ranges(
-    points: Coordinates,
-    begin: int,
-    pose: Pose32,
-    width: int,
-    cells: NDArray[np.int32],
-    ranges: NDArray[np.float32],
+    points: Coordinates, begin: int, pose: Pose32, width: int, cells: Int32s, ranges: Array32
 ) -> int:
     """Write cell (row * width + column) and range [m] of a chunk of points; return its length.
 
@@ -72,7 +68,7 @@ def cells_and_ranges(
 
 @kernel
 def nearest_ranges(
-    points: Coordinates, R_cam_from_world: Array, center_world: Array, width: int, depth: NDArray[np.float32]
+    points: Coordinates, R_cam_from_world: Array, center_world: Array, width: int, depth: Array32
 ) -> None:
     """Write the range [m] of the nearest point of each cell into `depth` (H * W,), which holds inf before."""
     pose = pose_float32(R_cam_from_world, center_world)
@@ -86,11 +82,11 @@ def nearest_ranges(
 @kernel
 def mean_colors(
     points: Coordinates,
-    rgbx: NDArray[np.int32],
+    rgbx: Int32s,
     R_cam_from_world: Array,
     center_world: Array,
     width: int,
-    depth: NDArray[np.float32],
+    depth: Array32,
     sums: Array,
 ) -> None:
     """Add up (H * W, 4): R, G, B [8-bit levels] and count of the points within BAND of the nearest."""
@@ -114,8 +110,8 @@ def select_visible(
     R_cam_from_world: Array,
     center_world: Array,
     width: int,
-    depth: NDArray[np.float32],
-    indices: NDArray[np.int64],
+    depth: Array32,
+    indices: Int64s,
 ) -> int:
     """Write the indices of the points that are visible, given `depth` (H * W,) [m]; return their number."""
     pose = pose_float32(R_cam_from_world, center_world)
@@ -134,7 +130,7 @@ def _xyz(points: PackedPoints) -> Coordinates:
     return points.x, points.y, points.z
 
 
-def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> NDArray[np.float32]:
+def nearest_depth(points: PackedPoints, pose: Pose, width: int) -> Array32:
     """Return the range (width / 2, width) [m] of the nearest point in each cell, inf where there is none."""
     depth = np.full((width // 2, width), np.inf, np.float32)
     nearest_ranges(_xyz(points), pose.R_cam_from_world, pose.center_world, width, depth.reshape(-1))
@@ -154,9 +150,7 @@ def render_view(points: PackedPoints, pose: Pose, width: int) -> View:
     return View(depth, rgb.reshape(width // 2, width, 3))
 
 
-def indices_in_front(
-    points: PackedPoints, center_world: Array, depth: NDArray[np.float32]
-) -> NDArray[np.int64]:
+def indices_in_front(points: PackedPoints, center_world: Array, depth: Array32) -> Int64s:
     """Return the indices of the points that are not behind `depth` (H, W) [m], seen from a place (3,) [m].
 
     The camera's axes are the world's. A point may be farther by VISIBLE_FACTOR and VISIBLE_OFFSET.
