@@ -421,7 +421,7 @@ REFUSED = {
         "--every: found nan, wanted at least 0.01",
     ),
     "step of a walk": (["--walk", "--pano", "a.jpg", "--every", "1"], 2, "--every: only with --video"),
-    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "--walk: not an option of the preset paper"),
+    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not an option of the preset paper"),
     "odometry alone": (["--pano", "a.jpg", "--odometry", "a.tum"], 2, "--odometry: only with --walk"),
     "no odometry": (
         ["--walk", "--pano", "a.jpg", "--times", "order", "--odometry", "missing.tum"],
