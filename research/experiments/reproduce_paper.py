@@ -15,8 +15,8 @@ from zlib import crc32
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
 from piccolo.cli.command import check_least, command, option
 from piccolo.cli.errors import EXIT_BAD_INPUT, checking_options, print_error
@@ -29,7 +29,7 @@ from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
-from piccolo.geometry.pose import Array, Pose, move, transform_points
+from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.geometry.rotations import random_rotation
 from piccolo.jobs.memory import limit_memory
 from piccolo.localization.settings import CoarseToFineSettings
@@ -74,7 +74,7 @@ def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     return replace(scene, cloud=_write_cloud(folder, points, cloud.colors), queries=queries)
 
 
-def _write_cloud(folder: Path, points: Array, colors: NDArray[np.uint8]) -> Path:
+def _write_cloud(folder: Path, points: Array, colors: Bytes) -> Path:
     path = folder / CLOUD_NAME
     write_ply(path, vertex_rows(points, colors))
     return path

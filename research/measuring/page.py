@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import piccolo
+from piccolo.arrays import Bytes
 from piccolo.cli.command import check_least, option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
@@ -30,7 +31,7 @@ from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
-from ..synthetic.photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
+from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
 from .kernels import kernel_table
 from .scaling import clean_queries, size_table
@@ -179,7 +180,7 @@ class Bench:
         if self.is_wanted(PAPER):
             self.measure_paper(scene, scan)
 
-    def measure_damage(self, scene: Scene, scan: piccolo.Scan, others: Sequence[Image]) -> None:
+    def measure_damage(self, scene: Scene, scan: piccolo.Scan, others: Sequence[Bytes]) -> None:
         """Localize damaged panoramas, and panoramas in damaged scans."""
         queries = clean_queries(scene, self.arguments.damaged)
         panoramas = [read_panorama(query.image).rgb for query in queries]
@@ -252,7 +253,7 @@ class Bench:
         print_note(self.arguments, text)
 
 
-def read_foreign(scenes: Sequence[Scene]) -> list[Image]:
+def read_foreign(scenes: Sequence[Scene]) -> list[Bytes]:
     """Return panoramas of other places: of the first other scene, or of a made room."""
     if scenes:
         return [read_panorama(query.image).rgb for query in clean_queries(scenes[0], 4)]
