@@ -20,7 +20,7 @@ from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
-from .result import FAILED, Result, with_localization
+from .result import Result, with_localization
 from .scan_map.named_scans import add_places, check_within
 from .walk.beliefs import believe
 from .walk.frames import Frame
@@ -155,22 +155,14 @@ class Walk:
         kept = Kept(self.blanks[-1].to_json(), self.tracker.frames[-1])
         return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
 
-    def restore(self, line: bytes, photo: Photo, time: float, name: str) -> bool:
-        """Take the next frame from a line of `last_to_json`, if it is of this photo, unchanged.
-
-        Raises ValueError if it is no such line.
-        """
+    def restore(self, text: str, photo: Photo) -> None:
+        """Take the next frame, of a photo, from a text of `last_to_json`; ValueError if it is none."""
         from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = convert(json.loads(line), Kept, dec_hook=lambda _, rows: np.array(rows))
-        blank = replace(Result.from_json(kept.blank), settings=self.settings_of(photo))
-        is_expected = (blank.pano, kept.frame.time) == (name, time)
-        if blank.status == FAILED or not is_expected or not self._is_of(photo, blank):
-            return False
+        kept = convert(json.loads(text), Kept, dec_hook=lambda _, rows: np.array(rows))
         self.photos.append(photo)
-        self.blanks.append(blank)
+        self.blanks.append(replace(Result.from_json(kept.blank), settings=self.settings_of(photo)))
         self.tracker.accept(kept.frame)
-        return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""

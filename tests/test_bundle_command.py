@@ -63,8 +63,8 @@ def test_results_are_written_in_order(scene, relative, tmp_path, capsys):
     assert "3 photos together in" in err
     assert err.splitlines()[-1].endswith("s: 3 localized")
     before = out.read_bytes()
-    assert main(_command(scene, relative, "--out", out)) == 2
-    assert f"--out: {out} has results already" in capsys.readouterr().err
+    assert main(_command(scene, relative, "--out", out)) == 0
+    assert f"{out}: nothing is left to do" in capsys.readouterr().err
     assert out.read_bytes() == before
     assert main(_command(scene, relative, "--out", out, "--overwrite", "--quiet")) == 0
     assert capsys.readouterr() == ("", "")

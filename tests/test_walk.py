@@ -11,7 +11,7 @@ import rooms
 
 import piccolo
 from piccolo.cli import localize as localize_command
-from piccolo.cli import walking as walk_command
+from piccolo.cli.together import steps_file
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
@@ -276,7 +276,7 @@ def test_a_video_of_an_unknown_camera_is_refused_once(building, tmp_path, capsys
     assert err.count("found a picture of 320 x 180") == err.count("\n") == 1
     assert "the other 11 frames seem no better" in err
     assert not out.exists()
-    assert not walk_command.frames_file(out).exists()
+    assert not steps_file(out).exists()
     frames = [tmp_path / f"{k}.png" for k in range(5)]
     for frame in frames[:-1]:
         cv2.imwrite(str(frame), np.zeros((24, 32, 3), np.uint8))
@@ -315,7 +315,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     whole, stopped = tmp_path / "whole.jsonl", tmp_path / "stopped.jsonl"
     assert _command(folder, *walk, str(whole)) == 0
     _assert_right(read_results([whole]), queries)
-    assert not walk_command.frames_file(whole).exists()
+    assert not steps_file(whole).exists()
 
     def killed(self, show):
         raise MemoryError
@@ -323,10 +323,11 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     with monkeypatch.context() as patched:
         patched.setattr(Walk, "finish", killed)
         assert _command(folder, *walk, str(stopped)) != 0
-    kept = walk_command.frames_file(stopped)
+    kept = steps_file(stopped)
     lines = kept.read_bytes().splitlines(keepends=True)
     assert len(lines) == 1 + len(queries)
-    kept.write_bytes(lines[0] + b'{"blank": 3}\n')
+    step = json.loads(lines[1])[0]
+    kept.write_bytes(lines[0] + json.dumps([step, '{"blank": 3}']).encode() + b"\n")
     assert _command(folder, *walk, str(stopped)) == 3
     assert f"{kept}: found a damaged line (ValidationError)" in capsys.readouterr().err
     kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])
@@ -350,11 +351,9 @@ def test_frames_come_back_from_their_lines(scan, building):
     for k, query in enumerate(building[1][:3]):
         path = query.image if k != 1 else building[0] / "cloud.ply"  # no picture
         walk.add(path, query.time, "name", query.pose)
-        line = walk.last_to_json()
-        assert not again.restore(line.encode(), Photo(path), query.time, "another")
-        assert not again.restore(line.encode(), Photo(building[1][4].image), query.time, "name")
-        assert again.restore(line.encode(), Photo(path), query.time, "name")
-        assert again.last_to_json() == line
+        text = walk.last_to_json()
+        again.restore(text, Photo(path))
+        assert again.last_to_json() == text
     assert again.blanks[1].error == walk.blanks[1].error is not None
 
 
@@ -370,7 +369,7 @@ def test_a_narrow_walk_goes_on_with_the_same_bits(building, tmp_path):
         for k, query in enumerate(queries[:5]):
             photo = Photo(query.image, mask=tmp_path / "mask.png")
             if k < num_kept:
-                assert walk.restore(lines[k].encode(), photo, query.time, query.image.name)
+                walk.restore(lines[k], photo)
             else:
                 walk.add(photo, query.time, query.image.name)
             lines.append(walk.last_to_json())
@@ -422,7 +421,7 @@ REFUSED = {
         "--every: found nan, wanted at least 0.01",
     ),
     "step of a walk": (["--walk", "--pano", "a.jpg", "--every", "1"], 2, "--every: only with --video"),
-    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
+    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not an option of the preset paper"),
     "odometry alone": (["--pano", "a.jpg", "--odometry", "a.tum"], 2, "--odometry: only with --walk"),
     "no odometry": (
         ["--walk", "--pano", "a.jpg", "--times", "order", "--odometry", "missing.tum"],

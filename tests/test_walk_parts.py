@@ -195,7 +195,7 @@ def test_the_result_of_a_narrow_frame_has_its_camera_and_name(tmp_path):
     scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=2)
     walk, again = (scan.track(gravity="known") for _ in range(2))
     walk.add(photo, 0.0, "a name")
-    assert again.restore(walk.last_to_json().encode(), photo, 0.0, "a name")
+    again.restore(walk.last_to_json(), photo)
     for result in (*walk.finish(), *again.finish()):
         assert result.pano == "a name"
         assert result.cameras[0].camera.focal == (140.0, 140.0)

@@ -109,14 +109,16 @@ class Localizer:
             photo = photo.with_calibration(calibration)
         return Task(photo, settings, files_of(pano) if self.sends_photos else None)
 
-    def expect(self, cloud_sha256: str) -> Callable[[Path], Mapping[str, Any]]:
-        """Return the fields of a panorama's line that say how it was made, the most telling first."""
+    def expect(
+        self, cloud_sha256: str, more: Mapping[str, Any] | None = None
+    ) -> Callable[[Path], Mapping[str, Any]]:
+        """Return the fields of a photo's line that say how it was made, with `more` settings."""
 
         @lru_cache
         def make_fields(settings: Settings, gravity_vector: Vector | None) -> Mapping[str, Any]:
             scan = {"cloud_sha256": cloud_sha256, "cloud": self.name}
             photo = replace(self.photo, gravity_vector=gravity_vector)
-            repeated = settings_json(settings, self.cloud_settings, photo)
+            repeated = settings_json(settings, self.cloud_settings, photo) | dict(more or {})
             return dict(json.loads(json.dumps({**scan, "settings": repeated, "version": __version__})))
 
         def expect(pano: Path) -> Mapping[str, Any]:
