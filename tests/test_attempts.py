@@ -20,7 +20,8 @@ from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.localization.verification import Verified
-from piccolo.scan_map.prior import Prior
+from piccolo.panorama import GPano
+from piccolo.prior import Prior
 
 KNOWN = CoarseToFineSettings(gravity="known")
 
@@ -119,10 +120,10 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     )
 
 
-def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):
+def test_gravity_and_gps_alone_exclude_no_pose_that_is_searched_for(monkeypatch):
     monkeypatch.setattr(attempts, "search_poses", lambda *_: pytest.fail("a search beyond gravity"))
-    told = replace(KNOWN, prior=Prior(gravity_vector=(0.0, 0.0, -1.0)))
-    asked = _query(rooms.as_panorama(rooms.query(1).rgb), told)
+    told = replace(rooms.as_panorama(rooms.query(1).rgb), gpano=GPano(0.0, 0.0))
+    asked = _query(told, replace(KNOWN, prior=Prior(use_gps=False)))
     assert attempts.search_beyond_prior(asked, rooms.scan_map(1), Stopwatch()) == []
 
 

@@ -20,7 +20,7 @@ from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_besi
 from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
 from piccolo.localization.selection import NOTHING
-from piccolo.scan_map.prior import Prior
+from piccolo.prior import Prior
 
 
 def test_a_photo_is_localized_beside_one_that_shows_the_same():
@@ -109,7 +109,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert _fused(replace(judged, is_ruled_out=True), _at(true, 0.01)) is None
     assert _fused(replace(judged, gaussian=None), _at(true, 0.01)) is None
     here = rooms.scan_map(1, NUM_POINTS).to_world(true).center_world
-    away = replace(SETTINGS, prior=Prior(near_world=(*(here[:2] + 5.0), None), radius=0.5))
+    away = replace(SETTINGS, prior=Prior(near=(*(here[:2] + 5.0), None), radius=0.5))
     assert _fused(judged, _at(true, 0.01), away) is None
     motion = np.zeros((6, 1))
     motion[3] = 1.0

@@ -6,6 +6,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from pictures import encoded, with_metadata, xmp_packet
 
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
@@ -15,11 +16,12 @@ from piccolo.localization import attempts, search
 from piccolo.localization.photo import make_images
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
-from piccolo.panorama import Panorama
+from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
-from piccolo.scan_map.prior import Prior
+from piccolo.photo import Photo
+from piccolo.prior import Prior
 from research.synthetic.photos import mask_outside_field
 
 AREA = make_grid(24).solid_angle
@@ -136,10 +138,13 @@ def test_tilt_in_the_metadata_is_that_of_every_start():
     assert len(np.unique(np.round(forward, 6), axis=0)) > 6
 
 
-def test_the_users_gravity_goes_before_the_tilt_in_the_metadata():
-    panorama = dataclasses.replace(rooms.scene(1)[1], gpano=GPano(pitch_deg=20.0))
-    settings = CoarseToFineSettings(prior=Prior(gravity_vector=(-9.0, 0.0, -9.0)))
-    photo = prepare_query(panorama, rooms.scan_map(1), settings, Workers(2)).photo
+def test_the_users_gravity_goes_before_the_tilt_in_the_metadata(tmp_path):
+    path = tmp_path / "a.jpg"
+    content = encoded(rooms.query(1).rgb, ".jpg")
+    path.write_bytes(with_metadata(content, xmp=xmp_packet({"PosePitchDegrees": 20})))
+    assert read_panorama(path).gpano == GPano(pitch_deg=20.0)
+    panorama = read_panorama(Photo(path, gravity_vector=(-9.0, 0.0, -9.0)))
+    photo = prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(), Workers(2)).photo
     assert photo.has_tilt
     np.testing.assert_allclose(photo.R_cam_from_level @ [0.0, 0.0, -1.0], [-(0.5**0.5), 0.0, -(0.5**0.5)])
 

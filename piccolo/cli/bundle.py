@@ -49,9 +49,8 @@ def run_bundle(
     with watch.stage("all"):
         scan = open_scan()
         scale = find_scale(arguments.relative)
-        results = scan.localize_bundle(
-            photos, poses, localizer.read_options, localizer.settings, relative_scale=scale
-        )
+        given = [localizer.ask(path)[0] for path in photos]
+        results = scan.localize_bundle(given, poses, localizer.settings, scale)
     write_results(arguments.out, results)
     for result in results:
         print_result(result, result.warnings[len(scan.warnings) :])

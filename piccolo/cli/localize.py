@@ -121,7 +121,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     masks = arguments.occlusion_mask is not None
     overlays = arguments.overlay is not None
     localizer = replace(localizer, priors=priors, makes_overlays=overlays, makes_occlusion_masks=masks)
-    rig = localizer.read_options.rig
+    rig = localizer.photo.instant
     is_one = rig.is_instant if rig else is_cube
     left_out = Counter[str]()
     named = list_panoramas(arguments.pano, sys.stdin, left_out, is_one)
@@ -131,7 +131,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     known = list(named)
     check_files(arguments, known, len(known))
     for pano in known:
-        localizer.settings_of(pano)
+        localizer.ask(pano)
     note_unused_priors(arguments, localizer)
     return Run(arguments, localizer, known, len(known), left_out, Counter())
 
@@ -330,11 +330,11 @@ def run_frames(run: Run) -> int:
     settings = run.localizer.settings
     if not isinstance(settings, CoarseToFineSettings):
         raise UsageError("--walk, --video: not options of the preset paper")
-    with walk_frames(arguments, list(run.panoramas)) as (frames, motion):
+    with walk_frames(arguments, run.localizer.photo, list(run.panoramas)) as (frames, motion):
         if run.left_out:
             print_note(arguments, describe_left_out(run.left_out))
         scan = open_scan(run, run.localizer, arguments.threads or num_cores())
-        return run_walk(arguments, frames, Walk(scan, run.localizer.read_options, settings, motion))
+        return run_walk(arguments, frames, Walk(scan, settings, motion))
 
 
 @command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")
@@ -350,7 +350,7 @@ def main(arguments: argparse.Namespace) -> int:
         run_all = run_bundle if arguments.relative else run_coloring
         printing = partial(print_result, arguments)
         return run_all(arguments, list(run.panoramas), localizer, opening, printing)
-    rig = run.localizer.read_options.rig
+    rig = run.localizer.photo.instant
     with open_output(run) as (output, records):
         panoramas = iter(run.panoramas)
         if run.total is not None:

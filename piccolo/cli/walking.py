@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,6 +23,7 @@ from ..jobs.stopwatch import Stopwatch
 from ..jobs.tasks import InFlight
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
+from ..photo import Photo
 from ..result import FAILED, UNREADABLE
 from ..scan_walk import Walk
 from ..walk.motion import Motion
@@ -40,7 +42,7 @@ KEY_BEGINS = b'{"'
 class WalkInput(NamedTuple):
     """A frame of a walk."""
 
-    path: Path
+    photo: Photo
     time: float  # [s] since the first; of frames without times their number
     name: str  # in the results
     odometry: Pose | None = None
@@ -63,38 +65,42 @@ def check_walk_options(arguments: argparse.Namespace) -> None:
     if is_from_stdin(arguments.pano):
         raise UsageError("--walk: found names on stdin, wanted files or folders")
     check_alone(arguments, "a walk", NOT_WITH)
-    Motion(arguments.max_speed)  # refuses a wrong one
+    Motion(max_speed=arguments.max_speed)  # refuses a wrong one
 
 
 @contextmanager
 def walk_frames(
-    arguments: argparse.Namespace, panoramas: Sequence[Path]
+    arguments: argparse.Namespace, photo: Photo, panoramas: Sequence[Path]
 ) -> Iterator[tuple[list[WalkInput], Motion]]:
-    """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
+    """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried.
+
+    `photo` has the options of all.
+    """
     with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
         times = None
         if arguments.video:
-            found = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
-            shots = show_progress(found, arguments.quiet, desc="read the video", unit=" frames", leave=False)
-            frames = [WalkInput(f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots]
+            taken = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
+            shots = show_progress(taken, arguments.quiet, desc="read the video", unit=" frames", leave=False)
+            found = ((f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots)
         else:
             times = times_of(panoramas, arguments.times)
             clock = times or [float(k) for k in range(len(panoramas))]
-            frames = [WalkInput(p, t - clock[0], str(p)) for p, t in zip(panoramas, clock, strict=True)]
+            found = ((p, t - clock[0], str(p)) for p, t in zip(panoramas, clock, strict=True))
+        frames = [WalkInput(replace(photo, picture=path), *more) for path, *more in found]
         if arguments.odometry:
-            paths = [frame.path for frame in frames]
+            paths = [frame.photo.path for frame in frames]
             when = times or [frame.time for frame in frames]
             poses = read_odometry(arguments.odometry, paths, when, has_clock=times is not None)
             frames = [f._replace(odometry=pose) for f, pose in zip(frames, poses, strict=True)]
         is_timed = times is not None or arguments.video is not None
-        yield frames, Motion(arguments.max_speed, is_timed=is_timed)
+        yield frames, Motion(max_speed=arguments.max_speed, is_timed=is_timed)
 
 
 def run_walk(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: Walk) -> int:
     """Localize a walk, write its results, return the exit code."""
     watch = Stopwatch()
     if arguments.odometry:
-        walk.settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
+        walk.more_settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
     if (counts := count_finished(None if arguments.overwrite else arguments.out, walk, frames)) is not None:
         print_note(arguments, f"{arguments.out}: nothing is left to do")
         return choose_exit_code(counts)
@@ -129,7 +135,7 @@ def follow_all(arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkI
         bar = {"desc": "frames", "total": len(frames), "initial": len(walk.blanks), "unit": ""}
         left = iter(frames[len(walk.blanks) :])
         # each is prepared while the one before it is followed
-        prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.path, frame.name), left, 2)
+        prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.photo, frame.name), left, 2)
         with interruptible() as interruption:
             pairs = show_progress(prepared, arguments.quiet, **bar)
             for frame, wait in interruption.each(pairs) if file else pairs:
@@ -147,7 +153,7 @@ def follow_all(arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkI
 def check_others(walk: Walk, frames: Sequence[WalkInput], error: str, path: Path | None) -> None:
     """Refuse a walk whose first frames, and the last, can't be read for one reason; nothing is kept."""
     others = [*frames[1:NUM_TRIED], frames[-1]]
-    found = (str(walk.prepare(other.path, other.name).blank.error) for other in others)
+    found = (str(walk.prepare(other.photo, other.name).blank.error) for other in others)
     is_same = (text.replace(o.name, frames[0].name) == error for text, o in zip(found, others, strict=True))
     if len(frames) > NUM_TRIED and all(is_same):
         if path:
@@ -158,7 +164,7 @@ def check_others(walk: Walk, frames: Sequence[WalkInput], error: str, path: Path
 def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, is_new: bool) -> None:
     """Restore the frames that an earlier run of the same walk has left, and cut off the rest of the file."""
     path = file.path
-    key = json.dumps(walk.key)
+    key = json.dumps(walk.key_of(frames[0].photo))
     size = 0 if is_new else whole_size(path, KEY_BEGINS, f"frames of a walk: {WAYS}")
     lines = whole_lines(path, size)
     first = next(lines, b"")
@@ -167,7 +173,7 @@ def take_up(walk: Walk, frames: Sequence[WalkInput], file: LineFile, is_new: boo
     kept = len(first)
     for frame, line in zip(frames, lines, strict=False):
         try:
-            is_same = walk.restore(line, frame.path, frame.time, frame.name)
+            is_same = walk.restore(line, frame.photo, frame.time, frame.name)
         except ValueError as error:
             raise InputError(f"{path}: found a damaged line ({type(error).__name__}); {WAYS}") from error
         if not is_same:
@@ -185,9 +191,9 @@ def count_finished(out: Path | None, walk: Walk, frames: Sequence[WalkInput]) ->
     """
     if out is None or is_stream(out):
         return None
-    paths = {frame.name: frame.path for frame in frames}
+    photos = {frame.name: frame.photo for frame in frames}
     records = Records(out)
-    key = walk.key
-    records.read(lambda name: key, paths)
-    left = list(records.remaining(paths, lambda name: sha256_of(paths[name], walk.read_options.rig)))
+    key = walk.key_of(frames[0].photo)
+    records.read(lambda name: key, photos)
+    left = list(records.remaining(photos, lambda name: sha256_of(photos[name].path, photos[name].instant)))
     return None if left or not records.is_in_order else records.counts

@@ -14,7 +14,7 @@ from ..errors import InputError
 from ..geometry.pose import Array, Pose
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
-from ..opened_scan import OpenedScan, read_options_of
+from ..opened_scan import OpenedScan, labels_of, photo_of
 from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink
 from ..result import Result
@@ -136,10 +136,9 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
 def read_unmasked(result: Result) -> Panorama:
     """Read the photo of a result as it was read when it was localized, without what was masked."""
     how: Any = result.settings.get("panorama") or {}
-    mask = Path(how["mask"]) if how.get("mask") else None
     nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
-    options = replace(read_options_of(result), mask=mask, mask_nadir_deg=nadir_deg)
-    return shrink(read_panorama(Path(result.pano), options), WIDTH)
+    photo = replace(photo_of(result), mask=how.get("mask"), mask_nadir_deg=nadir_deg)
+    return shrink(read_panorama(photo, labels_of(result)), WIDTH)
 
 
 def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:

@@ -15,8 +15,8 @@ from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, propose_poses
+from ..prior import NOTHING_KNOWN
 from ..scan_map.camera_positions import COARSE_SPACING
-from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
 from .beam import brief_query, refine_matches, refine_starts, score_mirror, score_starts
 from .comparison import score_pose
@@ -142,11 +142,10 @@ def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]
 
 def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
     """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    gravity_alone = Prior(gravity_vector=query.settings.prior.gravity_vector)
-    is_asked = query.settings.prior != gravity_alone and query.method.uses_search and is_whole(query)
+    is_asked = not query.settings.prior.is_empty and query.method.uses_search and is_whole(query)
     if not is_asked:
         return []
-    settings = replace(query.settings, prior=gravity_alone)
+    settings = replace(query.settings, prior=NOTHING_KNOWN)
     anywhere = brief_query(replace(query, scan_map=scan_map, settings=settings))
     with watch.stage("search"):
         starts = search_poses(anywhere, "known")

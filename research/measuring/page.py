@@ -163,7 +163,7 @@ class Bench:
         for scene in self.of_photos if self.is_wanted(PHOTOS) else []:
             scan = piccolo.open_scan(scene.cloud, cache=False)
             for query in scene.queries:
-                result = scan.localize(query.image, camera=camera_path(scene, query))
+                result = scan.localize(piccolo.Photo(query.image, camera=camera_path(scene, query)))
                 self.add(PHOTOS, f"{scene.name}, own photos", query.image.name, query.pose, result)
 
     def measure_panoramas(self, scene: Scene, others: Sequence[Scene]) -> None:
@@ -191,12 +191,13 @@ class Bench:
             elsewhere = Trial("another place", other, None)
             for trial in (taken, *damage_trial(taken, other, rng), elsewhere):
                 name = f"{scene.name}/{query.image.name}"
-                result = scan.localize(trial.rgb, mask=trial.is_masked)
+                result = scan.localize(piccolo.Photo(trial.rgb, mask=trial.is_masked))
                 self.add(DAMAGE, trial.case, name, trial.true_pose, result)
         cloud = read_cloud(scene.cloud)
         points: Points = (cloud.points + cloud.origin_world, cloud.colors)
         for label, change in DAMAGED_SCANS.items():
-            damaged_scan = piccolo.open_scan(*change(points, np.random.default_rng(61)))
+            damaged_points, colors = change(points, np.random.default_rng(61))
+            damaged_scan = piccolo.open_scan(piccolo.Cloud(damaged_points, colors=colors))
             for query in queries:
                 name = f"{scene.name}/{query.image.name}"
                 self.add(DAMAGE, label, name, query.pose, damaged_scan.localize(query.image))
@@ -211,7 +212,7 @@ class Bench:
                 path = Path(folder) / f"{scene.name}_{number}.jpg"
                 photo = cut_photo(read_panorama(query.image).rgb, query.pose, PHOTO_FOV_DEG, rng)
                 write_photo(photo, path)
-                exact = scan.localize(path, focal_px=photo.focal_px)
+                exact = scan.localize(piccolo.Photo(path, focal_px=photo.focal_px))
                 self.add(PHOTOS, f"{scene.name}, exact focal length", path.name, photo.pose, exact)
                 rounded = scan.localize(path)
                 self.add(PHOTOS, f"{scene.name}, focal length by EXIF", path.name, photo.pose, rounded)
