@@ -77,10 +77,10 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
 
 
 def test_sizes_are_those_asked_for(scene):
-    cloud, queries = scaling.scene_case(read_scene(scene), 50_000)  # more than it has
-    assert (len(cloud.points), len(queries)) == (50_000, 1)
-    cloud, queries = scaling.rooms_case(1)
-    assert (len(cloud.points), len(queries)) == (50_000, scaling.NUM_QUERIES)
+    points, _, queries = scaling.scene_case(read_scene(scene), 50_000)  # more than it has
+    assert (len(points), len(queries)) == (50_000, 1)
+    points, _, queries = scaling.rooms_case(1)
+    assert (len(points), len(queries)) == (50_000, scaling.NUM_QUERIES)
 
 
 def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):

@@ -73,7 +73,8 @@ The same panoramas by both methods, gravity known. The preset is Algorithm 1 of 
     "size": """\
 ## Time and memory by the size of the scan
 Each row is measured in a process of its own, gravity known and unknown. A scene is resampled; rooms are those
-of `tools/make_room.py`, 50,000 points each. The peak of memory is that of the whole process.""",
+of `tools/make_room.py`, 50,000 points each. Features: with the map's file. The peak of memory is that of the
+whole process.""",
     "kernels": """\
 ## Kernels against `cv2.remap`
 The reference is `cv2.remap`, one thread: 8 bits, 3 channels, bilinear, a pixel a point.""",
