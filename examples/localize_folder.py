@@ -10,16 +10,14 @@ from pathlib import Path
 
 import piccolo
 
-Place = tuple[float, float, float]
 
-
-def read_priors(path: str) -> dict[str, tuple[Place, float]]:
-    """Return the place and its radius by the photo's name."""
-    priors: dict[str, tuple[Place, float]] = {}
+def read_priors(path: str) -> dict[str, piccolo.Prior]:
+    """Return what is known of each photo, by its name."""
+    priors: dict[str, piccolo.Prior] = {}
     with Path(path).open(newline="") as file:
         for row in csv.DictReader(file):
-            near_world = float(row["x"]), float(row["y"]), float(row["z"])
-            priors[row["name"]] = near_world, float(row["radius"])
+            near = float(row["x"]), float(row["y"]), float(row["z"])
+            priors[row["name"]] = piccolo.Prior(near=near, radius=float(row["radius"]))
     return priors
 
 
@@ -30,8 +28,7 @@ def main(scan_path: str, folder: str, priors_path: str) -> None:
     print("name,status,confidence,x,y,z")
     for photo in sorted(Path(folder).iterdir()):
         try:
-            near_world, radius = priors.get(photo.name, (None, None))
-            result = scan.localize(photo, near_world=near_world, radius=radius)
+            result = scan.localize(photo, prior=priors.get(photo.name))
         except piccolo.InputError as error:
             print(error, file=sys.stderr)
             continue

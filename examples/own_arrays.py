@@ -16,7 +16,7 @@ vertices = PlyData.read(scan_path)["vertex"]
 points = np.stack([vertices[axis] for axis in ("x", "y", "z")], axis=1)
 colors = np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1)
 is_near = np.linalg.norm(points - np.median(points, axis=0), axis=1) < 20.0
-scan = piccolo.open_scan(points[is_near], colors[is_near])
+scan = piccolo.open_scan(piccolo.Cloud(points[is_near], colors=colors[is_near]))
 
 # %% A photo: (H, W, 3) in uint8, and a mask (H, W), True where a tripod hides the floor
 image = np.array(Image.open(photo_path).convert("RGB"))
@@ -25,7 +25,8 @@ elevation_deg = 90.0 - 180.0 * (np.arange(height) + 0.5) / height
 is_ignored = np.broadcast_to(elevation_deg[:, None] < -60.0, image.shape[:2])
 
 # %% The camera was upright, and between 0.5 and 2.2 m above the floor
-result = scan.localize(image, mask=is_ignored, gravity="known", height=(0.5, 2.2))
+photo = piccolo.Photo(image, mask=is_ignored)
+result = scan.localize(photo, prior=piccolo.Prior(height=(0.5, 2.2)), gravity="known")
 print(result.summary())
 
 # %% Where the camera is among the points

@@ -23,14 +23,19 @@ if TYPE_CHECKING:
     from .confidence.localization import FocalLength as FocalLength
     from .geometry.pose import Pose as Pose
     from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
+    from .opening import Cloud as Cloud
     from .opening import open_scan as open_scan
     from .paper.settings import PaperSettings as PaperSettings
+    from .photo import Photo as Photo
+    from .prior import Prior as Prior
+    from .report.build import ReportSettings as ReportSettings
     from .report.build import write_report as write_report
     from .result import Result as Result
     from .result import Source as Source
     from .scan import Scan as Scan
-    from .scan_map.prior import GpsPrior as GpsPrior
+    from .scan_map.gps import GpsPrior as GpsPrior
     from .scan_walk import Walk as Walk
+    from .walk.motion import Motion as Motion
     from .walk.path import Gap as Gap
     from .walk.results import Alone as Alone
     from .walk.results import WalkFrame as WalkFrame
@@ -38,14 +43,19 @@ if TYPE_CHECKING:
 MODULES = {
     "Alone": ".walk.results",
     "Alternative": ".confidence.localization",
+    "Cloud": ".opening",
     "CoarseToFineSettings": ".localization.settings",
     "Evidence": ".confidence.localization",
     "FocalLength": ".confidence.localization",
     "Gap": ".walk.path",
-    "GpsPrior": ".scan_map.prior",
+    "GpsPrior": ".scan_map.gps",
+    "Motion": ".walk.motion",
     "PaperSettings": ".paper.settings",
+    "Photo": ".photo",
     "Pose": ".geometry.pose",
     "PoseCovariance": ".confidence.covariance",
+    "Prior": ".prior",
+    "ReportSettings": ".report.build",
     "Result": ".result",
     "Scan": ".scan",
     "Source": ".result",

@@ -1,8 +1,9 @@
-"""Checks of the public functions' arguments against their annotations."""
+"""Checks of the values of options against their annotations."""
 
 import inspect
 import types
 from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from dataclasses import fields
 from os import PathLike
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -21,28 +22,21 @@ WORDS = {
 NUMBERS = {bool: bool | np.bool_, int: int | np.integer, float: float | int | np.floating | np.integer}
 
 
-def check_arguments(function: Callable[..., object], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the arguments of a function that are not None, by name.
+def check_fields(options: Any) -> None:
+    """Check the fields of a frozen dataclass against its annotations, when it is made.
 
-    `values` are the function's `locals()`; `**options` are an unpacked TypedDict. NumPy scalars become Python
-    numbers, and rows of numbers tuples. Raises InputError for an argument that is not of its annotated type,
-    and TypeError for an option that the function does not have.
+    NumPy scalars become Python numbers, and rows of numbers tuples. Raises InputError for another type.
     """
-    kinds = inspect.get_annotations(function)
-    if "options" in kinds:
-        kinds |= get_args(kinds.pop("options"))[0].__annotations__
-    options = values.get("options", {})
-    if unknown := options.keys() - kinds.keys():
-        raise TypeError(f"{function.__qualname__}() got an unexpected keyword argument {min(unknown)!r}")
-    given: dict[str, Any] = {}
-    for name, kind in kinds.items():
-        value = options.get(name, values.get(name))
-        if name == "return" or (value is None and is_of_kind(None, kind)):
-            continue
-        if not is_of_kind(value, kind):
-            raise InputError(f"`{name}`: found {describe_value(value)}, wanted {describe(kind)}")
-        given[name] = plain(value, kind)
-    return given
+    kinds = inspect.get_annotations(type(options))
+    for name in [f.name for f in fields(options) if f.name in kinds]:
+        object.__setattr__(options, name, check_kind(name, getattr(options, name), kinds[name]))
+
+
+def check_kind(name: str, value: Any, kind: Any) -> Any:
+    """Return the value of an option, plain; InputError if it is not of an annotated type."""
+    if not is_of_kind(value, kind):
+        raise InputError(f"`{name}`: found {describe_value(value)}, wanted {describe(kind)}")
+    return plain(value, kind)
 
 
 def is_of_kind(value: object, kind: Any) -> bool:

@@ -1,7 +1,7 @@
 """Opening of scans: files or arrays are read and prepared for a method, or a prepared map is read."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import KW_ONLY, dataclass, replace
 from os import PathLike
 from pathlib import Path
 from typing import Any, Literal
@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from .arguments import check_arguments
+from .arguments import check_fields, check_kind
+from .arrays import Floats
 from .cloud import open_cloud
 from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
@@ -19,9 +20,10 @@ from .geometry.colors import Labels
 from .jobs.stopwatch import Stopwatch
 from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
 from .localization.settings import CoarseToFineSettings
-from .opened_scan import File, OpenedScan, Settings
+from .opened_scan import OpenedScan, Settings
 from .paper.localize import PaperMap
 from .paper.localize import prepare as prepare_by_paper
+from .photo import File
 from .scan import Scan
 from .scan_map.named_scans import check_within
 from .scan_map.open_map import CachePolicy, find_prepared_map, open_map
@@ -31,22 +33,9 @@ Units = Literal["mm", "cm", "m", "ft", "us-ft"]
 DEFAULT = CoarseToFineSettings()
 
 
-def open_scan(  # noqa: PLR0913  options by name
-    source: File | Sequence[File] | NDArray[np.floating[Any]],
-    colors: NDArray[Any] | None = None,
-    *,
-    units: Units = "m",
-    up: UpAxis = "auto",
-    ignore_colors: bool = False,
-    labels: bool = False,
-    ignore_labels: Sequence[int] = (),
-    crs: str | None = None,
-    cache: bool | File = True,
-    num_threads: int | None = None,
-    progress: ProgressCallback | None = None,
-    settings: Settings = DEFAULT,
-) -> Scan:
-    """Read a coloured scan and prepare it, so that photos can be localized in it.
+@dataclass(frozen=True, eq=False)
+class Cloud:
+    """A scan, and what its files do not say of it. A path, a list of paths or an array serves as one.
 
     Parameters
     ----------
@@ -56,26 +45,86 @@ def open_scan(  # noqa: PLR0913  options by name
     colors
         RGB of the points (N, 3), in uint8, uint16, or floats in [0, 1]. Only with an array of points.
     units
-        Unit of the coordinates in files, "m" by default. Arrays and all poses are in metres.
+        Unit of the coordinates in files. Arrays and all poses are in metres.
     up
-        Axis of the scan that points up. By default "auto": z, in glTF files y.
+        Axis of the scan that points up; "auto" is z, in glTF files y.
     ignore_colors
-        Use the shape of the scan, and intensities, even if it has colours. False by default.
+        Use the shape of the scan, and intensities, even if it has colours.
     labels
-        Use semantic labels in place of colours, in scan and panoramas. False by default.
+        Use semantic labels in place of colours, in scan and panoramas.
     ignore_labels
         Labels that are left out of the scan and masked in panoramas. Only with `labels`.
     crs
         Coordinate system of the scan, such as "EPSG:25832", to use GPS positions of photos. By default the
         one that a LAS, LAZ or E57 file names.
+
+    Raises
+    ------
+    InputError
+        An option is invalid, or does not go with another.
+    """
+
+    source: File | Sequence[File] | Floats
+    _: KW_ONLY
+    colors: NDArray[Any] | None = None
+    units: Units = "m"
+    up: UpAxis = "auto"
+    ignore_colors: bool = False
+    labels: bool = False
+    ignore_labels: Sequence[int] = ()
+    crs: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse values that mean nothing, naming the option."""
+        check_fields(self)
+        if self.ignore_labels and not self.labels:
+            raise InputError("`ignore_labels`: only with `labels`")
+        if not isinstance(self.source, np.ndarray):
+            if self.colors is not None:
+                raise InputError("`colors`: found files, wanted an array of points")
+            if not self.paths:
+                raise InputError("`source`: found no file, wanted a scan's path")
+        elif self.units != "m":
+            raise InputError(f"`units`: found {self.units!r} for arrays, wanted points in metres")
+        self.settings  # noqa: B018  refuses what does not go together
+
+    @property
+    def paths(self) -> list[Path]:
+        """Paths of the files; none of an array."""
+        if isinstance(self.source, str | PathLike):
+            return [Path(self.source)]
+        return [] if isinstance(self.source, np.ndarray) else [Path(path) for path in self.source]
+
+    @property
+    def settings(self) -> CloudSettings:
+        """Settings with which the scan is read."""
+        channels = WITHOUT_COLORS if self.ignore_colors else IN_METRES.channels
+        labels = Labels(tuple(sorted(set(self.ignore_labels)))) if self.labels else None
+        return CloudSettings(METRES[self.units], self.up, channels, labels, self.crs)
+
+
+def open_scan(
+    cloud: File | Sequence[File] | Floats | Cloud,
+    *,
+    settings: Settings = DEFAULT,
+    cache: bool | File = True,
+    num_threads: int | None = None,
+    progress: ProgressCallback | None = None,
+) -> Scan:
+    """Read a coloured scan and prepare it, so that photos can be localized in it.
+
+    Parameters
+    ----------
+    cloud
+        The scan. A path, several paths of one scan, or an array of points is a `Cloud` without options.
+    settings
+        `CoarseToFineSettings` (the default method) or `PaperSettings` (the method of the paper).
     cache
         Keep the prepared map in the user's cache (True, the default), nowhere (False), or in this folder.
     num_threads
         Threads that prepare the scan and localize photos, by default one for each core.
     progress
         Function that is called as `progress(what, done, total)`; `total` is None where it is unknown.
-    settings
-        `CoarseToFineSettings` (the default method) or `PaperSettings` (the method of the paper).
 
     Returns
     -------
@@ -91,35 +140,24 @@ def open_scan(  # noqa: PLR0913  options by name
     Examples
     --------
     >>> import piccolo
-    >>> scan = piccolo.open_scan("room/cloud.ply", units="m", up="z")
+    >>> scan = piccolo.open_scan(piccolo.Cloud("room/cloud.ply", units="m", up="z"))
     >>> for result in scan.localize_many(["room/images/clean_0.jpg", "room/images/clean_1.jpg"]):
     ...     print(result.pano, result.status)
     room/images/clean_0.jpg localized
     room/images/clean_1.jpg localized
     """
-    check_arguments(open_scan, locals())
+    given = cloud if isinstance(cloud, Cloud) else Cloud(cloud)
+    check_kind("settings", settings, Settings)
+    check_kind("cache", cache, bool | File)
+    check_kind("num_threads", num_threads, int | None)
+    check_kind("progress", progress, ProgressCallback | None)
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
-    channels = WITHOUT_COLORS if ignore_colors else IN_METRES.channels
-    cloud_settings = CloudSettings(METRES[units], up, channels, _make_labels(labels, ignore_labels), crs)
-    if isinstance(source, np.ndarray):
-        if units != "m":
-            raise InputError(f"`units`: found {units!r} for arrays, wanted points in metres")
-        cloud = stream_of_arrays(source, None if ignore_colors else colors)
-        return Scan(scan_of(cloud, str(ARRAYS), cloud_settings, settings, workers, Stopwatch()))
-    if colors is not None:
-        raise InputError("colors: found files, wanted an array of points")
-    paths = [Path(source)] if isinstance(source, str | PathLike) else [Path(path) for path in source]
-    if not paths:
-        raise InputError("open_scan: found no file, wanted a scan's path")
+    if isinstance(given.source, np.ndarray):
+        stream = stream_of_arrays(given.source, None if given.ignore_colors else given.colors)
+        return Scan(scan_of(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch()))
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
-    return Scan(open_files(paths, cloud_settings, settings, policy, workers))
-
-
-def _make_labels(labels: bool, ignore_labels: Sequence[int]) -> Labels | None:
-    if ignore_labels and not labels:
-        raise InputError("`ignore_labels`: only with `labels`")
-    return Labels(tuple(sorted({int(label) for label in ignore_labels}))) if labels else None
+    return Scan(open_files(given.paths, given.settings, settings, policy, workers))
 
 
 def open_files(

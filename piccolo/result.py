@@ -22,9 +22,8 @@ from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .scan_map.prior import GpsPrior
-from .walk.path import Gap
-from .walk.results import Alone, WalkFrame
+from .scan_map.gps import GpsPrior
+from .walk.results import WalkFrame
 
 FORMAT = "piccolo-pose/10"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
@@ -118,7 +117,7 @@ class Result:
     alternatives: tuple[Alternative, ...] = ()
     covariance: PoseCovariance | None = None
     seconds: dict[str, float] = field(default_factory=dict, hash=False)
-    settings: dict[str, object] = field(default_factory=dict, hash=False)
+    settings: dict[str, Any] = field(default_factory=dict, hash=False)
     warnings: tuple[str, ...] = ()
     source: Source = Source()
     error: str | None = None
@@ -134,10 +133,15 @@ class Result:
 
     def __post_init__(self) -> None:
         """Make the arrays read-only, on which the JSON and the hash rest."""
+        for part in (*self.poses, *filter(None, [self.covariance])):
+            part.freeze()
+
+    @property
+    def poses(self) -> list[Pose]:
+        """All poses: the best, the alternatives, and that of a walk's frame alone."""
         alone = self.walk.alone.pose if self.walk and self.walk.alone else None
-        for part in (self.best_pose, self.covariance, alone, *(a.pose for a in self.alternatives)):
-            if part is not None:
-                part.freeze()
+        found = [self.best_pose, *(a.pose for a in self.alternatives), alone]
+        return [pose for pose in found if pose is not None]
 
     @property
     def is_calibrated(self) -> bool:
@@ -228,32 +232,30 @@ class Result:
     @classmethod
     def from_json(cls, text: str) -> "Result":
         """Return the result that `to_json` wrote. Raises InputError for any other text."""
+        from msgspec import convert  # noqa: PLC0415  only who reads results waits for it
+
         with document_of(text, FORMAT, "result") as document:
-            cloud = document.pop("cloud")
-            beside = document["beside"]
-            best = document if document["status"] == LOCALIZED else document["best_guess"]
+            walk = document["walk"]
+            alone = walk and walk["alone"]
+            if alone:
+                walk = {**walk, "alone": {**alone, "pose": alone if alone["center_world"] else None}}
             matrix = document["covariance"]
             about = document["least_constrained_direction"]
-            gps = document["gps_prior"]
-            source = {f.name: document[f.name] for f in fields(Source)}
-            size = source.pop("image_size")
-            given: dict[str, Any] = {
-                "cloud": cloud if isinstance(cloud, str) else _names(cloud),
-                "best_pose": None if best is None else _pose_from_json(best),
-                "source": Source(image_size=size and tuple(size), **source),
-                "cameras": read_mounts(document["camera"]) if document.get("camera") else (),
-                "focal_length": document["focal_length"] and FocalLength(**document["focal_length"]),
-                "gps_prior": gps and GpsPrior(**gps | {"center_world": tuple(gps["center_world"])}),
-                "evidence": document["evidence"] and Evidence(**document["evidence"]),
-                "alternatives": tuple(map(_alternative_from_json, document["alternatives"])),
-                "covariance": None if matrix is None else PoseCovariance(np.array(matrix), about),
+            made = {
+                "best_pose": document if document["status"] == LOCALIZED else document["best_guess"],
+                "source": {f.name: document[f.name] for f in fields(Source)},
+                "cameras": (),
+                "alternatives": [{**one, "pose": one} for one in document["alternatives"]],
+                "covariance": matrix and {"matrix": matrix, "least_constrained_direction": about},
                 "height_above_floor": document["height_above_floor_m"],
-                "walk": document["walk"] and _walk_from_json(document["walk"]),
-                "beside": beside and Beside(_names(beside["photos"]), beside["asked_sha256"]),
-                "warnings": tuple(document["warnings"]),
+                "walk": walk,
             }
-            plain = {f.name: document[f.name] for f in fields(cls) if f.name not in given}
-            return cls(**given, **plain)
+            plain = {f.name: document[f.name] for f in fields(cls) if f.name not in made}
+            result = convert(plain | made, cls, dec_hook=lambda _, rows: np.array(rows, np.float64))
+            for pose in result.poses:
+                check_pose(pose, "result", MAX_ROTATION_ERROR)
+            camera = document["camera"]
+            return replace(result, cameras=read_mounts(camera) if camera else ())
 
 
 def with_localization(result: Result, found: Localization) -> Result:
@@ -287,11 +289,6 @@ def unreadable_result(
     return Result(status, 0.0, cloud, pano, error=error, **more)
 
 
-def _pose_from_json(document: dict[str, Any]) -> Pose:
-    pose = Pose(np.array(document["R_cam_from_world"]), np.array(document["center_world"]))
-    return check_pose(pose, "result", MAX_ROTATION_ERROR)
-
-
 def _pose_json(pose: Pose | None) -> dict[str, object] | None:
     """Return a pose in all its forms, POSE_FIELDS."""
     return None if pose is None else {name: getattr(pose, name).tolist() for name in POSE_FIELDS}
@@ -300,11 +297,6 @@ def _pose_json(pose: Pose | None) -> dict[str, object] | None:
 def _alternative_json(alternative: Alternative) -> dict[str, object]:
     pose = {name: getattr(alternative.pose, name).tolist() for name in POSE_FIELDS[:2]}
     return pose | {f.name: getattr(alternative, f.name) for f in fields(alternative) if f.name != "pose"}
-
-
-def _alternative_from_json(document: dict[str, Any]) -> Alternative:
-    numbers = {f.name: document[f.name] for f in fields(Alternative) if f.name != "pose"}
-    return Alternative(_pose_from_json(document), **numbers)
 
 
 def _walk_json(walk: WalkFrame) -> dict[str, object]:
@@ -316,15 +308,6 @@ def _walk_json(walk: WalkFrame) -> dict[str, object]:
     return {**plain, "alone": alone, "gap": walk.gap and asdict(walk.gap)}
 
 
-def _walk_from_json(value: dict[str, Any]) -> WalkFrame:
-    gap = value["gap"]
-    alone = value["alone"]
-    if alone is not None:
-        pose = None if alone["R_cam_from_world"] is None else _pose_from_json(alone)
-        alone = Alone(alone["status"], alone["confidence"], pose)
-    return WalkFrame(value["time"], value["frame"], value["how"], alone, gap and Gap(**gap))
-
-
 def _place(alternative: Alternative) -> str:
     x, y, z = alternative.pose.center_world
     p = alternative.probability
@@ -334,13 +317,6 @@ def _place(alternative: Alternative) -> str:
 
 def _in(scan: str | None) -> str:
     return f" ({scan})" if scan else ""
-
-
-def _names(value: object) -> tuple[str, ...]:
-    """Return a list of names; TypeError for anything else."""
-    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise TypeError("neither a name nor a list of names")
-    return tuple(value)
 
 
 def read_results(paths: Sequence[Path]) -> list[Result]:
@@ -377,11 +353,11 @@ def _parse_result(text: str) -> Result:
     result = Result.from_json(text)
     texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
     for label, value in texts.items():
-        if not isinstance(value, str) or UNPRINTABLE.search(value):
+        if UNPRINTABLE.search(value):
             raise InputError(f"result: found {label} {value!r}, wanted text on one line")
-    if not isinstance(result.pano, str) or NO_NAME.search(result.pano):
+    if NO_NAME.search(result.pano):
         raise InputError(f"result: found pano {result.pano!r}, wanted a file's name as os.fsdecode gives it")
     values = [result.confidence, *([result.evidence.score] if result.evidence else [])]
-    if not all(isinstance(value, int | float) and math.isfinite(value) for value in values):
+    if not all(map(math.isfinite, values)):
         raise InputError(f"result: found confidence and score {values}, wanted finite numbers")
     return result

@@ -2,15 +2,13 @@
 
 import json
 from dataclasses import dataclass, replace
-from os import PathLike
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import __version__
-from .arguments import check_arguments
+from .arguments import check_kind
+from .arrays import Bytes
 from .confidence.localization import Localization
 from .errors import InputError
 from .files.json_file import reading_once
@@ -19,9 +17,10 @@ from .jobs.stopwatch import Stopwatch
 from .jobs.threads import Progress, Workers, no_progress
 from .localization.query import Query
 from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
-from .panorama import Panorama, ReadOptions, read_photo
+from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
-from .result import FAILED, Result, with_localization
+from .photo import File, Photo, as_photo
+from .result import Result, with_localization
 from .scan_map.named_scans import add_places, check_within
 from .walk.beliefs import believe
 from .walk.frames import Frame
@@ -31,7 +30,6 @@ from .walk.second_look import finish
 from .walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
-Picture = str | PathLike[str] | NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class Kept:
 class Prepared(NamedTuple):
     """A frame that is ready to be tracked."""
 
-    picture: Picture
+    photo: Photo
     blank: Result  # without a pose
     panorama: Panorama | None  # None of one that can't be read
     query: Query | None
@@ -57,34 +55,32 @@ class Walk:
     Raises InputError for the preset paper, and for a focal length that is to be refined.
     """
 
-    def __init__(
-        self, scan: OpenedScan, read_options: ReadOptions, settings: Settings, motion: Motion
-    ) -> None:
+    def __init__(self, scan: OpenedScan, settings: Settings, motion: Motion) -> None:
         scan_map, settings = scan.require_default_method("walks", settings)
-        if read_options.refine_focal:
-            raise InputError(NO_REFINING)
         check_within(scan_map, settings.prior.within)
         quiet = Workers(scan.workers.num_threads, warn=scan.workers.warn)
         self.scan = scan
-        self.read_options = read_options
         self.tracker = Tracker(scan_map, settings, quiet, motion)
         self.tracker.read = self._read_again
-        about = settings_json(settings, scan.cloud_settings, read_options)
-        self.settings: dict[str, object] = {**about, "walk": motion.to_settings()}
-        self.pictures: list[Picture] = []
+        self.more_settings: dict[str, object] = {}  # that results repeat
+        self.photos: list[Photo] = []
         self.blanks: list[Result] = []  # of the frames so far, without poses
         self.has_times = True  # the frames are given with theirs
 
-    @property
-    def key(self) -> dict[str, object]:
-        """Settings, scan and version, which must be the same where a walk goes on."""
-        settings = json.loads(json.dumps(self.settings))
+    def settings_of(self, photo: Photo) -> dict[str, object]:
+        """Return the settings of a frame as its result repeats them."""
+        settings = settings_json(self.tracker.settings, self.scan.cloud_settings, photo)
+        return {**settings, "walk": self.tracker.motion.to_settings(), **self.more_settings}
+
+    def key_of(self, photo: Photo) -> dict[str, object]:
+        """Return settings, scan and version, which must be the same where a walk goes on."""
+        settings = json.loads(json.dumps(self.settings_of(photo)))
         digest = self.tracker.scan_map.scan_sha256 or None
         return {"settings": settings, "cloud_sha256": digest, "version": __version__}
 
     def add(
         self,
-        frame: Picture,
+        frame: File | Bytes | Photo,
         time: float | None = None,
         name: str | None = None,
         odometry: Pose | None = None,
@@ -93,39 +89,45 @@ class Walk:
 
         A frame that can't be read has a result that says so. `time` [s] counts from any beginning, and is
         given for all frames or for none; `name` replaces the path in the result. `odometry` is the camera's
-        pose in any frame that all poses of an odometry share [m].
+        pose in any frame that all poses of an odometry share [m]. Raises InputError for a focal length that
+        is to be refined.
         """
-        check_arguments(Walk.add, locals())
+        check_kind("time", time, float | None)
+        check_kind("name", name, str | None)
         return self.follow(self.prepare(frame, name), time, odometry)
 
-    def prepare(self, frame: Picture, name: str | None = None) -> Prepared:
+    def prepare(self, frame: File | Bytes | Photo, name: str | None = None) -> Prepared:
         """Read a frame and prepare what does not depend on other frames; another thread may do it.
 
         Of a live camera, one thread prepares frames and another follows them. Two cores do most with a scan
         that was opened with one thread.
         """
         watch = Stopwatch()
-        name = name or ("array" if isinstance(frame, np.ndarray) else str(frame))
+        photo = as_photo(frame)
+        name = name or photo.name
+        settings = self.tracker.settings
+        self.scan.check_options(photo, settings)
+        if photo.refine_focal:
+            raise InputError(NO_REFINING)
         with reading_once():
             try:
                 with watch.stage("read"):
-                    panorama = self._read(frame, name)
-                    photo = read_photo_facts(frame, self.read_options.rig)
+                    panorama = self._read(photo, name)
+                    facts = read_photo_facts(photo)
             except Exception as error:
-                if isinstance(frame, np.ndarray):
+                if isinstance(photo.picture, np.ndarray):
                     raise
-                settings = self.tracker.settings
-                failed = make_failed_result(self.scan, frame, error, self.read_options, settings, name)
-                return Prepared(frame, replace(failed, settings=self.settings), None, None)
+                failed = make_failed_result(self.scan, photo, error, settings, name)
+                return Prepared(photo, failed, None, None)
         with watch.stage("prepare"):
             query = self.tracker.prepare(panorama)
-        result = self.scan.make_result(frame, panorama, photo, Localization(), self.settings, watch.seconds)
-        return Prepared(frame, replace(result, pano=name), panorama, query)
+        blank = self.scan.make_blank(photo, panorama, facts, settings, watch.seconds)
+        return Prepared(photo, replace(blank, pano=name), panorama, query)
 
     def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
         """Localize a prepared frame, as `add` does."""
         number = len(self.blanks)
-        picture, blank, panorama, query = prepared
+        photo, blank, panorama, query = prepared
         odometry = None if odometry is None else check_pose(odometry, "`odometry`")
         if number and self.has_times != (time is not None):
             raise InputError(f"`time`: found {time} at frame {number}, wanted it of all frames or of none")
@@ -135,17 +137,16 @@ class Walk:
             check_times([self.tracker.frames[-1].time, when])
         elif time is None:
             self.tracker.forget_times()
-            self.settings["walk"] = self.tracker.motion.to_settings()
         if panorama is None or query is None:
             self.tracker.accept(Frame(when, odometry=odometry))
         else:
             with Stopwatch(blank.seconds).stage("track"):
                 self.tracker.add(panorama, query, when, odometry)
-        self.pictures.append(picture)
-        self.blanks.append(blank)
+        self.photos.append(photo)
+        self.blanks.append(replace(blank, settings=self.settings_of(photo)))
         belief = believe(self.tracker.frames, self.tracker.lattice.filter_path(), number)
         found = make_localization(self.tracker, self.tracker.frames[number], belief)
-        return self._result(blank, found, describe_frame(self.tracker.frames, number, None))
+        return self._result(self.blanks[-1], found, describe_frame(self.tracker.frames, number, None))
 
     def last_to_json(self) -> str:
         """Return what is known of the last frame on one line, for `restore`."""
@@ -154,22 +155,14 @@ class Walk:
         kept = Kept(self.blanks[-1].to_json(), self.tracker.frames[-1])
         return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
 
-    def restore(self, line: bytes, picture: Path, time: float, name: str) -> bool:
-        """Take the next frame from a line of `last_to_json`, if it is of this picture, unchanged.
-
-        Raises ValueError if it is no such line.
-        """
+    def restore(self, text: str, photo: Photo) -> None:
+        """Take the next frame, of a photo, from a text of `last_to_json`; ValueError if it is none."""
         from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = convert(json.loads(line), Kept, dec_hook=lambda _, rows: np.array(rows))
-        blank = replace(Result.from_json(kept.blank), settings=self.settings)
-        is_expected = (blank.pano, kept.frame.time) == (name, time)
-        if blank.status == FAILED or not is_expected or not self._is_of(picture, blank):
-            return False
-        self.pictures.append(picture)
-        self.blanks.append(blank)
+        kept = convert(json.loads(text), Kept, dec_hook=lambda _, rows: np.array(rows))
+        self.photos.append(photo)
+        self.blanks.append(replace(Result.from_json(kept.blank), settings=self.settings_of(photo)))
         self.tracker.accept(kept.frame)
-        return True
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""
@@ -183,23 +176,23 @@ class Walk:
             return result
         return with_localization(result, add_places(self.tracker.scan_map, found))
 
-    def _read(self, picture: Picture, name: str) -> Panorama:
-        """Read a picture, which warnings call by its name; its focal length counts as exact."""
-        panorama = read_photo(picture, self.read_options)
-        path = name if isinstance(picture, np.ndarray) else str(picture)
+    def _read(self, photo: Photo, name: str) -> Panorama:
+        """Read a photo, which warnings call by its name; its focal length counts as exact."""
+        panorama = self.scan.read(photo)
+        path = name if isinstance(photo.picture, np.ndarray) else photo.name
         warnings = tuple(warning.replace(path, name) for warning in panorama.warnings)
         return replace(panorama, focal_prior=None, warnings=warnings)
 
     def _read_again(self, k: int) -> Panorama | None:
-        """Read the picture of an earlier frame; None if it can't be read, or is another now."""
-        picture = self.pictures[k]
+        """Read the photo of an earlier frame; None if it can't be read, or is another now."""
+        photo = self.photos[k]
         blank = self.blanks[k]
         with reading_once():
-            is_readable = blank.error is None and self._is_of(picture, blank)
-            return self._read(picture, blank.pano) if is_readable else None
+            is_readable = blank.error is None and self._is_of(photo, blank)
+            return self._read(photo, blank.pano) if is_readable else None
 
-    def _is_of(self, picture: Picture, result: Result) -> bool:
-        """Return True if a result is of what a picture shows now."""
-        if isinstance(picture, np.ndarray):
+    def _is_of(self, photo: Photo, result: Result) -> bool:
+        """Return True if a result is of what a photo shows now."""
+        if isinstance(photo.picture, np.ndarray):
             return True
-        return sha256_of(Path(picture), self.read_options.rig) == result.source.pano_sha256
+        return sha256_of(photo.path, photo.instant) == result.source.pano_sha256

@@ -7,11 +7,11 @@ import numpy as np
 from piccolo.camera import Calibration, Mount
 from piccolo.camera.model import pinhole
 from piccolo.geometry.pose import exp_so3
-from piccolo.panorama import ReadOptions
+from piccolo.photo import Photo
 
 
-def calibrated(mounts):
-    return ReadOptions(calibration=Calibration("made", tuple(mounts)))
+def calibrated(picture, mounts):
+    return Photo(picture).with_calibration(Calibration("made", tuple(mounts)))
 
 
 @functools.lru_cache

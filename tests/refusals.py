@@ -3,16 +3,18 @@
 import pytest
 
 from piccolo.errors import InputError
+from piccolo.photo import Photo
 
 
 def assert_refused(message, read, path, *arguments, **options):
-    """`read` refuses a file in one line that begins with its name and holds `message`, an expression."""
+    """`read` refuses a file or photo in one line that begins with its name and holds an expression."""
     with pytest.raises(InputError, match=message) as error:
         read(path, *arguments, **options)
     text = str(error.value)
     del error  # its traceback would keep files open until the garbage collector comes
-    assert len(text) < 500 + len(str(path))
-    assert text.startswith(str(path))
+    name = path.name if isinstance(path, Photo) else str(path)
+    assert len(text) < 500 + len(name)
+    assert text.startswith(name)
     assert "\n" not in text
 
 

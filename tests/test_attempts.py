@@ -20,7 +20,8 @@ from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.localization.verification import Verified
-from piccolo.scan_map.prior import Prior
+from piccolo.panorama import GPano
+from piccolo.prior import Prior
 
 KNOWN = CoarseToFineSettings(gravity="known")
 
@@ -119,10 +120,10 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     )
 
 
-def test_gravity_alone_excludes_no_pose_that_is_searched_for(monkeypatch):
+def test_gravity_and_gps_alone_exclude_no_pose_that_is_searched_for(monkeypatch):
     monkeypatch.setattr(attempts, "search_poses", lambda *_: pytest.fail("a search beyond gravity"))
-    told = replace(KNOWN, prior=Prior(gravity_vector=(0.0, 0.0, -1.0)))
-    asked = _query(rooms.as_panorama(rooms.query(1).rgb), told)
+    told = replace(rooms.as_panorama(rooms.query(1).rgb), gpano=GPano(0.0, 0.0))
+    asked = _query(told, replace(KNOWN, prior=Prior(use_gps=False)))
     assert attempts.search_beyond_prior(asked, rooms.scan_map(1), Stopwatch()) == []
 
 
@@ -140,9 +141,9 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
     """With the gravity `auto`, where the upright search came first, by a brief search."""
     made = []
 
-    def searched(query, gravity):
-        made.append((gravity, query.settings, len(query.scan_map.sparse)))
-        return search_poses(query, gravity)
+    def searched(query, tilts):
+        made.append((tilts, query.settings, len(query.scan_map.sparse)))
+        return search_poses(query, tilts)
 
     monkeypatch.setattr(attempts, "search_poses", searched)
     monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
@@ -151,7 +152,7 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
     assert is_correct(found.pose, taken.pose)
     how, asked, num_searched = made[-1]
     num_candidates = len(rooms.scan_map(1).sparse)
-    assert (how, asked) == ("unknown", replace(settings, **changes))
+    assert (how, asked) == ("any", replace(settings, **changes))
     assert 0.3 < num_searched / num_candidates < 0.7 if changes else num_searched == num_candidates
 
 
@@ -159,17 +160,17 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     whole = rooms.scan_map(1)
     few = whole.narrow(np.arange(len(whole.sparse)) < 7)
     asked = _query(rooms.as_panorama(rooms.query(1).rgb))
-    assert attempts.tilt_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
-    assert 0.3 < len(attempts.tilt_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
+    assert attempts.thin_query(replace(asked, scan_map=few)).scan_map.sparse.tolist() == few.sparse.tolist()
+    assert 0.3 < len(attempts.thin_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
 
 
 LOOK = (0, "look_first")
 HALF = (1, "search_part")
 ALL = (2, "search_matches")
-UPRIGHT = (2, {"gravity": "known"})
-ABOUT_LEVEL = (2, {"gravity": "level"})
-TILTED = (2, {"gravity": "unknown", "is_brief": False})
-BRIEFLY = (2, {"gravity": "unknown", "is_brief": True})
+UPRIGHT = (2, {"tilts": "known"})
+ABOUT_LEVEL = (2, {"tilts": "level"})
+TILTED = (2, {"tilts": "any", "is_brief": False})
+BRIEFLY = (2, {"tilts": "any", "is_brief": True})
 
 
 @pytest.mark.parametrize(

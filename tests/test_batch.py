@@ -41,7 +41,7 @@ def counted(monkeypatch):
     names, answer = [], module.Localizer.answer
 
     def counting(self, scan, task):
-        names.append(task.pano.name)
+        names.append(task.photo.path.name)
         return answer(self, scan, task)
 
     monkeypatch.setattr(module.Localizer, "answer", counting)
@@ -223,14 +223,14 @@ class Short(module.Localizer):
 
     def open_scan(self, workers):
         scan = super().open_scan(workers)
-        ask = type(scan).localize_query
+        ask = type(scan).localize
 
-        def localize_query(self, path, *more, **options):
-            if error := Short.errors.pop(path.name, None):
+        def localize(self, photo, *more):
+            if error := Short.errors.pop(photo.path.name, None):
                 raise error
-            return ask(self, path, *more, **options)
+            return ask(self, photo, *more)
 
-        return type("Scan", (type(scan),), {"localize_query": localize_query})(**vars(scan))
+        return type("Scan", (type(scan),), {"localize": localize})(**vars(scan))
 
 
 def test_what_the_system_did_to_a_photo_is_tried_again(scene, out, counted, monkeypatch, capsys):
@@ -389,7 +389,7 @@ def test_priors_of_a_table_go_before_the_general_one(scene, tmp_path, out, capsy
     assert "1 names without a photo, such as clean_9.jpg" in err.splitlines()[0]  # before the work
     assert "%|" not in err  # a bar is for a terminal
     priors = [line["settings"]["prior"] for line in _lines(out)]
-    assert priors[0]["near_world"] == [x, y, None]
+    assert priors[0]["near"] == [x, y, None]
     assert (priors[0]["radius"], priors[0]["height"]) == (0.5, [1.2, 1.8])
-    assert [prior["near_world"] for prior in priors[1:]] == [None, None]
+    assert [prior["near"] for prior in priors[1:]] == [None, None]
     assert priors[1]["height"] == priors[2]["height"] == [0.2, 2.2]

@@ -21,7 +21,7 @@ from piccolo.confidence.covariance import describe_errors
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.opened_scan import OpenedScan
-from piccolo.panorama import ReadOptions
+from piccolo.photo import Photo
 from piccolo.result import Result
 
 CAMERA = {"model": "PINHOLE"}
@@ -99,25 +99,25 @@ class Looked(NamedTuple):
 @pytest.fixture
 def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
-    ask, known, looked = OpenedScan.localize_query, {}, Looked([], {})
+    ask, known, looked = OpenedScan.localize, {}, Looked([], {})
 
-    def localize_query(self, panorama, *more):
-        content = panorama.read_bytes()
+    def localize(self, photo, *more):
+        content = photo.path.read_bytes()
         if content not in known:
-            known[content] = ask(self, panorama, *more)
-        found = replace(known[content], pano=str(panorama))
-        is_sure = panorama.name not in ("b.jpg", "d.jpg")
+            known[content] = ask(self, photo, *more)
+        found = replace(known[content], pano=photo.name)
+        is_sure = photo.path.name not in ("b.jpg", "d.jpg")
         status = found.status if is_sure else "ambiguous"
         found = replace(found, cameras=PHONE, confidence=0.95, status=status)
-        looked.firsts[panorama.name] = found.to_json()
+        looked.firsts[photo.path.name] = found.to_json()
         return found
 
-    def localize_again(_self, panorama, first, list_pictures, *_):
+    def localize_again(_self, photo, first, list_pictures, *_):
         names = tuple(list_pictures())
-        looked.asked.append((panorama.name, [Path(name).name for name in names]))
-        return (first, ()) if panorama.name == "d.jpg" else (replace(first, status="localized"), names[:1])
+        looked.asked.append((photo.path.name, [Path(name).name for name in names]))
+        return (first, ()) if photo.path.name == "d.jpg" else (replace(first, status="localized"), names[:1])
 
-    monkeypatch.setattr(OpenedScan, "localize_query", localize_query)
+    monkeypatch.setattr(OpenedScan, "localize", localize)
     monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
     monkeypatch.setattr(Localizer, "locate", lambda self, scan, line: line)
     return looked
@@ -266,7 +266,7 @@ def test_what_is_looked_at(scene, monkeypatch):
     monkeypatch.setattr(opened_scan, "localize_beside", localize_beside)
 
     def look(before, pictures):
-        return opened.localize_again(photo, before, lambda: pictures, ReadOptions(), opened.settings)
+        return opened.localize_again(Photo(photo), before, lambda: pictures, opened.settings)
 
     found, names = look(first, {"x": None})
     assert (found.status, found.confidence, names) == ("localized", 0.7, ("x",))
@@ -289,7 +289,7 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     text = scan.localize(str(photo)).to_json()
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
-    localizer = Localizer((scene / "cloud.ply",), *settings, ReadOptions(), None)
+    localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
     located, confidence, gaussian = localizer.locate(opened, text)
     assert confidence == json.loads(text)["confidence"]
     in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix

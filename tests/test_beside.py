@@ -16,11 +16,11 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.beside import Beside, Picture, fuse, localize_beside, match_covariance
+from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside, match_covariance
 from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
 from piccolo.localization.selection import NOTHING
-from piccolo.scan_map.prior import Prior
+from piccolo.prior import Prior
 
 
 def test_a_photo_is_localized_beside_one_that_shows_the_same():
@@ -29,7 +29,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     nothing = replace_keypoints(_beside(), np.arange(3))
     ask = functools.partial(localize_beside, rooms.scan_map(1, NUM_POINTS), panorama, [])
     found, names = ask(
-        {"bare": Picture(nothing, 0.99, None), "beside": Picture(_beside(), 0.97, None)},
+        {"bare": SurePhoto(nothing, 0.99, None), "beside": SurePhoto(_beside(), 0.97, None)},
         SETTINGS,
         Workers(2),
         Stopwatch(),
@@ -40,7 +40,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     assert found.probability_none == pytest.approx(1.0 - found.confidence, abs=0.01)
     assert found.evidence.num_matches >= 20
     assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
-    assert ask({"bare": Picture(nothing, 0.99, None)}, SETTINGS, Workers(2), Stopwatch()) == (
+    assert ask({"bare": SurePhoto(nothing, 0.99, None)}, SETTINGS, Workers(2), Stopwatch()) == (
         Localization(),
         (),
     )
@@ -89,7 +89,7 @@ def _fused(judged, of_photo, settings=SETTINGS, fit=None):
     """The mean of a result's pose and that by a photo beside, at the true pose."""
     matches = _matches_of(_true_pose(), 1e-3, np.random.default_rng(1))
     located = verification.Located(_beside().keypoints, _beside().ranges, of_photo.pose)
-    other = Beside("b", Picture(located, 0.99, of_photo), matches, _true_pose())
+    other = Neighbor("b", SurePhoto(located, 0.99, of_photo), matches, _true_pose())
     return fuse(judged, other, Found(replace(_query(), settings=settings), NOTHING, fit))
 
 
@@ -109,7 +109,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert _fused(replace(judged, is_ruled_out=True), _at(true, 0.01)) is None
     assert _fused(replace(judged, gaussian=None), _at(true, 0.01)) is None
     here = rooms.scan_map(1, NUM_POINTS).to_world(true).center_world
-    away = replace(SETTINGS, prior=Prior(near_world=(*(here[:2] + 5.0), None), radius=0.5))
+    away = replace(SETTINGS, prior=Prior(near=(*(here[:2] + 5.0), None), radius=0.5))
     assert _fused(judged, _at(true, 0.01), away) is None
     motion = np.zeros((6, 1))
     motion[3] = 1.0

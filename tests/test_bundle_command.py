@@ -1,4 +1,4 @@
-"""localize.py --relative and Scan.localize_many(relative_poses=...): results in order, and refusals."""
+"""localize.py --relative and Scan.localize_bundle: results in order, and refusals."""
 
 import json
 
@@ -16,6 +16,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opened_scan import OpenedScan
 from piccolo.paper.settings import PaperSettings
+from piccolo.photo import Photo
 from piccolo.result import read_results
 from piccolo.scan import Scan
 from piccolo.scene import read_scene
@@ -62,8 +63,8 @@ def test_results_are_written_in_order(scene, relative, tmp_path, capsys):
     assert "3 photos together in" in err
     assert err.splitlines()[-1].endswith("s: 3 localized")
     before = out.read_bytes()
-    assert main(_command(scene, relative, "--out", out)) == 2
-    assert f"--out: {out} has results already" in capsys.readouterr().err
+    assert main(_command(scene, relative, "--out", out)) == 0
+    assert f"{out}: nothing is left to do" in capsys.readouterr().err
     assert out.read_bytes() == before
     assert main(_command(scene, relative, "--out", out, "--overwrite", "--quiet")) == 0
     assert capsys.readouterr() == ("", "")
@@ -129,11 +130,11 @@ def _photos_and_poses(scene):
 
 def test_scan_localizes_many_together(scene, opened):
     photos, poses = _photos_and_poses(scene)
-    results = list(Scan(opened).localize_many(iter(photos), relative_poses=poses, gravity="known"))
+    results = Scan(opened).localize_bundle(iter(photos), poses, gravity="known")
     _assert_right(scene, results)
     assert all(piccolo.Result.from_json(r.to_json()).to_json() == r.to_json() for r in results)
     assert results[0].settings["gravity"] == "known"
-    assert list(Scan(opened).localize_many([], relative_poses=[])) == []
+    assert Scan(opened).localize_bundle([], []) == []
 
 
 def test_relative_poses_that_are_none_are_refused(scene, opened, tmp_path):
@@ -152,17 +153,18 @@ def test_relative_poses_that_are_none_are_refused(scene, opened, tmp_path):
         ),
     ):
         with pytest.raises(piccolo.InputError, match=text):
-            scan.localize_many(photos, relative_poses=given)
+            scan.localize_bundle(photos, given)
     (tmp_path / "bad.jpg").write_bytes(b"no picture")
     with pytest.raises(piccolo.InputError, match=r"bad\.jpg"):
-        scan.localize_many([tmp_path / "bad.jpg"], relative_poses=poses[:1])
+        scan.localize_bundle([tmp_path / "bad.jpg"], poses[:1])
+    guesses = [Photo(p, fov_deg=60.0, projection="pinhole", refine_focal=True) for p in photos]
     with pytest.raises(piccolo.InputError, match="found a focal length that is a guess, wanted a known one"):
-        scan.localize_many(photos, poses, fov_deg=60.0, projection="pinhole", refine_focal=True)
+        scan.localize_bundle(guesses, poses)
 
 
 def test_the_preset_paper_has_no_relative_poses(scene):
     photos, poses = _photos_and_poses(scene)
     points = np.random.default_rng(0).uniform(0.0, 3.0, (2000, 3))
-    scan = piccolo.open_scan(points, np.full((2000, 3), 0.5), settings=PaperSettings())
+    scan = piccolo.open_scan(piccolo.Cloud(points, colors=np.full((2000, 3), 0.5)), settings=PaperSettings())
     with pytest.raises(piccolo.InputError, match="`relative_poses`: not available with the preset paper"):
-        scan.localize_many(photos, relative_poses=poses)
+        scan.localize_bundle(photos, poses)

@@ -211,7 +211,7 @@ def test_a_photo_becomes_the_part_of_the_sphere_that_it_shows(tmp_path, lens):
     this, pose, full = place()
     mounts = LENSES[lens]
     rgb = picture_of_all(mounts, this, pose, Workers(2))
-    panorama = read_panorama(write(tmp_path / "a.png", encoded(rgb, ".png")), calibrated(mounts))
+    panorama = read_panorama(calibrated(write(tmp_path / "a.png", encoded(rgb, ".png")), mounts))
     width = panorama.rgb.shape[1]
     assert panorama.cameras == mounts
     assert width == sphere_width(mounts)
@@ -265,7 +265,7 @@ def write_instant(folder, mounts, this, pose):
 def test_a_rig_is_one_sphere(tmp_path):
     this, pose, full = place()
     folder = write_instant(tmp_path / "1", four_sides(), this, pose)
-    panorama = read_panorama(folder, calibrated(four_sides()))
+    panorama = read_panorama(calibrated(folder, four_sides()))
     assert panorama.cameras == four_sides()
     assert panorama.warnings == ()
     width = panorama.rgb.shape[1]
@@ -279,7 +279,7 @@ def test_a_rig_says_how_far_apart_its_cameras_are(tmp_path):
     this, pose, _ = place()
     far = [Mount(m.camera, m.R_lens_from_cam, (0.0, 0.2, 0.0), image=m.image) for m in four_sides()[:2]]
     folder = write_instant(tmp_path / "1", far, this, pose)
-    (note,) = read_panorama(folder, calibrated(far)).warnings
+    (note,) = read_panorama(calibrated(folder, far)).warnings
     assert note == "the rig's cameras are up to 0.20 m from its origin: near objects appear displaced"
     (folder / "1.png").unlink()
-    assert_refused("found 0 pictures for the camera '1.png' of made", read_panorama, folder, calibrated(far))
+    assert_refused("found 0 pictures for the camera '1.png' of made", read_panorama, calibrated(folder, far))

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from piccolo.cli import color_scan as tool
 from piccolo.cli import localize as command_line
+from piccolo.cli.together import steps_file
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.colored_writer import write_colored, writing_e57
 from piccolo.cloud.octree import build_octree, recolor
@@ -25,6 +26,7 @@ from piccolo.coloring.painting import find_medians, make_brushes, paint_points
 from piccolo.coloring.sight import look, weigh_points
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
+from piccolo.files.journal import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
@@ -179,7 +181,7 @@ def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch, num_folds
         shown.append((k, {c for c in range(3) if leaves[:, 3 + c].max() > 0.5}))
         return replace(by_shape[k], status="not_localized" if k == 2 else "localized", confidence=0.5)
 
-    results = localize_by_colors(scan_map, by_shape, localize, Workers(2))
+    results = localize_by_colors(scan_map, by_shape, localize, Workers(2), Journal())
     first, second = dict(shown[:3]), dict(shown[3:])
     if num_folds == 8:
         assert first == {0: {1, 2}, 1: {0, 2}, 2: {0, 1}}
@@ -204,7 +206,7 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
         about = {name: getattr(found, name) for name in ("status", "confidence", "covariance")}
         return replace(by_shape[k], best_pose=found.pose, **about)
 
-    results = localize_by_colors(scan_map, by_shape, localize_one, Workers(2))
+    results = localize_by_colors(scan_map, by_shape, localize_one, Workers(2), Journal())
     assert [result.status for result in results] == ["localized"] * 3 + ["not_localized"]
     errors = [pose_errors(r.pose, one.pose)[0] for r, one in zip(results, right, strict=False)]
     assert max(errors) < 0.02
@@ -305,11 +307,46 @@ def test_the_commands_colour_a_scan(files, tmp_path, capsys):
     assert tool.main([*cloud, "--results", str(lines), "--out", str(again)]) == 0
     assert json.loads(capsys.readouterr().out)["photos"] == 2
     assert len(read_cloud(again).points) == NUM_POINTS
-    assert command_line.main(given) == 2
-    assert "has results already" in capsys.readouterr().err
+    assert command_line.main(given) == 0
+    assert "nothing is left to do" in capsys.readouterr().err
     lines.write_text(lines.read_text().splitlines()[0] + "\n")
     assert tool.main([*cloud, "--results", str(lines), "--out", str(again)]) == 3
     assert "found 1 localized photos, wanted 2" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("num_kept", [0, 1, 3, 5])
+def test_a_colouring_that_was_stopped_goes_on_with_the_same_bits(files, tmp_path, monkeypatch, num_kept):
+    """Two photos are localized by shape, then twice by colours; it is killed after some of these steps."""
+    cloud, photos = files
+    given = [*cloud, "--pano", *photos, "--gravity", "known", "--quiet"]
+    ends = []
+    for name, limit in (("whole", 99), ("stopped", num_kept)):
+        steps = []
+        append = Journal.append
+
+        def count(self, step, text, steps=steps, limit=limit, append=append):
+            if len(steps) == limit:
+                raise MemoryError
+            steps.append(step)
+            append(self, step, text)
+
+        words = [
+            *given,
+            "--color-scan",
+            str(tmp_path / f"{name}.ply"),
+            "--out",
+            str(tmp_path / f"{name}.jsonl"),
+        ]
+        with monkeypatch.context() as patched:
+            patched.setattr(Journal, "append", count)
+            assert command_line.main(words) == (0 if limit == 99 else 3)
+        assert len(steps) == min(limit, 6)
+        assert command_line.main(words) == 0
+        lines = (tmp_path / f"{name}.jsonl").read_text().splitlines()
+        ends.append([{**json.loads(line), "seconds": None} for line in lines])
+        ends[-1].append((tmp_path / f"{name}.ply").read_bytes())
+        assert not steps_file(tmp_path / f"{name}.jsonl").exists()
+    assert ends[0] == ends[1]
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
 from piccolo.result import read_results
-from piccolo.scan_map.prior import GpsPrior
+from piccolo.scan_map.gps import GpsPrior
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 from piccolo.walk.path import Gap
 from piccolo.walk.results import Alone, WalkFrame
@@ -51,7 +51,9 @@ BAD = {
 @pytest.fixture(scope="module")
 def scan():
     cloud = rooms.room(1)[1]
-    return piccolo.open_scan(cloud.points + cloud.origin_world, cloud.colors, num_threads=2)
+    return piccolo.open_scan(
+        piccolo.Cloud(cloud.points + cloud.origin_world, colors=cloud.colors), num_threads=2
+    )
 
 
 def _assert_refused(message, function, *arguments, **options):
@@ -67,7 +69,7 @@ def test_what_is_no_pose_is_refused_at_every_door(scan, name):
     good = Pose(I, HERE)
     _assert_refused("^`pose`: ", scan.occlusion_mask, "none.jpg", pose)
     _assert_refused("^`pose`: ", scan.from_world, pose)
-    _assert_refused("^`relative_poses`: ", scan.localize_many, ["a.jpg", "b.jpg"], [good, pose])
+    _assert_refused("^`relative_poses`: ", scan.localize_bundle, ["a.jpg", "b.jpg"], [good, pose])
     _assert_refused(f"^it: {message}", check_pose, pose, "it")
     if pose is None:  # a frame may be without one
         return
@@ -141,15 +143,15 @@ def test_the_whole_part_of_a_pixel_is_as_before(u):
         (lambda s: piccolo.open_scan(None), "^`source`: found None, wanted a path or"),
         (lambda s: piccolo.open_scan("a.ply", cache=None), "^`cache`: found None, wanted True or False or"),
         (lambda s: piccolo.open_scan("a.ply", settings=None), "^`settings`: found None, wanted"),
-        (lambda s: piccolo.open_scan(np.zeros((2000, 3)), units="mm"), "^`units`: found 'mm' for arrays"),
+        (lambda s: piccolo.Cloud(np.zeros((2000, 3)), units="mm"), "^`units`: found 'mm' for arrays"),
         (lambda s: piccolo.open_scan(np.full((2000, 3), "x")), "^points: found <U1, wanted numbers"),
         (lambda s: piccolo.open_scan(np.full((2000, 3), None)), "^points: found object, wanted numbers"),
-        (lambda s: s.localize(None), "^`panorama`: found None, wanted a path or an array"),
-        (lambda s: s.localize_many(None), "^`panoramas`: found None, wanted a list"),
-        (lambda s: s.localize_walk(["a"], max_acceleration=None), "^`max_acceleration`: found None"),
-        (lambda s: s.track().add(None), "^`frame`: found None, wanted a path or an array"),
+        (lambda s: s.localize(None), "^`picture`: found None, wanted a path or an array"),
+        (lambda s: s.localize_many(None), "^`photos`: found None, wanted a list"),
+        (lambda s: piccolo.Motion(max_acceleration=None), "^`max_acceleration`: found None"),
+        (lambda s: s.track().add(None), "^`picture`: found None, wanted a path or an array"),
         (lambda s: s.track().add("a.jpg", "soon"), "^`time`: found 'soon', wanted a number"),
-        (lambda s: s.localize("a.jpg", heading_tolerance_deg=5.0), "^`heading_tolerance_deg`: only with"),
+        (lambda s: piccolo.Prior(heading_tolerance_deg=5.0), "^`heading_tolerance_deg`: only with"),
         (lambda s: s.save("no folder/a.piccolo-map"), "^no folder/a.piccolo-map: found no folder"),
         (lambda s: Result.from_json("{}"), "^result: found no format, wanted 'piccolo-pose/"),
         (lambda s: Result.from_json("[]"), "^result: found no format, wanted 'piccolo-pose/"),
@@ -160,9 +162,9 @@ def test_other_input_is_refused_in_one_line(scan, call, message):
     _assert_refused(message, call, scan)
 
 
-def test_a_heading_has_a_tolerance(scan):
-    parsed = scan._parse({"heading_deg": 10.0, "heading_tolerance_deg": 5.0})[1]
-    assert (parsed.prior.heading_deg, parsed.prior.heading_tolerance_deg) == (10.0, 5.0)
+def test_a_heading_has_a_tolerance():
+    assert piccolo.Prior(heading_deg=10.0).tolerance_deg == 20.0
+    assert piccolo.Prior(heading_deg=10.0, heading_tolerance_deg=5.0).tolerance_deg == 5.0
 
 
 @pytest.mark.parametrize("times", [(0.0, None), (None, 1.0)])

@@ -2,10 +2,10 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from pictures import encoded, write
 from rooms import scan_map
 from test_localize_cameras import place, scan
 
@@ -25,7 +25,8 @@ from piccolo.localization.localize import localize, select_likeliest
 from piccolo.localization.query import prepare_query
 from piccolo.localization.selection import Selection
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import ReadOptions, panorama_of_array
+from piccolo.panorama import read_panorama
+from piccolo.photo import Photo
 from research.synthetic.world import render_picture
 
 TRUE = 320.0  # [px] of the photos here, 640 x 480
@@ -37,7 +38,7 @@ def _photo(camera):
 
 
 def _panorama(rgb, **options):
-    return panorama_of_array(rgb, np.ones(rgb.shape[:2], np.bool_), ReadOptions(**options))
+    return read_panorama(Photo(rgb, **options))
 
 
 def _fit(rgb, pose, **options):
@@ -101,7 +102,7 @@ def test_matches_with_photos_beside_follow_the_focal_length():
 def test_k1_is_fitted_with_the_focal_length_of_a_guess():
     rgb, pose = _photo(Camera("SIMPLE_RADIAL", 640, 480, (TRUE, 320.0, 240.0, -0.04)))
     mount = Mount(Camera("SIMPLE_RADIAL", 640, 480, (1.03 * TRUE, 320.0, 240.0, 0.0)))
-    _, fit = _fit(rgb, pose, calibration=Calibration("guess", (mount,)), refine_focal=True)
+    _, fit = _fit(rgb, pose, camera=Calibration("guess", (mount,)), refine_focal=True)
     f, k1 = mount.camera.change(*fit.change).params[::3]
     assert f == pytest.approx(TRUE, rel=0.02)
     assert k1 == pytest.approx(-0.04, abs=0.015)
@@ -119,7 +120,7 @@ def test_the_focal_length_of_a_bare_part_of_a_wall_stays_open():
 
 def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found():
     rgb, pose = _photo(pinhole(640, 480, TRUE))
-    result = scan().localize(rgb, focal_px=290.0, gravity="known", refine_focal=True)
+    result = scan().localize(Photo(rgb, focal_px=290.0, refine_focal=True), gravity="known")
     assert result.status == "localized"
     found = result.focal_length
     assert abs(found.px - TRUE) < 3.0 * found.std_px
@@ -132,12 +133,12 @@ def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found
 
 def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
     rgb, _ = _photo(pinhole(640, 480, TRUE))
-    result = scan().localize(rgb, focal_px=290.0, gravity="known")
+    result = scan().localize(Photo(rgb, focal_px=290.0), gravity="known")
     assert result.status == "not_localized"
     assert result.warnings[-1].endswith(" px, not 290: check `focal_px`")
     assert result.focal_length.px == pytest.approx(TRUE, rel=0.03)
     wrong = Calibration("of another zoom", (Mount(pinhole(640, 480, 1.15 * TRUE)),))
-    panorama = _panorama(rgb, calibration=wrong)
+    panorama = _panorama(rgb, camera=wrong)
     far = localize(scan_map(5), panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
     assert far.status == "not_localized"
     assert far.warnings[-1].endswith(" px, not 368: check `camera`")
@@ -146,7 +147,7 @@ def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
 
 def test_each_source_of_a_focal_length_has_its_deviation():
     rgb, _ = _photo(pinhole(640, 480, TRUE))
-    of_file = _panorama(rgb, calibration=Calibration("a", (Mount(pinhole(640, 480, TRUE)),))).focal_prior
+    of_file = _panorama(rgb, camera=Calibration("a", (Mount(pinhole(640, 480, TRUE)),))).focal_prior
     assert (of_file.deviation, of_file.source) == (0.003, "`camera`")
     of_field = _panorama(rgb, projection="fisheye", fov_deg=90.0).focal_prior
     assert (of_field.deviation, of_field.source) == (0.03, "`fov_deg`")
@@ -269,9 +270,10 @@ def test_the_first_sure_guess_ends_the_search(monkeypatch):
     assert not list(statuses)
 
 
-def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask():
+def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask(tmp_path):
     rgb, _ = _photo(pinhole(640, 480, TRUE))
-    panorama = _panorama(rgb, focal_px=TRUE, mask_nadir_deg=80.0)
+    path = write(tmp_path / "a.png", encoded(rgb, ".png"))
+    panorama = read_panorama(Photo(path, focal_px=TRUE, mask_nadir_deg=80.0))
     found = panorama.resample(pinhole(640, 480, 1.1 * TRUE), 1024)
     pixels = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
     wanted, is_wanted = make_sphere([View(Mount(pinhole(640, 480, 1.1 * TRUE)), pixels)], 1024)
@@ -283,17 +285,15 @@ def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask():
 
 def test_only_the_photo_of_one_camera_has_a_focal_length_to_refine():
     with pytest.raises(piccolo.InputError, match="found a sphere or a part of one, wanted the photo of one"):
-        scan().localize(np.zeros((64, 128, 3), np.uint8), refine_focal=True)
+        scan().localize(Photo(np.zeros((64, 128, 3), np.uint8), refine_focal=True))
 
 
 def test_pictures_of_a_result_are_made_with_the_camera_found():
     found = (Mount(pinhole(640, 480, 321.5)),)
-    options = ReadOptions(focal_px=300.0, refine_focal=True).with_refined_camera(found, Path("a.jpg"))
+    options = Photo("a.jpg", focal_px=300.0, refine_focal=True).with_refined_camera(found)
     assert (options.focal_px, options.calibration.mounts) == (None, found)
     turned = Mount(pinhole(640, 480, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
-    given = ReadOptions(calibration=Calibration("a.json", (turned,)), refine_focal=True)
-    assert given.with_refined_camera(found, Path("a.jpg")).calibration.mounts == (
-        turned.with_camera(found[0].camera),
-    )
-    plain = ReadOptions()
-    assert plain.with_refined_camera((), Path("a.jpg")) is plain
+    given = Photo("a.jpg", camera=Calibration("a.json", (turned,)), refine_focal=True)
+    assert given.with_refined_camera(found).calibration.mounts == (turned.with_camera(found[0].camera),)
+    plain = Photo("a.jpg")
+    assert plain.with_refined_camera(()) is plain

@@ -15,7 +15,8 @@ from test_cloud_las import RAW
 import piccolo
 from piccolo.cloud.crs import from_wgs84, read_crs
 from piccolo.panorama.photo import GpsPosition, read_photo_facts
-from piccolo.scan_map.prior import Prior, gps_prior
+from piccolo.prior import Prior
+from piccolo.scan_map.gps import gps_prior
 
 UTM = "EPSG:25832"
 OFFSET = np.array([500_000.0, 5_400_000.0, 300.0])  # of a room in UTM
@@ -89,19 +90,19 @@ def test_a_position_becomes_a_prior_of_any_height():
     assert (prior.radius, prior.is_used) == (15.0, True)
     assert gps_prior(GpsPosition(latitude, longitude, None), UTM, 1.0).radius == 30.0
     near = prior.apply_to(Prior(height=(1.0, 2.0)))
-    assert near.near_world == (*prior.center_world, None)
+    assert near.near == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)
     assert from_wgs84("EPSG:4326", latitude, longitude) is None
     with pytest.raises(piccolo.InputError, match="`crs`: found 'EPSG:0'"):
         from_wgs84("EPSG:0", latitude, longitude)
     with pytest.raises(piccolo.InputError, match="`crs`: found 'EPSG:0'"):
-        piccolo.open_scan("no_such_scan.ply", crs="EPSG:0")
+        piccolo.Cloud("no_such_scan.ply", crs="EPSG:0")
 
 
 def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):
     cloud, taken = rooms.room(1)[1], rooms.query(1)
     points = cloud.points + cloud.origin_world + OFFSET
-    scan = piccolo.open_scan(points, cloud.colors, crs=UTM)
+    scan = piccolo.open_scan(piccolo.Cloud(points, colors=cloud.colors, crs=UTM))
     here = taken.pose.center_world + OFFSET
     to_degrees = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True)
     for shift, is_used in ((3.0, True), (2000.0, False)):
@@ -113,8 +114,8 @@ def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):
         assert result.gps_prior.is_used == is_used
         assert result.gps_prior.center_world == pytest.approx((here[0] + shift, here[1]), abs=0.01)
         assert piccolo.Result.from_json(result.to_json()).gps_prior == result.gps_prior
-    assert scan.localize(path, use_gps=False).gps_prior is None
+    assert scan.localize(path, prior=Prior(use_gps=False)).gps_prior is None
     near = tuple(here.tolist())
-    assert scan.localize(path, near_world=near, radius=2.0).gps_prior is None
-    unknown = piccolo.open_scan(points, cloud.colors)
+    assert scan.localize(path, prior=Prior(near=near, radius=2.0)).gps_prior is None
+    unknown = piccolo.open_scan(piccolo.Cloud(points, colors=cloud.colors))
     assert unknown.localize(path).gps_prior is None

@@ -57,7 +57,7 @@ class Deadly(Localizer):
     """Localizes; one photo kills the process at work on it."""
 
     def answer(self, scan, task):
-        if task.pano.name == "deadly.jpg":
+        if task.photo.path.name == "deadly.jpg":
             os.kill(os.getpid(), signal.SIGKILL)
         return super().answer(scan, task)
 

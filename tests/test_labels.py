@@ -19,14 +19,14 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
-from piccolo.panorama import ReadOptions as PanoramaOptions
 from piccolo.panorama import read_panorama
+from piccolo.photo import Photo
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
 LABELS = np.random.default_rng(2).integers(0, 21, 3000)
 READ = CloudSettings(labels=Labels())
 IMAGE = np.random.default_rng(3).integers(0, 200, (64, 128))
-READ_IMAGE = PanoramaOptions(labels=Labels())
+READ_IMAGE = Labels()
 
 
 @pytest.mark.parametrize(("count", "least"), [(16, 123.0), (64, 68.0), (256, 38.0), (NUM_COLORS, 16.0)])
@@ -140,12 +140,12 @@ def test_ignored_labels_and_masks_do_not_count_and_nothing_else_is_masked(tmp_pa
     assert read_panorama(path, READ_IMAGE).is_valid.all()
     is_left = np.broadcast_to(np.arange(128) < 20, (64, 128))
     mask = _png(tmp_path / "mask.png", np.uint8(255 * is_left))
-    panorama = read_panorama(path, PanoramaOptions(mask=mask, mask_nadir_deg=20.0, labels=Labels((0, 5))))
+    panorama = read_panorama(Photo(path, mask=mask, mask_nadir_deg=20.0), Labels((0, 5)))
     expected = (labels != 0) & (labels != 5) & (np.arange(128) >= 20)
     expected[-7:] = False
     np.testing.assert_array_equal(panorama.is_valid, expected)
     with pytest.raises(InputError, match="no pixel is left: all are masked, black, or of ignored"):
-        read_panorama(path, PanoramaOptions(labels=Labels(tuple(range(256)))))
+        read_panorama(path, Labels(tuple(range(256))))
 
 
 def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
@@ -164,4 +164,4 @@ def test_pictures_that_do_not_keep_labels_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"found labels of 128 x 65, wanted the full sphere, W = 2 H"):
         read_panorama(_png(tmp_path / "c.png", np.zeros((65, 128), np.uint8)), READ_IMAGE)
     with pytest.raises(InputError, match="`labels`: found `fov_deg` or `projection` too"):
-        PanoramaOptions(fov_deg=90.0, labels=Labels())
+        read_panorama(Photo(path, fov_deg=90.0), Labels())

@@ -11,7 +11,7 @@ import rooms
 from piccolo.cloud.settings import IN_METRES
 from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Once, Workers
-from piccolo.opening import open_scan
+from piccolo.opening import Cloud, open_scan
 from piccolo.scan_map import open_map, scan_map
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.open_map import CachePolicy
@@ -96,7 +96,7 @@ def test_a_map_file_without_them_makes_them_too(tmp_path, finding):
 
 def test_a_scan_of_arrays_is_opened_without_them(finding):
     cloud = rooms.room(1)[1]
-    scan = open_scan(cloud.points.astype(float), cloud.colors, num_threads=2)
+    scan = open_scan(Cloud(cloud.points.astype(float), colors=cloud.colors), num_threads=2)
     assert scan._opened.prepared.lacks_features
     assert finding == []
     scan.localize(rooms.query(1).rgb, gravity="unknown")

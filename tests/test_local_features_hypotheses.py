@@ -19,7 +19,7 @@ from piccolo.localization.localize import localize
 from piccolo.localization.prior import contradictions
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.scan_map.prior import Prior
+from piccolo.prior import Prior
 
 
 @functools.lru_cache
@@ -133,9 +133,9 @@ def test_poses_that_contradict_a_prior_are_told():
     heading = np.degrees(np.arctan2(*world.R_cam_from_world[0, :2]))
     for prior, wrong in (
         (Prior(), ""),
-        (Prior(near_world=(x + 0.55, y, z), radius=0.5), ""),
+        (Prior(near=(x + 0.55, y, z), radius=0.5), ""),
         (
-            Prior(near_world=(x + 1.4, y, None), radius=0.5),
+            Prior(near=(x + 1.4, y, None), radius=0.5),
             "is 1.40 m from the place given, not within 0.5 m",
         ),
         (Prior(height=(z - 0.3, z + 0.3)), ""),
@@ -151,14 +151,14 @@ def test_poses_that_contradict_a_prior_are_told():
 def test_matches_beyond_a_prior_are_asked_too():
     query, world = _query(1), rooms.query(1).pose
     x, y, _ = world.center_world
-    prior = Prior(near_world=(x + 1.4, y, None), radius=0.5)
+    prior = Prior(near=(x + 1.4, y, None), radius=0.5)
     poses = match_poses(replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)))
     assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses)
 
 
 def test_a_prior_that_excludes_the_place_makes_no_pose_sure():
     x, y, _ = rooms.query(1).pose.center_world
-    prior = Prior(near_world=(x + 1.4, y, None), radius=0.5)
+    prior = Prior(near=(x + 1.4, y, None), radius=0.5)
     settings = CoarseToFineSettings(gravity="known", prior=prior)
     result = localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2), Stopwatch())
     assert result.status == "not_localized"

@@ -16,9 +16,9 @@ from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.prior import allow_rotations, apply_prior
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.prior import Prior
 from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
-from piccolo.scan_map.prior import Prior
 from piccolo.scan_map.scan_map import prepare_map
 
 KNOWN = CoarseToFineSettings(gravity="known")
@@ -99,7 +99,7 @@ def test_priors_leave_what_they_say():
     whole, origin = scan_map(1), room(1)[1].origin_world
     turn = exp_so3(np.array([0.0, 0.0, 2.0]))  # of a map that was levelled
     turned = dataclasses.replace(whole, R_map_from_world=turn)
-    near_it = Prior(near_world=tuple(origin + turn.T @ [0.5, 0, 0]), radius=1.0)
+    near_it = Prior(near=tuple(origin + turn.T @ [0.5, 0, 0]), radius=1.0)
     near = apply_prior(turned, near_it)
     distance = np.linalg.norm(whole.centers - [0.5, 0, 0], axis=1)
     is_near = distance <= 1.3  # half a spacing more
@@ -125,14 +125,14 @@ def test_priors_leave_what_they_say():
 def test_a_prior_that_allows_nothing_says_what_was_left_out():
     whole, origin = scan_map(1), room(1)[1].origin_world
     num, heights = len(whole.centers), heights_above_floor(whole.octree, whole.centers)
-    prior = Prior(tuple(whole.centers[0] + origin - [50.0, 0.0, 0.0]), 1.0, (0.5, 1.0))
+    prior = Prior(near=tuple(whole.centers[0] + origin - [50.0, 0.0, 0.0]), radius=1.0, height=(0.5, 1.0))
     settings = dataclasses.replace(KNOWN, prior=prior)
     (text,) = _localize(1, query(1).rgb, settings).warnings
     num_low = ((heights >= 0.2) & (heights <= 1.3)).sum()
-    counts = f"`near_world` allows 0, `height` allows {num_low}; "
+    counts = f"`near` allows 0, `height` allows {num_low}; "
     assert f"no position is left of the scan's {num}: {counts}" in text
     x, y, z, distance = map(float, re.search(r"is (\S+) (\S+) (\S+), (\S+) m away", text).groups())
-    to_near = np.linalg.norm(whole.centers + origin - prior.near_world, axis=1)
+    to_near = np.linalg.norm(whole.centers + origin - prior.near, axis=1)
     np.testing.assert_allclose((x, y, z), whole.centers[to_near.argmin()] + origin, atol=0.005)
     assert distance == pytest.approx(to_near.min(), abs=0.005)
 
@@ -144,21 +144,19 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
     num = len(find_supported_cells(top_surfaces(whole.octree)))
     for most in (num - 1, 10):  # known when all have been counted, or from the surfaces alone
         monkeypatch.setattr(camera_positions, "MAX_POSITIONS", most)
-        with pytest.raises(
-            InputError, match=rf"more than {most} camera positions, .*`units`, .*`near_world`"
-        ):
+        with pytest.raises(InputError, match=rf"more than {most} camera positions, .*`units`, .*`near`"):
             prepare_map(cloud, Workers(1))
     monkeypatch.setattr(camera_positions, "MAX_POSITIONS", num - 1)
-    prior = Prior(tuple(center + cloud.origin_world), 1.0)
+    prior = Prior(near=tuple(center + cloud.origin_world), radius=1.0)
     said = []
     part = prepare_map(cloud, Workers(1, warn=said.append), prior=prior)
     assert part.is_partial
     assert said == list(part.warnings)
-    assert "prepared within 1 m of `near_world`" in said[0]
+    assert "prepared within 1 m of `near`" in said[0]
     assert 0 < len(part.centers) < len(whole.centers)
     left = {tuple(c) for c in apply_prior(part, prior).centers}
     assert {tuple(c) for c in whole.centers[is_near]} <= left
-    far = Prior((900.0, 0.0, 0.0), 1.0)
+    far = Prior(near=(900.0, 0.0, 0.0), radius=1.0)
     assert len(prepare_map(cloud, Workers(1), prior=far).centers) == 0
 
 

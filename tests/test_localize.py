@@ -71,7 +71,7 @@ def test_prior_narrows_the_search_and_stands_in_the_result(scene, capsys):
     assert localize.main(_arguments(scene, "--quiet", "--near", "900", "0", "0", "1")) == 1
     nothing = json.loads(capsys.readouterr().out)
     assert nothing["center_world"] is None
-    assert "`near_world` allows 0; the nearest to `near_world` is" in nothing["warnings"][-1]
+    assert "`near` allows 0; the nearest to `near` is" in nothing["warnings"][-1]
 
 
 def test_a_tilted_photo_is_clear_by_its_gravity_in_a_table(scene, tmp_path, capsys):
@@ -85,7 +85,7 @@ def test_a_tilted_photo_is_clear_by_its_gravity_in_a_table(scene, tmp_path, caps
     result = Result.from_json(capsys.readouterr().out)
     assert errors(result.pose, taken.pose)[0] < 0.03
     assert set(result.seconds) == {"read", "search", "refine"}  # as upright: no features are matched
-    assert result.settings["prior"]["gravity_vector"] == pytest.approx(down.tolist())
+    assert result.settings["panorama"]["gravity_vector"] == pytest.approx(down.tolist())
 
 
 def test_files_are_written_and_look_right(scene, tmp_path, capsys):

@@ -26,8 +26,9 @@ from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opened_scan import OpenedScan
-from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import sha256_of
+from piccolo.photo import Photo
 from piccolo.result import Beside, Result, read_results
 from piccolo.scan import Scan
 from research.synthetic.world import (
@@ -79,7 +80,7 @@ def test_a_rig_of_four_photos_equals_the_sphere_that_they_were_cut_from(tmp_path
         write(folder / mount.image, encoded(cut(full, mount), ".png"))
     rig = write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode())
     sphere = scan().localize(write(tmp_path / "full.png", encoded(full, ".png")), gravity="known")
-    result = scan().localize(folder, rig=rig, gravity="known")
+    result = scan().localize(Photo(folder, rig=rig), gravity="known")
     distance, angle = pose_errors(result.best_pose, sphere.best_pose)
     assert distance < 0.002
     assert np.degrees(angle) < 0.1
@@ -94,7 +95,7 @@ def test_a_dual_fisheye_is_localized(tmp_path):
     rgb = picture_of_all(DUAL, this, pose, Workers(2))
     calibration = write(tmp_path / "dual.json", json.dumps(document_of(DUAL)).encode())
     photo = write(tmp_path / "a.png", encoded(rgb, ".png"))
-    result = scan().localize(photo, camera=calibration, gravity="unknown")
+    result = scan().localize(Photo(photo, camera=calibration), gravity="unknown")
     distance, angle = pose_errors(result.best_pose, pose)
     assert distance < 0.01
     assert np.degrees(angle) < 0.2
@@ -110,7 +111,9 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     rgb = render_picture(Mount(camera), this, pose, Workers(2))
     down = tuple((pose.R_cam_from_world @ [0.0, 0.0, -9.81]).tolist())
     fov_deg = float(np.degrees(800 / 230.0))
-    result = scan().localize(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down, gravity="known")
+    result = scan().localize(
+        Photo(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down), gravity="known"
+    )
     distance, angle = pose_errors(result.best_pose, pose)
     assert distance < 0.02
     assert np.degrees(angle) < 0.5
@@ -123,7 +126,7 @@ def test_arrays_of_photos_need_a_camera():
     with pytest.raises(piccolo.InputError, match=r"found uint8 of shape .300, 400, 3., wanted RGB"):
         scan().localize(rgb)
     with pytest.raises(piccolo.InputError, match="`camera`, `rig`: found both, wanted one of them"):
-        scan().localize(rgb, camera="a.json", rig="b.json")
+        Photo(rgb, camera="a.json", rig="b.json")
 
 
 def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):
@@ -137,9 +140,8 @@ def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):
         mask = np.zeros((128, 256), np.uint8)
         mask[60:68, 40 * k : 40 * k + 20] = 255
         write(masks / f"{Path(mount.image).stem}.png", encoded(mask, ".png"))
-    options = ReadOptions(calibration=rig)
-    is_valid = read_panorama(folder, options).is_valid
-    seen = read_panorama(folder, replace(options, mask=masks)).is_valid
+    is_valid = read_panorama(Photo(folder, rig=rig)).is_valid
+    seen = read_panorama(Photo(folder, rig=rig, mask=masks)).is_valid
     white = sum(cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in masks.iterdir())
     is_masked = cv2.resize(white, is_valid.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
     assert is_masked.sum() > 400
@@ -191,10 +193,12 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
         write(photos / f"{name}.jpg", encoded(rgb, ".jpg"))
     write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(480, 360, 150.0)),))).encode())
     write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(480, 360, 160.0)),))).encode())
-    results = list(scan().localize_many(sorted(photos.iterdir()), camera=cameras, gravity="known"))
+    results = list(
+        scan().localize_many([Photo(p, camera=cameras) for p in sorted(photos.iterdir())], gravity="known")
+    )
     assert [result.focal_length.given_px for result in results[:2]] == [150.0, 160.0]
     assert results[0].status == "localized"
-    assert results[0].settings["panorama"]["calibration"] == str(cameras)
+    assert results[0].settings["panorama"]["camera"] == str(cameras)
     assert results[2].status == "unreadable"
     assert f"found no calibration of it in {cameras}, wanted c.camera.json or c.json" in results[2].error
 
@@ -209,7 +213,7 @@ def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
         cv2.imwrite(str(path), rgb[..., ::-1])
     opened = scan()._opened
     settings = opened.settings, opened.cloud_settings
-    localizer = Localizer((Path("room"),), *settings, ReadOptions(focal_px=320.0), None)
+    localizer = Localizer((Path("room"),), *settings, Photo("", focal_px=320.0), None)
     answer = localizer.answer_in(opened)
     a = answer(localizer.task(paths[0])).result
     assert a.status == "localized"

@@ -24,9 +24,9 @@ from research.synthetic.world import photograph, render_picture
 def test_a_bundle_of_one_keeps_what_its_photo_rules_out():
     """A focal length that the picture contradicts."""
     rgb, pose = _photo(pinhole(640, 480, TRUE))
-    wrong = {"focal_px": 0.89 * TRUE, "gravity": "known"}
-    alone = scan().localize(rgb, **wrong)
-    (together,) = scan().localize_many([rgb], [pose], **wrong)
+    photo = piccolo.Photo(rgb, focal_px=0.89 * TRUE)
+    alone = scan().localize(photo, gravity="known")
+    (together,) = scan().localize_bundle([photo], [pose], gravity="known")
     for result in (alone, together):
         assert result.status == "not_localized"
         assert any("the picture has a focal length of" in warning for warning in result.warnings)
@@ -40,9 +40,9 @@ def test_photos_of_one_wrong_focal_length_are_not_sure_together():
         center = pose.center_world + np.array([0.05, 0.03, 0.0])
         poses.append(Pose(yaw_rotation(turn) @ pose.R_cam_from_world, center))
     photos = [render_picture(camera, room, p, Workers(2)) for p in poses]
-    for result, true in zip(
-        scan().localize_many(photos, poses, focal_px=0.89 * TRUE, gravity="known"), poses, strict=True
-    ):
+    given = [piccolo.Photo(photo, focal_px=0.89 * TRUE) for photo in photos]
+    results = scan().localize_bundle(given, poses, gravity="known")
+    for result, true in zip(results, poses, strict=True):
         if result.status == "localized":
             assert result.pose.distance(true) < 0.05
         else:
@@ -53,9 +53,11 @@ def test_a_frame_that_contradicts_the_prior_says_so_in_a_walk():
     world, cloud = rooms.room(3)
     poses = _walk_through(world)[:4]
     frames = [photograph(world.rooms[0], p, rooms.WIDTH, Workers(2)) for p in poses]
-    opened = piccolo.open_scan(cloud.points.astype(float) + cloud.origin_world, cloud.colors, num_threads=2)
-    prior = {"near_world": tuple(poses[0].center_world), "radius": 0.4, "gravity": "known"}
-    results = opened.localize_walk(frames, times=[0.5 * k for k in range(len(frames))], **prior)
+    points_world = cloud.points.astype(float) + cloud.origin_world
+    opened = piccolo.open_scan(piccolo.Cloud(points_world, colors=cloud.colors), num_threads=2)
+    prior = piccolo.Prior(near=tuple(poses[0].center_world), radius=0.4)
+    times = [0.5 * k for k in range(len(frames))]
+    results = opened.localize_walk(frames, times, prior=prior, gravity="known")
     for result, pose in zip(results, poses, strict=True):
         distance = float(np.linalg.norm(pose.center_world - poses[0].center_world))
         if distance > 0.6:

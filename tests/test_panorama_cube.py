@@ -6,7 +6,8 @@ from refusals import assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama import read_panorama
+from piccolo.photo import Photo
 
 SIZE = 64
 # forward, right and up of each face's picture, by hand: +x the panorama's centre, +y left, +z up
@@ -98,16 +99,16 @@ def test_crosses_are_known_by_their_empty_cells(tmp_path, rows):
 def test_grids_are_read_by_the_order_given(tmp_path, rows):
     path = write(tmp_path / "a.png", encoded(picture_of(rows), ".png"))
     assert_refused(r"`cube_order`", read_panorama, path)
-    assert_is_the_sphere(read_panorama(path, ReadOptions(cube_order="".join(rows))))
+    assert_is_the_sphere(read_panorama(Photo(path, cube_order="".join(rows))))
 
 
 def test_orders_and_shapes_that_are_no_cube_are_refused(tmp_path):
     for order in ("", "rlud", "rludff", "rludfx"):
         with pytest.raises(InputError, match=r"`cube_order`: found .*, wanted each of the letters rludfb"):
-            ReadOptions(cube_order=order)
+            Photo("a.jpg", cube_order=order)
     path = write(tmp_path / "a.png", encoded(picture_of(["fl"]), ".png"))
     with pytest.raises(InputError, match="found 128 x 64, wanted six equal squares as cube_order says"):
-        read_panorama(path, ReadOptions(cube_order="rludfb"))
+        read_panorama(Photo(path, cube_order="rludfb"))
 
 
 def test_folders_that_are_no_cube_are_refused(tmp_path):

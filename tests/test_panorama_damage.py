@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from pictures import crop_fields, encoded, png_chunk, smooth_rgb, tiff, with_metadata, write, xmp_packet
 from refusals import mutated, read_or_refused
 
-from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama import read_panorama
+from piccolo.photo import Photo
 
 RGB = smooth_rgb()
 RGBA = np.dstack([RGB, np.full((64, 128), 255, np.uint8)])
@@ -91,5 +92,5 @@ def test_mutated_masks_are_read_or_refused(data, tmp_path_factory):
     folder = tmp_path_factory.getbasetemp()
     mask = write(folder / "mask.png", mutated(data.draw, st.integers, FILES["webp"]))
     path = write(folder / "a.png", FILES["png"])
-    panorama, message = read_or_refused(lambda _: read_panorama(path, ReadOptions(mask=mask)), mask)
+    panorama, message = read_or_refused(lambda _: read_panorama(Photo(path, mask=mask)), mask)
     assert (panorama is None) == bool(message)

@@ -12,9 +12,10 @@ from refusals import assert_refused, read_or_refused
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
-from piccolo.panorama import GPano, ReadOptions, panorama_of_array, read_panorama
+from piccolo.panorama import GPano, read_panorama
 from piccolo.panorama.gpano import attitude_of_gravity, rotation_to_level
 from piccolo.panorama.photo import read_focal_length
+from piccolo.photo import Photo
 
 PHOTO = smooth_rgb(360, 480)
 
@@ -58,9 +59,9 @@ def test_a_photo_twice_as_wide_as_high_is_read_as_a_sphere_with_a_warning(tmp_pa
     (note,) = panorama.warnings
     assert note.startswith("read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole")
     assert note.endswith("EXIF's 35 mm equivalent of 26 mm")
-    assert len(read_panorama(path, ReadOptions(projection="pinhole")).cameras) == 1
-    for quiet in (ReadOptions(projection="equirectangular"), ReadOptions(fov_deg=360.0)):
-        assert read_panorama(path, quiet).warnings == ()
+    assert len(read_panorama(Photo(path, projection="pinhole")).cameras) == 1
+    for quiet in (Photo(path, projection="equirectangular"), Photo(path, fov_deg=360.0)):
+        assert read_panorama(quiet).warnings == ()
     assert read_panorama(photo(tmp_path / "b.jpg", size=(480, 240))).warnings == ()
     sphere = with_metadata(path.read_bytes(), xmp=xmp_packet({"ProjectionType": "equirectangular"}))
     assert read_panorama(write(tmp_path / "c.jpg", sphere)).warnings == ()
@@ -110,7 +111,7 @@ def test_the_photo_is_turned_as_exif_says_and_so_is_its_calibration(tmp_path):
         path = photo(tmp_path / "b.jpg", FILM, orientation)
         shown = read_panorama(path)
         stored = Calibration("stored", (Mount(pinhole(480, 360, shown.cameras[0].camera.params[0])),))
-        again = read_panorama(path, ReadOptions(calibration=stored))
+        again = read_panorama(Photo(path, camera=stored))
         assert (again.cameras[0].camera.width, again.cameras[0].camera.height) == (480, 360)
         is_both = shown.is_valid & again.is_valid
         assert is_both.sum() > 0.98 * shown.is_valid.sum()
@@ -120,23 +121,23 @@ def test_the_photo_is_turned_as_exif_says_and_so_is_its_calibration(tmp_path):
 def test_what_the_user_says_goes_before_exif(tmp_path):
     path = photo(tmp_path / "a.jpg", FILM)
     focals = {
-        430.0: ReadOptions(focal_px=430.0),
-        240.0: ReadOptions(fov_deg=90.0, projection="pinhole"),
-        480.0 / np.pi: ReadOptions(fov_deg=180.0, projection="fisheye"),
-        77.0: calibrated([Mount(pinhole(480, 360, 77.0))]),
+        430.0: Photo(path, focal_px=430.0),
+        240.0: Photo(path, fov_deg=90.0, projection="pinhole"),
+        480.0 / np.pi: Photo(path, fov_deg=180.0, projection="fisheye"),
+        77.0: calibrated(path, [Mount(pinhole(480, 360, 77.0))]),
     }
-    for focal, options in focals.items():
-        panorama = read_panorama(path, options)
+    for focal, asked in focals.items():
+        panorama = read_panorama(asked)
         assert panorama.cameras[0].camera.params[0] == pytest.approx(focal)
         assert panorama.warnings == ()
-    crop = read_panorama(path, ReadOptions(fov_deg=60.0, projection="equirectangular"))
+    crop = read_panorama(Photo(path, fov_deg=60.0, projection="equirectangular"))
     assert (crop.cameras, crop.warnings) == ((), ())
     assert crop.rgb.shape == (1440, 2880, 3)
 
 
 @pytest.mark.parametrize("size", [(480, 360), (360, 480), (480, 320), (480, 270), (480, 271)])
 def test_a_field_of_view_alone_makes_no_pinhole_of_a_photo_and_a_warning_says_so(tmp_path, size):
-    panorama = read_panorama(photo(tmp_path / "a.jpg", size=size), ReadOptions(fov_deg=65.0))
+    panorama = read_panorama(Photo(photo(tmp_path / "a.jpg", size=size), fov_deg=65.0))
     assert panorama.cameras == ()
     (warning,) = panorama.warnings
     assert "part of a panorama" in warning
@@ -145,20 +146,18 @@ def test_a_field_of_view_alone_makes_no_pinhole_of_a_photo_and_a_warning_says_so
 
 def test_a_part_of_a_panorama_is_not_taken_for_a_photo(tmp_path):
     path = photo(tmp_path / "a.jpg", size=(480, 200))
-    assert read_panorama(path, ReadOptions(fov_deg=65.0)).warnings == ()
+    assert read_panorama(Photo(path, fov_deg=65.0)).warnings == ()
     sphere = with_metadata(encoded(PHOTO, ".jpg"), xmp=xmp_packet({"PosePitchDegrees": 10}))
     path = write(tmp_path / "b.jpg", sphere)
-    assert read_panorama(path, ReadOptions(fov_deg=65.0)).warnings == ()
+    assert read_panorama(Photo(path, fov_deg=65.0)).warnings == ()
 
 
 def test_a_sphere_stays_a_sphere_whatever_its_exif(tmp_path):
     wide = photo(tmp_path / "a.jpg", FILM, size=(480, 240))
     assert read_panorama(wide).cameras == ()
-    assert len(read_panorama(wide, ReadOptions(projection="pinhole")).cameras) == 1
+    assert len(read_panorama(Photo(wide, projection="pinhole")).cameras) == 1
     sphere = Calibration("made", (Mount(Camera("EQUIRECTANGULAR", 960, 480, (960.0, 480.0))),))
-    np.testing.assert_array_equal(
-        read_panorama(wide, ReadOptions(calibration=sphere)).rgb, read_panorama(wide).rgb
-    )
+    np.testing.assert_array_equal(read_panorama(Photo(wide, camera=sphere)).rgb, read_panorama(wide).rgb)
 
 
 def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
@@ -169,10 +168,10 @@ def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
     assert_refused(message, read_panorama, path)
     upright = photo(tmp_path / "b.jpg", orientation=6)
     assert_refused("found a picture of 360 x 480, .* `fov_deg` 50 `refine_focal`", read_panorama, upright)
-    pinhole_only = ReadOptions(projection="pinhole")
-    assert_refused("found no focal length in EXIF, wanted `focal_px`", read_panorama, path, pinhole_only)
-    wrong = calibrated([Mount(pinhole(640, 360, 100.0))])
-    assert_refused("made: found a picture of 480 x 360 and a calibration for 640", read_panorama, path, wrong)
+    pinhole_only = Photo(path, projection="pinhole")
+    assert_refused("found no focal length in EXIF, wanted `focal_px`", read_panorama, pinhole_only)
+    wrong = calibrated(path, [Mount(pinhole(640, 360, 100.0))])
+    assert_refused("made: found a picture of 480 x 360 and a calibration for 640", read_panorama, wrong)
 
 
 @pytest.mark.parametrize(
@@ -192,21 +191,21 @@ def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
 )
 def test_options_that_mean_nothing_are_refused(options, message):
     with pytest.raises(InputError, match=message):
-        ReadOptions(**options)
+        Photo("a.jpg", **options)
 
 
 def test_no_plane_shows_half_a_sphere():
-    options = ReadOptions(fov_deg=179.5, projection="pinhole")
+    wide = Photo(PHOTO, fov_deg=179.5, projection="pinhole")
     with pytest.raises(InputError, match=r"`fov_deg`: found 179.5 of a pinhole, wanted less than 178"):
-        panorama_of_array(PHOTO, np.ones(PHOTO.shape[:2], bool), options)
+        read_panorama(wide)
 
 
 def test_a_mask_of_the_photo_goes_along(tmp_path):
     path = photo(tmp_path / "a.jpg", FILM)
     mask = np.zeros((360, 480), np.uint8)
     mask[:, 240:] = 255
-    masked = ReadOptions(mask=write(tmp_path / "m.png", encoded(mask, ".png")))
-    plain, half = read_panorama(path), read_panorama(path, masked)
+    masked = Photo(path, mask=write(tmp_path / "m.png", encoded(mask, ".png")))
+    plain, half = read_panorama(path), read_panorama(masked)
     width = plain.rgb.shape[1]
     np.testing.assert_array_equal(half.is_valid[:, : width // 2 - 1], plain.is_valid[:, : width // 2 - 1])
     assert not half.is_valid[:, width // 2 :].any()

@@ -11,9 +11,10 @@ from PIL import Image
 from pillow_heif import register_heif_opener
 from refusals import assert_refused
 
-from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
 from piccolo.panorama.picture import read_picture
+from piccolo.photo import Photo
 
 RGB = smooth_rgb()
 RANDOM16 = np.random.default_rng(3).integers(0, 65536, (64, 128, 4), dtype=np.uint16)
@@ -204,4 +205,4 @@ def test_insp_is_a_jpeg_of_two_fisheyes(tmp_path):
     path = tmp_path / "a.insp"
     path.write_bytes(cv2.imencode(".jpg", circles)[1].tobytes() + b"trailer of the camera" * 9)
     assert_refused("two fisheye pictures side by side, wanted their calibration", read_panorama, path)
-    assert read_panorama(path, ReadOptions(fov_deg=360.0)).rgb.shape[1] == 512
+    assert read_panorama(Photo(path, fov_deg=360.0)).rgb.shape[1] == 512

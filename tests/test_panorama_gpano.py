@@ -18,8 +18,9 @@ from pictures import (
 from refusals import assert_refused, read_or_refused
 
 from piccolo.errors import InputError
-from piccolo.panorama import GPano, ReadOptions, read_panorama
+from piccolo.panorama import GPano, read_panorama
 from piccolo.panorama.gpano import gpano_fields, rotation_to_level
+from piccolo.photo import Photo
 
 RGB = smooth_rgb(200, 400)
 LOSSLESS = [cv2.IMWRITE_WEBP_QUALITY, 101]
@@ -161,21 +162,21 @@ def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
         read_panorama,
         path,
     )
-    panorama = read_panorama(path, ReadOptions(fov_deg=180.0))
+    panorama = read_panorama(Photo(path, fov_deg=180.0))
     rgb, is_valid = expected_crop(100, 60, 200, 80)
     np.testing.assert_array_equal(panorama.is_valid, is_valid)
     np.testing.assert_array_equal(panorama.rgb, rgb)
-    around = read_panorama(path, ReadOptions(fov_deg=360.0))
+    around = read_panorama(Photo(path, fov_deg=360.0))
     assert around.rgb.shape == (100, 200, 3)
     assert around.is_valid[10:90].all()
     with pytest.raises(InputError, match=r"found 200 x 200, higher than the sphere .* a smaller `fov_deg`"):
-        read_panorama(write(path, encoded(RGB[:, :200], ".png")), ReadOptions(fov_deg=270.0))
+        read_panorama(Photo(write(path, encoded(RGB[:, :200], ".png")), fov_deg=270.0))
 
 
 @pytest.mark.parametrize("fov_deg", [0.0, -90.0, 361.0, float("nan")])
 def test_other_fields_of_view_are_refused(fov_deg):
     with pytest.raises(InputError, match=r"`fov_deg`: found .*, wanted above 0 and at most 360"):
-        ReadOptions(fov_deg=fov_deg)
+        Photo("a.jpg", fov_deg=fov_deg)
 
 
 def test_many_prefixes_of_the_namespace_cost_no_time():

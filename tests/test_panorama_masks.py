@@ -8,8 +8,9 @@ from pictures import crop_fields, encoded, with_metadata, write, xmp_packet
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3
 from piccolo.geometry.sphere import pixel_rays, solid_angles
-from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama import read_panorama
 from piccolo.panorama.masks import is_dual_fisheye
+from piccolo.photo import Photo
 
 WIDTH, HEIGHT = 1024, 512
 
@@ -36,10 +37,10 @@ def plain_room(ceiling=235.0, floor=90.0):
     return image
 
 
-def read(path, image, suffix=".jpg", options=None, xmp=None):
+def read(path, image, suffix=".jpg", xmp=None, **options):
     content = encoded(np.round(image).clip(0, 255).astype(np.uint8), suffix, [cv2.IMWRITE_JPEG_QUALITY, 92])
     content = with_metadata(content, xmp=xmp) if xmp else content
-    return read_panorama(write(path, content), options or ReadOptions())
+    return read_panorama(Photo(write(path, content), **options))
 
 
 FROM_NADIR = 180.0 - (np.arange(HEIGHT) + 0.5) * 180.0 / HEIGHT  # [deg] of each row
@@ -175,7 +176,7 @@ def checker_mask(width, height):
 def test_a_mask_of_any_size_is_applied(tmp_path, factor):
     mask = checker_mask(int(WIDTH * factor), int(HEIGHT * factor))
     file = write(tmp_path / "mask.png", encoded(mask, ".png"))
-    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=file)).is_valid
+    is_valid = read(tmp_path / "a.jpg", room(), mask=file).is_valid
     np.testing.assert_array_equal(is_valid, checker_mask(WIDTH, HEIGHT) == 0)
 
 
@@ -183,13 +184,13 @@ def test_any_white_pixel_of_a_larger_mask_counts_and_the_nadir_is_masked(tmp_pat
     mask = np.zeros((2 * HEIGHT, 2 * WIDTH), np.uint8)
     mask[301, 401], mask[700, 800] = 128, 127
     file = write(tmp_path / "mask.png", encoded(mask, ".png"))
-    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=file)).is_valid
+    is_valid = read(tmp_path / "a.jpg", room(), mask=file).is_valid
     assert np.argwhere(~is_valid).tolist() == [[150, 200]]
-    is_valid = read(tmp_path / "a.jpg", room(), options=ReadOptions(mask_nadir_deg=20.0)).is_valid
+    is_valid = read(tmp_path / "a.jpg", room(), mask_nadir_deg=20.0).is_valid
     np.testing.assert_array_equal(is_valid, np.repeat((FROM_NADIR >= 20)[:, None], WIDTH, axis=1))
     for degrees in (-1.0, 91.0, float("nan")):
         with pytest.raises(InputError, match=r"`mask_nadir_deg`: found .*, wanted 0 to 90"):
-            ReadOptions(mask_nadir_deg=degrees)
+            Photo("a.jpg", mask_nadir_deg=degrees)
 
 
 def test_a_mask_of_a_crop_may_have_its_shape_or_the_spheres(tmp_path):
@@ -199,25 +200,24 @@ def test_a_mask_of_a_crop_may_have_its_shape_or_the_spheres(tmp_path):
     of_crop[:50] = 255
     file = write(tmp_path / "crop.png", encoded(of_crop, ".png"))
     top = (HEIGHT - 200) // 2
-    is_valid = read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options)).is_valid
+    is_valid = read(tmp_path / "a.jpg", image, mask=file, **options).is_valid
     assert (np.nonzero(is_valid.any(axis=1))[0][[0, -1]] == [top + 50, top + 199]).all()
     file = write(tmp_path / "full.png", encoded(checker_mask(WIDTH, HEIGHT), ".png"))
-    is_valid = read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options)).is_valid
+    is_valid = read(tmp_path / "a.jpg", image, mask=file, **options).is_valid
     assert is_valid[top:].sum() == 200 * 600
     file = write(tmp_path / "wrong.png", encoded(np.zeros((100, 100), np.uint8), ".png"))
     with pytest.raises(InputError, match=r"wrong.png: found a mask of 100 x 100, wanted the shape of 1024 x"):
-        read(tmp_path / "a.jpg", image, options=ReadOptions(mask=file, **options))
+        read(tmp_path / "a.jpg", image, mask=file, **options)
 
 
 def test_a_folder_of_masks_is_looked_up_by_name(tmp_path):
     folder = tmp_path / "masks"
     folder.mkdir()
     write(folder / "a.png", encoded(checker_mask(64, 32), ".png"))
-    options = ReadOptions(mask=folder)
-    is_valid = read(tmp_path / "a.jpg", room(), options=options).is_valid
+    is_valid = read(tmp_path / "a.jpg", room(), mask=folder).is_valid
     np.testing.assert_array_equal(is_valid, checker_mask(WIDTH, HEIGHT) == 0)
-    panorama = read(tmp_path / "b.jpg", room(), options=options)
+    panorama = read(tmp_path / "b.jpg", room(), mask=folder)
     assert panorama.is_valid.all()
     assert panorama.warnings == (f"found no mask b in {folder}",)
     with pytest.raises(InputError, match=r"none.png: cannot be read"):
-        read(tmp_path / "a.jpg", room(), options=ReadOptions(mask=tmp_path / "none.png"))
+        read(tmp_path / "a.jpg", room(), mask=tmp_path / "none.png")

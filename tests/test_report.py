@@ -277,7 +277,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     scan = piccolo.open_scan(scene.cloud)
     with pytest.raises(InputError, match="results of another scan"):
         piccolo.write_report(lines, scan, tmp_path / "r")
-    piccolo.write_report(lines, scan, tmp_path / "r", force=True)
+    piccolo.write_report(lines, scan, tmp_path / "r", piccolo.ReportSettings(force=True))
 
 
 def test_hopeless_guesses_are_on_no_plan(house, tmp_path):
@@ -296,18 +296,18 @@ def test_hopeless_guesses_are_on_no_plan(house, tmp_path):
 
 def test_in_python(house, tmp_path):
     scene, results = house
-    scan = piccolo.open_scan(scene.cloud)
     told = []
-    page = piccolo.write_report(
-        results[1], scan, tmp_path / "r", title="A walk", progress=lambda *words: told.append(words)
-    )
+    scan = piccolo.open_scan(scene.cloud, progress=lambda *words: told.append(words))
+    page = piccolo.write_report(results[1], scan, tmp_path / "r", piccolo.ReportSettings(title="A walk"))
     assert page == tmp_path / "r" / "index.html"
     assert _document(tmp_path / "r")["title"] == "A walk"
     assert ("photos", 6, 6) in told
-    with pytest.raises(TypeError, match="unexpected keyword argument 'titel'"):
-        piccolo.write_report(results, scan, tmp_path / "r", titel="x")
+    with pytest.raises(InputError, match="`title`: found 1, wanted a text"):
+        piccolo.ReportSettings(title=1)
+    with pytest.raises(InputError, match=r"`scan`: found .*, wanted Scan"):
+        piccolo.write_report(results, str(scene.cloud), tmp_path / "r")
     with pytest.raises(InputError, match="found 1 names, wanted 2"):
-        piccolo.write_report(results, str(scene.cloud), tmp_path / "r", storeys=["Ground floor"])
+        piccolo.write_report(results, scan, tmp_path / "r", piccolo.ReportSettings(storeys=["Ground floor"]))
 
 
 @pytest.mark.parametrize(

@@ -109,9 +109,9 @@ def test_any_name_that_a_file_may_have_comes_back_from_ascii(tmp_path):
     file = tmp_path / "poses.jsonl"
     file.write_text(text, "ascii")
     assert [os.fsencode(result.pano) for result in read_results([file])] == [os.fsencode(n) for n in names]
-    for name in ("half a character \ud83d", 7):
+    for name, text in (("half a character \ud83d", "wanted a file's name as"), (7, "Expected str, got int")):
         file.write_text(json.dumps(json.loads(RESULT.to_json()) | {"pano": name}))
-        with pytest.raises(InputError, match="wanted a file's name as"):
+        with pytest.raises(InputError, match=text):
             read_results([file])
 
 
@@ -129,7 +129,7 @@ def test_several_files_of_a_cloud_are_a_list():
     assert Result.from_json(several.to_json()) == several
     for cloud in (7, ["a", 7], None):
         document = json.loads(several.to_json()) | {"cloud": cloud}
-        with pytest.raises(InputError, match="neither a name nor a list of names"):
+        with pytest.raises(InputError, match=r"at .*cloud"):
             Result.from_json(json.dumps(document))
 
 

@@ -4,52 +4,76 @@ import dataclasses
 import hashlib
 import inspect
 import re
-from typing import get_args
 
 import numpy as np
 import pytest
 import rooms
 
 import piccolo
+from piccolo.errors import InputError
 from piccolo.files.cache import sha256_of_arrays
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
-from piccolo.scan import PhotoOptions
-from piccolo.scan_map.prior import Prior
+from piccolo.prior import Prior
 
 
 @pytest.fixture(scope="module")
 def scan():
     cloud = rooms.room(1)[1]
-    return piccolo.open_scan(cloud.points + cloud.origin_world, cloud.colors)
+    return piccolo.open_scan(piccolo.Cloud(cloud.points + cloud.origin_world, colors=cloud.colors))
 
 
 def test_options_that_are_none_are_named(scan):
-    points = np.zeros((2, 3))
-    for options, error, text in (
-        ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
-        ({"units": "inch"}, piccolo.InputError, "`units`: found 'inch', wanted one of mm, cm, m"),
-        ({"up": "w"}, piccolo.InputError, "`up`: found 'w', wanted one of auto, z"),
-        ({"num_threads": 0}, piccolo.InputError, "`num_threads`: found 0"),
+    with pytest.raises(piccolo.InputError, match="`num_threads`: found 0"):
+        piccolo.open_scan(np.zeros((2, 3)), num_threads=0)
+    for call, error, text in (
+        (lambda: piccolo.open_scan("a.ply", foo=3), TypeError, "unexpected keyword argument 'foo'"),
+        (lambda: scan.localize("a.jpg", near=3), TypeError, "unexpected keyword argument 'near'"),
+        (lambda: piccolo.Photo("a.jpg", near=3), TypeError, "unexpected keyword argument 'near'"),
+        (lambda: piccolo.Prior(mask=3), TypeError, "unexpected keyword argument 'mask'"),
+        (lambda: scan.localize("a.jpg", gravity="Known"), InputError, "`gravity`: found 'Known', wanted one"),
+        (lambda: scan.localize("a.jpg", prior=3), InputError, "`prior`: found 3, wanted Prior"),
+        (lambda: scan.localize_many([], min_confidence=2), InputError, "`min_confidence`: found 2"),
+        (lambda: scan.track(motion=2.0), InputError, "`motion`: found 2.0, wanted Motion"),
     ):
         with pytest.raises(error, match=text):
-            piccolo.open_scan(points, points, **options)
-    with pytest.raises(piccolo.InputError, match="found no file"):
-        piccolo.open_scan([])
-    for options, error, text in (
-        ({"foo": 3}, TypeError, "unexpected keyword argument 'foo'"),
-        ({"gravity": "Known"}, piccolo.InputError, "`gravity`: found 'Known', wanted one of auto"),
-        ({"mask": np.ones((3, 3), bool)}, piccolo.InputError, "mask: wanted an array"),
-        ({"fov_deg": 90.0}, piccolo.InputError, "need a file"),
-        ({"gravity_vector": (0.0, 0.0, 0.0)}, piccolo.InputError, "`gravity_vector`: found .*, wanted three"),
-    ):
-        with pytest.raises(error, match=text):
-            scan.localize(np.zeros((64, 128, 3), np.uint8), **options)
-    with pytest.raises(piccolo.InputError, match=r"`mask`: found bool of shape \(3, 3\), wanted a path"):
-        scan.track(mask=np.zeros((3, 3), bool))
-    with pytest.raises(piccolo.InputError, match="panorama: found float64 of shape"):
-        scan.localize(np.zeros((64, 128, 3)))
+            call()
+
+
+PIXELS = np.zeros((64, 128, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: piccolo.Photo(PIXELS, mask=np.ones((3, 3), bool)), "`mask`: found bool of shape .*, wanted"),
+        (lambda: piccolo.Photo("a.jpg", mask=np.ones((3, 3), bool)), "`mask`: found an array .*, wanted a p"),
+        (lambda: piccolo.Photo(PIXELS, fov_deg=90.0), "found an array as picture, wanted a file"),
+        (lambda: piccolo.Photo(PIXELS, mask="mask.png"), "found an array as picture, wanted a file"),
+        (lambda: piccolo.Photo(np.zeros((64, 128, 3))), "`picture`: found float64 of shape"),
+        (
+            lambda: piccolo.Photo("a.jpg", gravity_vector=(0, 0, 0)),
+            "`gravity_vector`: found .*, wanted three",
+        ),
+        (lambda: piccolo.Photo("a.jpg", camera=3), "`camera`: found 3, wanted a path"),
+        (lambda: piccolo.Photo("a.jpg", camera="none.json"), "none.json: "),
+        (lambda: piccolo.Photo("a.jpg", camera="a.json", rig="b.json"), "`camera`, `rig`: found both"),
+        (lambda: piccolo.Photo("a.jpg", refine_focal=1), "`refine_focal`: found 1, wanted True or False"),
+        (lambda: piccolo.Prior(height=1.5), "`height`: found 1.5, wanted 2 numbers"),
+        (lambda: piccolo.Prior(near=(1, 2), radius=1.0), r"`near`: found \(1, 2\), wanted 3 numbers"),
+        (lambda: piccolo.Prior(near=(1, 2, 3)), "`near`, `radius`: found one of them, wanted both or none"),
+        (lambda: piccolo.Prior(within="x"), "`within`: found 'x', wanted a list, each a text"),
+        (lambda: piccolo.Prior(heading_deg="12"), "`heading_deg`: found '12', wanted a number"),
+        (lambda: piccolo.Prior(use_gps=1), "`use_gps`: found 1, wanted True or False"),
+        (lambda: piccolo.Prior(height=(2.0, 1.0)), r"`height`: found \[2.0, 1.0\], wanted MIN below MAX"),
+        (lambda: CoarseToFineSettings(solver="newton"), "`solver`: found 'newton', wanted one of"),
+    ],
+)
+def test_an_option_is_checked_when_the_object_is_made(make, text):
+    with pytest.raises(piccolo.InputError, match=text) as error:
+        make()
+    assert "\n" not in str(error.value)
 
 
 def test_a_mask_is_left_out_and_settings_are_repeated(scan):
@@ -58,8 +82,8 @@ def test_a_mask_is_left_out_and_settings_are_repeated(scan):
     mask[-20:] = True
     spoilt = np.where(mask[..., None], np.uint8(255), image)
     heading_deg = heading_pitch_roll_deg(true_pose)[0] + 20.0
-    prior = {"heading_deg": heading_deg, "heading_tolerance_deg": 30.0}
-    result = scan.localize(spoilt, mask=mask, gravity="known", **prior)
+    prior = piccolo.Prior(heading_deg=heading_deg, heading_tolerance_deg=30.0)
+    result = scan.localize(piccolo.Photo(spoilt, mask=mask), prior=prior, gravity="known")
     assert rooms.errors(result.pose, true_pose)[0] < 0.02
     assert result.storey == 1
     assert result.height_above_floor == pytest.approx(true_pose.center_world[2], abs=0.05)
@@ -80,60 +104,44 @@ def test_a_scan_is_known_by_its_bytes(tmp_path, scan):
     assert len({digest, sha256_of_arrays(cloud.points), sha256_of_arrays(cloud.points.T.copy())}) == 3
 
 
-def test_a_signature_shows_every_option():
-    options = inspect.signature(piccolo.open_scan).parameters
-    assert {"labels", "ignore_labels", "units", "crs", "settings"} <= options.keys()
-    for method in (piccolo.Scan.localize, piccolo.Scan.localize_many):
-        signature = inspect.signature(method)
-        assert get_args(signature.parameters["options"].annotation) == (PhotoOptions,)
-        own = {p.name for p in signature.parameters.values() if p.kind is p.KEYWORD_ONLY}
-        assert len((own - {"relative_scale"}) | PhotoOptions.__annotations__.keys()) == 20
-    section = piccolo.Scan.localize.__doc__.split("Returns")[0]
-    assert all(re.search(rf"^ {{8}}(\w+, )?{name}\b", section, re.M) for name in PhotoOptions.__annotations__)
-    assert not [name for name in dir(piccolo.Scan) if name in ("prepared", "workers", "settings", "walk")]
-    assert all(getattr(piccolo, name) is not None for name in piccolo.__all__)
+def _public_functions():
+    """All functions and methods that the documents name; options are objects, which are made by name."""
+    for name in piccolo.__all__:
+        value = getattr(piccolo, name)
+        if inspect.isfunction(value):
+            yield name, value
+        elif inspect.isclass(value):
+            for method, function in inspect.getmembers(value, inspect.isfunction):
+                if not method.startswith("_"):
+                    yield f"{name}.{method}", function
+
+
+def test_no_public_function_has_more_than_six_parameters():
+    signatures = {name: inspect.signature(function) for name, function in _public_functions()}
+    assert {"open_scan", "write_report", "Scan.localize_bundle", "Walk.add"} <= signatures.keys()
+    for name, signature in signatures.items():
+        kinds = {p.kind for p in signature.parameters.values()}
+        assert len(signature.parameters.keys() - {"self"}) <= 6, name
+        assert not kinds & {inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL}, name
 
 
 @pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"height": 1.5}, "`height`: found 1.5, wanted 2 numbers"),
-        ({"near_world": (1, 2), "radius": 1.0}, r"`near_world`: found \(1, 2\), wanted 3 numbers"),
-        ({"within": "x"}, "`within`: found 'x', wanted a list, each a text"),
-        ({"heading_deg": "12"}, "`heading_deg`: found '12', wanted a number"),
-        ({"use_gps": 1}, "`use_gps`: found 1, wanted True or False"),
-        ({"solver": "newton"}, "`solver`: found 'newton', wanted one of"),
-        ({"camera": 3}, "`camera`: found 3, wanted a path"),
-    ],
+    "kind", [piccolo.Photo, piccolo.Prior, piccolo.Cloud, piccolo.Motion, piccolo.ReportSettings]
 )
-def test_an_option_of_another_type_is_refused(scan, options, text):
-    with pytest.raises(piccolo.InputError, match=text):
-        scan.localize("a.jpg", **options)
-    with pytest.raises(piccolo.InputError, match=text):
-        scan.localize_many([], **options)
-    with pytest.raises(piccolo.InputError, match=text):
-        scan.track(**options)
-
-
-def test_an_option_that_a_method_does_not_have_is_refused(scan):
-    wrong = (
-        (scan.localize, ("a.jpg",), "near"),
-        (scan.localize_many, ([],), "near"),
-        (scan.track, (), "refine_focal"),
-        (scan.localize_walk, ([],), "refine_focal"),
-        (scan.occlusion_mask, ("a.jpg", None), "gravity"),
-    )
-    for method, arguments, name in wrong:
-        text = rf"{method.__qualname__}\(\) got an unexpected keyword argument '{name}'"
-        with pytest.raises(TypeError, match=text):
-            method(*arguments, **{name: True})
-    with pytest.raises(piccolo.InputError, match=r"`mask`: found .*, wanted a path"):
-        scan.track(mask=np.zeros((4, 8), bool))
+def test_each_option_is_described_where_it_is_given(kind):
+    section = kind.__doc__.split("Parameters")[1].split("Raises")[0]
+    for name in inspect.signature(kind).parameters:
+        assert re.search(rf"^ {{4}}(\w+, )?{name}\b", section, re.MULTILINE), name
+    assert not [name for name in dir(piccolo.Scan) if name in ("prepared", "workers", "settings", "walk")]
 
 
 @pytest.mark.parametrize(
     ("options", "text"),
     [
+        ({"source": 3}, "`source`: found 3, wanted a path"),
+        ({"source": [], "colors": None}, "`source`: found no file"),
+        ({"units": "inch"}, "`units`: found 'inch', wanted one of mm, cm, m"),
+        ({"up": "w"}, "`up`: found 'w', wanted one of auto, z"),
         ({"units": ["m"]}, r"`units`: found \['m'\], wanted one of mm"),
         ({"settings": "paper"}, "`settings`: found 'paper', wanted CoarseToFineSettings or PaperSettings"),
         ({"crs": 12}, "`crs`: found 12, wanted a text"),
@@ -145,10 +153,12 @@ def test_an_option_that_a_method_does_not_have_is_refused(scan):
     ],
 )
 def test_an_option_of_a_scan_of_another_type_is_refused(options, text):
+    known = inspect.signature(piccolo.Cloud).parameters
+    arrays = {"source": np.zeros((2, 3)), "colors": np.zeros((2, 3))}
+    of_cloud = arrays | {name: value for name, value in options.items() if name in known}
+    others = {name: value for name, value in options.items() if name not in known}
     with pytest.raises(piccolo.InputError, match=text):
-        piccolo.open_scan(np.zeros((2, 3)), **{"colors": np.zeros((2, 3))} | options)
-    with pytest.raises(piccolo.InputError, match="`source`: found 3, wanted"):
-        piccolo.open_scan(3)
+        piccolo.open_scan(piccolo.Cloud(**of_cloud), **others)
 
 
 def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
@@ -161,21 +171,44 @@ def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
     assert np.array_equal(again.covariance.matrix, result.covariance.matrix)
     partial_map = dataclasses.replace(scan._opened.prepared, is_partial=True)
     partial = piccolo.Scan(dataclasses.replace(scan._opened, prepared=partial_map))
-    with pytest.raises(piccolo.InputError, match="prepared within `near_world` only"):
+    with pytest.raises(piccolo.InputError, match="prepared within `near` only"):
         partial.save(tmp_path / "part.map")
     cloud = rooms.room(1)[1]
-    paper = piccolo.open_scan(cloud.points, cloud.colors, settings=PaperSettings())
+    paper = piccolo.open_scan(piccolo.Cloud(cloud.points, colors=cloud.colors), settings=PaperSettings())
     with pytest.raises(piccolo.InputError, match="found a scan of the preset paper"):
         paper.save(tmp_path / "paper.map")
     assert [path.name for path in tmp_path.iterdir()] == ["room.map"]
 
 
-def test_a_photos_prior_is_added_to_that_of_the_scan(tmp_path, scan):
-    settings = CoarseToFineSettings(prior=Prior(height=(1.0, 2.0)))
+def test_each_of_many_photos_has_its_own_options_and_prior(tmp_path, scan):
+    settings = CoarseToFineSettings(prior=Prior(height=(1.0, 2.0)), gravity="known")
     opened = piccolo.Scan(dataclasses.replace(scan._opened, settings=settings))
-    (result,) = opened.localize_many([tmp_path / "none.jpg"], gravity_vector=np.array([0.0, 0.0, -1.0]))
-    prior = Prior(height=(1.0, 2.0), gravity_vector=(0.0, 0.0, -1.0))
-    assert result.settings["prior"] == dataclasses.asdict(prior)
+    own = Prior(near=(1.0, 2.0, None), radius=3.0)
+    photos = [
+        piccolo.Photo(tmp_path / "a.jpg", gravity_vector=np.array([0.0, 0.0, -1.0])),
+        piccolo.Photo(tmp_path / "b.jpg", focal_px=300),
+    ]
+    first, second = opened.localize_many(photos, prior=[None, own])
+    assert first.settings["prior"] == dataclasses.asdict(Prior(height=(1.0, 2.0)))
+    assert first.settings["panorama"]["gravity_vector"] == (0.0, 0.0, -1.0)
+    assert second.settings["prior"] == dataclasses.asdict(own)
+    assert second.settings["panorama"]["focal_px"] == 300
+    assert {r.settings["gravity"] for r in (first, second)} == {"known"}
+    with pytest.raises(InputError, match="`prior`: found 1 of 2 photos, wanted one of each photo"):
+        opened.localize_many(photos, prior=[own])
+
+
+@pytest.mark.parametrize("option", [{"refine_focal": True}, {"gravity_vector": (0.0, 0.0, -1.0)}])
+def test_the_paper_refuses_what_it_would_ignore(option):
+    cloud = rooms.room(1)[1]
+    colored = piccolo.Cloud(cloud.points, colors=cloud.colors)
+    paper = piccolo.open_scan(colored, settings=PaperSettings(num_translations=1))
+    with pytest.raises(InputError, match=f"`{next(iter(option))}`: not an option of the preset paper"):
+        paper.localize(piccolo.Photo(rooms.query(1).rgb, **option))
+    with pytest.raises(InputError, match="`prior`: not an option of the preset paper"):
+        paper.localize(rooms.query(1).rgb, prior=Prior())
+    with pytest.raises(InputError, match="walks: not available with the preset paper"):
+        paper.track()
 
 
 def test_a_photo_that_cannot_be_read_is_a_result_among_many(tmp_path, scan):

@@ -20,10 +20,10 @@ from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.prior import Prior
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.named_scans import add_places, find_scan_at, name_scan
-from piccolo.scan_map.prior import Prior
 from piccolo.scan_map.scan_addition import add_scan
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide

@@ -6,6 +6,7 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from pictures import encoded, with_metadata, xmp_packet
 
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
@@ -15,11 +16,12 @@ from piccolo.localization import attempts, search
 from piccolo.localization.photo import make_images
 from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
-from piccolo.panorama import Panorama
+from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
-from piccolo.scan_map.prior import Prior
+from piccolo.photo import Photo
+from piccolo.prior import Prior
 from research.synthetic.photos import mask_outside_field
 
 AREA = make_grid(24).solid_angle
@@ -75,14 +77,14 @@ def test_wide_samples_are_averages_by_area():
         np.testing.assert_array_equal(is_valid, np.rint(validity @ matrix / areas))
 
 
-@pytest.mark.parametrize(("gravity", "most"), [("known", 10), ("unknown", 100)])
-def test_best_score_is_near_the_true_pose(gravity, most):
+@pytest.mark.parametrize(("tilts", "most"), [("known", 10), ("any", 100)])
+def test_best_score_is_near_the_true_pose(tilts, most):
     true_pose, scan_map = rooms.scene(1)[2], rooms.scan_map(1)
-    rotations = uniform_yaws(48) if gravity == "known" else uniform_rotations(2000)
+    rotations = uniform_yaws(48) if tilts == "known" else uniform_rotations(2000)
     samples, validity = search.turn_panorama(_query().photo.images.search(), rotations)
     sparse, rotation, values = search.best_poses_wide(scan_map, samples, validity, 200, Workers(2))
     assert (np.diff(values) <= 0).all()
-    starts = search.search_poses(_query(), gravity)
+    starts = search.search_poses(_query(), tilts)
     centers = scan_map.centers[scan_map.sparse[sparse]]
     for found in ((centers, rotations[rotation]), (starts.center_map, starts.R_cam_from_map)):
         near = [
@@ -136,10 +138,13 @@ def test_tilt_in_the_metadata_is_that_of_every_start():
     assert len(np.unique(np.round(forward, 6), axis=0)) > 6
 
 
-def test_the_users_gravity_goes_before_the_tilt_in_the_metadata():
-    panorama = dataclasses.replace(rooms.scene(1)[1], gpano=GPano(pitch_deg=20.0))
-    settings = CoarseToFineSettings(prior=Prior(gravity_vector=(-9.0, 0.0, -9.0)))
-    photo = prepare_query(panorama, rooms.scan_map(1), settings, Workers(2)).photo
+def test_the_users_gravity_goes_before_the_tilt_in_the_metadata(tmp_path):
+    path = tmp_path / "a.jpg"
+    content = encoded(rooms.query(1).rgb, ".jpg")
+    path.write_bytes(with_metadata(content, xmp=xmp_packet({"PosePitchDegrees": 20})))
+    assert read_panorama(path).gpano == GPano(pitch_deg=20.0)
+    panorama = read_panorama(Photo(path, gravity_vector=(-9.0, 0.0, -9.0)))
+    photo = prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(), Workers(2)).photo
     assert photo.has_tilt
     np.testing.assert_allclose(photo.R_cam_from_level @ [0.0, 0.0, -1.0], [-(0.5**0.5), 0.0, -(0.5**0.5)])
 
@@ -175,7 +180,7 @@ def test_about_level_only_headings_that_the_prior_allows_are_searched():
 def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
     """With all yaws at that tilt, not about level."""
     is_left = np.arange(1024) < 300
-    for gpano, gravity in (
+    for gpano, tilts in (
         (GPano(pitch_deg=0.0), "known"),
         (None, "level"),
         (GPano(pitch_deg=12.0), "known"),
@@ -184,10 +189,10 @@ def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
         assert narrow.photo.is_partial
         assert narrow.photo.has_tilt == (gpano is not None)
         searched = [
-            run.keywords["gravity"] for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")
+            run.keywords["tilts"] for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")
         ]
-        assert searched == [gravity, "unknown"]
-        rotations = search.list_rotations(narrow, gravity)
+        assert searched == [tilts, "any"]
+        rotations = search.list_rotations(narrow, tilts)
         if gpano is not None:
             assert len(rotations) == narrow.settings.num_yaws
             np.testing.assert_allclose(np.degrees(np.arcsin(rotations[:, 0, 2])), gpano.pitch_deg, atol=1e-6)
@@ -216,12 +221,12 @@ def test_starts_of_a_narrow_photo_are_the_distinct_best_of_wide_views():
     assert starts.candidate[0] == narrow.scan_map.sparse[best[0]]
 
 
-@pytest.mark.parametrize("gravity", ["known", "unknown"])
-def test_heading_is_the_worlds_where_the_map_was_levelled(gravity):
+@pytest.mark.parametrize("tilts", ["known", "any"])
+def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
     query = _query()
     tilted = dataclasses.replace(query.scan_map, R_map_from_world=exp_so3(np.array([0.4, 0.3, 1.0])))
     settings = dataclasses.replace(query.settings, prior=Prior(heading_deg=70.0, heading_tolerance_deg=20.0))
-    starts = search.search_poses(dataclasses.replace(query, scan_map=tilted, settings=settings), gravity)
+    starts = search.search_poses(dataclasses.replace(query, scan_map=tilted, settings=settings), tilts)
     forward = (starts.R_cam_from_map @ tilted.R_map_from_world)[:, 0]
     off = np.degrees(np.arctan2(forward[:, 0], forward[:, 1])) - 70.0
     assert len(off) > 0
@@ -235,13 +240,13 @@ def test_number_of_starts(fewest, most, expected):
     method = query.method._replace(min_starts=fewest)
     settings = dataclasses.replace(query.settings, max_starts=most)
     few = dataclasses.replace(query, method=method, settings=settings)
-    for gravity in ("known", "unknown"):
-        starts = search.search_poses(few, gravity)
+    for tilts in ("known", "any"):
+        starts = search.search_poses(few, tilts)
         num_searched = len(query.scan_map.sparse)
         assert len(starts.candidate) == (expected or num_searched // 2)
         np.testing.assert_array_equal(starts.center_map, query.scan_map.centers[starts.candidate])
         pairs = itertools.combinations(starts.poses(), 2)
         apart = np.array([rooms.errors(*pair) for pair in pairs])
         assert 0.5 <= apart[apart[:, 1] < 20.0, 0].min(initial=0.9) < 1.0
-        if gravity == "known":  # turned by twelfths of a turn
+        if tilts == "known":  # turned by twelfths of a turn
             assert 20.0 <= apart[apart[:, 0] < 0.5, 1].min() < 40.0

@@ -303,9 +303,10 @@ def test_arrays_without_colours_are_a_scan(tmp_path):
 
 def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
     with pytest.raises(InputError, match="`ignore_colors`"):
-        piccolo.open_scan(tmp_path / "a.ply", ignore_colors=True, labels=True)
+        piccolo.Cloud(tmp_path / "a.ply", ignore_colors=True, labels=True)
+    bare = piccolo.Cloud(rooms.room(1)[1].points, ignore_colors=True)
     with pytest.raises(InputError, match="found no colours to be used, wanted some for the preset paper"):
-        piccolo.open_scan(rooms.room(1)[1].points, ignore_colors=True, settings=piccolo.PaperSettings())
+        piccolo.open_scan(bare, settings=piccolo.PaperSettings())
 
 
 def test_the_command_localizes_in_a_scan_without_colours(tmp_path, capsys):

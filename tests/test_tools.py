@@ -20,6 +20,8 @@ from research.evaluation.query_result import QueryResult
 from research.measuring import benchmark, confidence, page, scaling, trials
 from research.synthetic import photos
 
+TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
+
 
 @pytest.fixture(scope="module")
 def scene(tmp_path_factory):
@@ -46,45 +48,47 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     commit = run(["git", "-C", str(ROOT), "describe", "--always", "--abbrev=12"]).stdout.strip()
     assert f"Measured on {datetime.datetime.now(datetime.UTC).date()} at commit {commit or 'unknown'}" in text
     assert f"NumPy {np.__version__}, Numba {numba.__version__}, OpenCV {cv2.__version__};\n" in text
-    row = table_of(text, page.PANORAMAS)[f"{scene.name}, clean"]
+    row = table_of(text, TITLES["panoramas"])[f"{scene.name}, clean"]
     assert row["queries"] == row["right"] == row["localized"] == "1"
     assert row["wrong of these"] == "0"
     assert 0.0 < float(row["mm"]) < 20.0
     assert 0.0 < float(row["deg"]) < 0.5
-    damaged = table_of(text, page.DAMAGE)
+    damaged = table_of(text, TITLES["damage"])
     assert {row["queries"] for row in damaged.values()} == {"1"}
     assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
     for name in ("mirrored", "another place"):
         assert [damaged[name][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
     assert set(trials.DAMAGED_SCANS) < set(damaged)
-    photos = table_of(text, page.PHOTOS)
+    photos = table_of(text, TITLES["photos"])
     assert [row["queries"] for row in photos.values()] == ["1", "1"]
-    paper = table_of(text, page.PAPER)
+    paper = table_of(text, TITLES["paper"])
     ratio = float(paper["preset paper"]["s"]) / float(paper["default method"]["s"])
     stated = float(re.search(r"The preset takes (\d+\.\d) times as long", text)[1])
     assert stated == pytest.approx(ratio, abs=0.1)
     confidences = table_of(text, "Confidences")
     assert sum(int(row["answers"]) for row in confidences.values()) == 1 + len(damaged) + 2
     assert f"0 of {1 + len(damaged) + 2} were localized and are not right." in text
-    sizes = table_of(text, page.SIZE)
+    sizes = table_of(text, TITLES["size"])
     assert [row["points"] for row in sizes.values()] == ["20,000"]
     assert re.fullmatch("[01]/1", sizes[f"{scene.name}, resampled"]["right"])
-    speeds = table_of(text, page.KERNELS)
+    speeds = table_of(text, TITLES["kernels"])
     assert speeds["cv2.remap, 1 thread"]["of cv2.remap"] == "1.00"
     assert float(speeds["loss, 2 threads"]["of its one thread"]) > 0.0
 
 
 def test_sizes_are_those_asked_for(scene):
-    cloud, queries = scaling.scene_case(read_scene(scene), 50_000)  # more than it has
-    assert (len(cloud.points), len(queries)) == (50_000, 1)
-    cloud, queries = scaling.rooms_case(1)
-    assert (len(cloud.points), len(queries)) == (50_000, scaling.NUM_QUERIES)
+    points, _, queries = scaling.scene_case(read_scene(scene), 50_000)  # more than it has
+    assert (len(points), len(queries)) == (50_000, 1)
+    points, _, queries = scaling.rooms_case(1)
+    assert (len(points), len(queries)) == (50_000, scaling.NUM_QUERIES)
 
 
 def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
     assert benchmark.main(["all", "--scenes", str(scene), "--only", "kernels"]) == 0
     text = capsys.readouterr().out
-    assert [line for line in text.splitlines() if line.startswith("## ")] == [f"## {page.KERNELS}"]
+    assert [line for line in text.splitlines() if line.startswith("## ")] == [
+        "## Kernels against `cv2.remap`"
+    ]
     assert "40,000 points, 512 x 256 image" in text
     assert benchmark.main(["all", "--scenes", str(scene / "no")]) == 3
     write_queries(tmp_path, [])
@@ -107,10 +111,10 @@ def test_photos_of_a_scene_come_with_their_calibrations(tmp_path, capsys):
     assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 0
     text = capsys.readouterr().out
     assert [line for line in text.splitlines() if line.startswith("## ")] == [
-        f"## {page.PHOTOS}",
+        "## Phone photos",
         "## Confidences",
     ]
-    assert table_of(text, page.PHOTOS)[f"{tmp_path.name}, own photos"]["right"] == "1"
+    assert table_of(text, TITLES["photos"])[f"{tmp_path.name}, own photos"]["right"] == "1"
 
 
 def test_wrong_answers_are_listed():

@@ -11,7 +11,7 @@ import rooms
 
 import piccolo
 from piccolo.cli import localize as localize_command
-from piccolo.cli import walking as walk_command
+from piccolo.cli.together import steps_file
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
@@ -20,6 +20,7 @@ from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import picture
+from piccolo.photo import Photo
 from piccolo.result import read_results
 from piccolo.scan_walk import Walk
 from piccolo.walk import tracker as tracker_module
@@ -100,7 +101,7 @@ def test_a_walk_keeps_within_a_prior(scan, building):
     x, y, z = np.mean([q.pose.center_world for q in queries], axis=0)
     frames = [q.image for q in queries]
     frames[3] = np.zeros((rooms.WIDTH // 2, rooms.WIDTH, 3), np.uint8) + 99  # lost: looked for near and far
-    results = scan.localize_walk(frames, gravity="known", near_world=(x, y, z), radius=2.0)
+    results = scan.localize_walk(frames, gravity="known", prior=piccolo.Prior(near=(x, y, z), radius=2.0))
     good = [k for k in range(len(queries)) if k != 3]
     _assert_right([results[k] for k in good], [queries[k] for k in good])
     assert results[3].status != "localized"
@@ -150,7 +151,7 @@ def _short_at(path):
 
 def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
     _, queries = building
-    tracker = scan.track(max_speed=0.5, gravity="known")
+    tracker = scan.track(motion=piccolo.Motion(max_speed=0.5), gravity="known")
     live = [tracker.add(q.image) for q in queries]
     _assert_right(live, queries)
     assert [result.walk.time for result in live] == [float(k) for k in range(len(queries))]
@@ -172,7 +173,7 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building)
 def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, building, tmp_path):
     """The first frame can't be read; the second is searched, and as it is lost, again 2.3 m and 6.3 m on."""
     _, queries = building
-    walk = scan.track(max_speed=1.0, gravity="known")
+    walk = scan.track(motion=piccolo.Motion(max_speed=1.0), gravity="known")
     walk.add(tmp_path / "missing.jpg", 0.0)
     noise = np.random.default_rng(1).integers(0, 255, (256, 512, 3), dtype=np.uint8)
     searched = [walk.add(noise, time).walk.alone is not None for time in range(1, 10)]
@@ -183,7 +184,7 @@ def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, bu
 def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, building, monkeypatch):
     _, queries = building
     monkeypatch.setattr(tracker_module, "BETWEEN_KEYS", 0.4)  # [m] the camera goes 0.23 at a time
-    walk = scan.track(max_speed=0.6, gravity="known")
+    walk = scan.track(motion=piccolo.Motion(max_speed=0.6), gravity="known")
     live = [walk.add(q.image, q.time) for q in queries]
     _assert_right(live, queries)
     assert [frame.is_key for frame in walk.tracker.frames] == [k % 2 == 0 for k in range(NUM_FRAMES)]
@@ -275,7 +276,7 @@ def test_a_video_of_an_unknown_camera_is_refused_once(building, tmp_path, capsys
     assert err.count("found a picture of 320 x 180") == err.count("\n") == 1
     assert "the other 11 frames seem no better" in err
     assert not out.exists()
-    assert not walk_command.frames_file(out).exists()
+    assert not steps_file(out).exists()
     frames = [tmp_path / f"{k}.png" for k in range(5)]
     for frame in frames[:-1]:
         cv2.imwrite(str(frame), np.zeros((24, 32, 3), np.uint8))
@@ -314,7 +315,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     whole, stopped = tmp_path / "whole.jsonl", tmp_path / "stopped.jsonl"
     assert _command(folder, *walk, str(whole)) == 0
     _assert_right(read_results([whole]), queries)
-    assert not walk_command.frames_file(whole).exists()
+    assert not steps_file(whole).exists()
 
     def killed(self, show):
         raise MemoryError
@@ -322,10 +323,11 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     with monkeypatch.context() as patched:
         patched.setattr(Walk, "finish", killed)
         assert _command(folder, *walk, str(stopped)) != 0
-    kept = walk_command.frames_file(stopped)
+    kept = steps_file(stopped)
     lines = kept.read_bytes().splitlines(keepends=True)
     assert len(lines) == 1 + len(queries)
-    kept.write_bytes(lines[0] + b'{"blank": 3}\n')
+    step = json.loads(lines[1])[0]
+    kept.write_bytes(lines[0] + json.dumps([step, '{"blank": 3}']).encode() + b"\n")
     assert _command(folder, *walk, str(stopped)) == 3
     assert f"{kept}: found a damaged line (ValidationError)" in capsys.readouterr().err
     kept.write_bytes(b"".join(lines[:-2]) + lines[-2][:30])
@@ -349,11 +351,9 @@ def test_frames_come_back_from_their_lines(scan, building):
     for k, query in enumerate(building[1][:3]):
         path = query.image if k != 1 else building[0] / "cloud.ply"  # no picture
         walk.add(path, query.time, "name", query.pose)
-        line = walk.last_to_json()
-        assert not again.restore(line.encode(), path, query.time, "another")
-        assert not again.restore(line.encode(), building[1][4].image, query.time, "name")
-        assert again.restore(line.encode(), path, query.time, "name")
-        assert again.last_to_json() == line
+        text = walk.last_to_json()
+        again.restore(text, Photo(path))
+        assert again.last_to_json() == text
     assert again.blanks[1].error == walk.blanks[1].error is not None
 
 
@@ -365,12 +365,13 @@ def test_a_narrow_walk_goes_on_with_the_same_bits(building, tmp_path):
     ends, lines = [], []
     for num_threads, num_kept in ((2, 0), (1, 2)):
         scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=num_threads)
-        walk = scan.track(gravity="known", mask=tmp_path / "mask.png")
+        walk = scan.track(gravity="known")
         for k, query in enumerate(queries[:5]):
+            photo = Photo(query.image, mask=tmp_path / "mask.png")
             if k < num_kept:
-                assert walk.restore(lines[k].encode(), query.image, query.time, query.image.name)
+                walk.restore(lines[k], photo)
             else:
-                walk.add(query.image, query.time, query.image.name)
+                walk.add(photo, query.time, query.image.name)
             lines.append(walk.last_to_json())
         ends.append([{**json.loads(result.to_json()), "seconds": None} for result in walk.finish()])
     assert ends[0] == ends[1]
@@ -420,7 +421,7 @@ REFUSED = {
         "--every: found nan, wanted at least 0.01",
     ),
     "step of a walk": (["--walk", "--pano", "a.jpg", "--every", "1"], 2, "--every: only with --video"),
-    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not options of the preset paper"),
+    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not an option of the preset paper"),
     "odometry alone": (["--pano", "a.jpg", "--odometry", "a.tum"], 2, "--odometry: only with --walk"),
     "no odometry": (
         ["--walk", "--pano", "a.jpg", "--times", "order", "--odometry", "missing.tum"],

@@ -15,6 +15,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian
 from piccolo.optimize.smoothing import smooth_positions
+from piccolo.photo import Photo
 from piccolo.walk.frames import Frame
 from piccolo.walk.results import check_odometry
 
@@ -189,12 +190,12 @@ def test_a_frame_that_is_gone_or_another_is_not_read_again(tmp_path):
 
 def test_the_result_of_a_narrow_frame_has_its_camera_and_name(tmp_path):
     folder = write_room(tmp_path, "--seed 3 --points 40000 --panoramas 1 --width 512 --variants clean")
-    photo = tmp_path / "photo.png"
-    cv2.imwrite(str(photo), np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8))
+    photo = Photo(tmp_path / "photo.png", focal_px=140.0)
+    cv2.imwrite(photo.name, np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8))
     scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=2)
-    walk, again = (scan.track(gravity="known", focal_px=140.0) for _ in range(2))
+    walk, again = (scan.track(gravity="known") for _ in range(2))
     walk.add(photo, 0.0, "a name")
-    assert again.restore(walk.last_to_json().encode(), photo, 0.0, "a name")
+    again.restore(walk.last_to_json(), photo)
     for result in (*walk.finish(), *again.finish()):
         assert result.pano == "a name"
         assert result.cameras[0].camera.focal == (140.0, 140.0)

@@ -185,7 +185,7 @@ def test_a_jump_has_a_price_and_is_reported():
 
 
 def test_frames_without_times_may_be_anywhere_and_report_no_gap():
-    assert (Motion().speed, Motion(is_timed=False).speed, Motion(3.0, is_timed=False).speed) == (
+    assert (Motion().speed, Motion(is_timed=False).speed, Motion(max_speed=3.0, is_timed=False).speed) == (
         2.0,
         5.0,
         3.0,

@@ -11,7 +11,7 @@ from piccolo.walk.beliefs import NOTHING, Belief
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
 from piccolo.walk.path import Path
-from piccolo.walk.tracker import Found, expect
+from piccolo.walk.tracker import Followed, expect
 
 TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
 LOST = 2
@@ -48,7 +48,7 @@ def _find(walk, monkeypatch, x, how="near", is_alone=True):
 
     def find(query, expected):
         asked.append(expected)
-        return Found(State(_at(x), 5.0, 0.5), how, is_alone)
+        return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
 
     monkeypatch.setattr(second_look, "find_near", find)
     tracker, path, beliefs = walk

@@ -18,11 +18,11 @@ from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.tasks import WorkerLostError
 from ..jobs.threads import Workers
-from ..localization.beside import Picture
+from ..localization.beside import SurePhoto
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
-from ..panorama import ReadOptions, read_panorama
+from ..photo import Photo, Vector
 from ..result import Beside, Result, Source, unreadable_result
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
@@ -32,26 +32,25 @@ from .second_look import MOST_PICTURES, Look
 
 
 class Task(NamedTuple):
-    """A panorama to be localized."""
+    """A photo to be localized."""
 
-    pano: Path
+    photo: Photo
     settings: Settings
-    calibration: Calibration | None = None  # the camera of this photo
-    files: Mapping[str, bytes] | None = None  # what is at `pano`, where that is not to be seen
+    files: Mapping[str, bytes] | None = None  # what is at its path, where that is not to be seen
     look: Look | None = None  # if it is looked at again, beside others
 
     @contextmanager
-    def place(self, folder: Path) -> Iterator[Path]:
-        """Yield the panorama's path here: relative to a folder, or written from the files."""
+    def place(self, folder: Path) -> Iterator[Photo]:
+        """Yield the photo at its path here: relative to a folder, or written from the files."""
         if self.files is None:
-            yield folder / self.pano
+            yield replace(self.photo, picture=folder / self.photo.path)
             return
         with TemporaryDirectory(prefix="piccolo-") as temporary:
             for name, content in self.files.items():
                 path = Path(temporary) / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content)
-            yield Path(temporary) / self.pano.name
+            yield replace(self.photo, picture=Path(temporary) / self.photo.path.name)
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
@@ -78,7 +77,7 @@ class Localizer:
     paths: tuple[Path, ...]  # of the scan
     settings: Settings  # for which the scan is prepared
     cloud_settings: CloudSettings
-    read_options: ReadOptions
+    photo: Photo  # the options of all photos; its picture is none
     cache: CachePolicy
     priors: PriorTable | None = None
     num_threads: int = 1
@@ -94,27 +93,39 @@ class Localizer:
         """The scan's path as given, or the paths of its files."""
         return str(self.paths[0]) if len(self.paths) == 1 else tuple(map(str, self.paths))
 
+    def ask(self, pano: Path) -> tuple[Photo, Settings]:
+        """Return a photo and its settings, with its own row of the table of priors if it has one."""
+        photo = replace(self.photo, picture=pano)
+        settings = self.settings
+        if self.priors is None or not isinstance(settings, CoarseToFineSettings):
+            return photo, settings
+        photo, prior = self.priors.apply(photo, settings.prior)
+        return photo, replace(settings, prior=prior)
+
     def task(self, pano: Path, calibration: Calibration | None = None) -> Task:
-        """Return what is to be done for a panorama."""
-        files = files_of(pano) if self.sends_photos else None
-        return Task(pano, self.settings_of(pano), calibration, files)
+        """Return what is to be done for a photo; its calibration counts if no option gives one."""
+        photo, settings = self.ask(pano)
+        if calibration is not None and photo.camera is None and photo.rig is None:
+            photo = photo.with_calibration(calibration)
+        return Task(photo, settings, files_of(pano) if self.sends_photos else None)
 
-    def settings_of(self, pano: Path) -> Settings:
-        """Return the settings of one panorama: its own prior, if it has one."""
-        if self.priors is None or not isinstance(self.settings, CoarseToFineSettings):
-            return self.settings
-        return replace(self.settings, prior=self.priors.prior_of(pano, self.settings.prior))
-
-    def expect(self, cloud_sha256: str) -> Callable[[Path], Mapping[str, Any]]:
-        """Return the fields of a panorama's line that say how it was made, the most telling first."""
+    def expect(
+        self, cloud_sha256: str, more: Mapping[str, Any] | None = None
+    ) -> Callable[[Path], Mapping[str, Any]]:
+        """Return the fields of a photo's line that say how it was made, with `more` settings."""
 
         @lru_cache
-        def make_fields(settings: Settings) -> Mapping[str, Any]:
+        def make_fields(settings: Settings, gravity_vector: Vector | None) -> Mapping[str, Any]:
             scan = {"cloud_sha256": cloud_sha256, "cloud": self.name}
-            repeated = settings_json(settings, self.cloud_settings, self.read_options)
+            photo = replace(self.photo, gravity_vector=gravity_vector)
+            repeated = settings_json(settings, self.cloud_settings, photo) | dict(more or {})
             return dict(json.loads(json.dumps({**scan, "settings": repeated, "version": __version__})))
 
-        return lambda pano: make_fields(self.settings_of(pano))
+        def expect(pano: Path) -> Mapping[str, Any]:
+            photo, settings = self.ask(pano)
+            return make_fields(settings, photo.gravity_vector)
+
+        return expect
 
     def open(self) -> Callable[[Task], Answer]:
         """Open the scan in this process; return what answers tasks."""
@@ -142,81 +153,75 @@ class Localizer:
         return replace(scan, name=self.name)
 
     def answer(self, scan: OpenedScan, task: Task) -> Answer:
-        """Localize one panorama, and make the pictures asked for; of one that can't be read say why."""
-
-        def localize(path: Path) -> Result:
-            return scan.localize_query(path, self.read_options, task.settings, None, task.calibration)
-
-        return self._answer(scan, task, localize)
+        """Localize one photo, and make the pictures asked for; of one that can't be read say why."""
+        return self._answer(scan, task, lambda photo: scan.localize(photo, task.settings))
 
     def answer_again(
-        self, scan: OpenedScan, task: Task, look: Look, locate: Callable[[str], Picture | None]
+        self, scan: OpenedScan, task: Task, look: Look, locate: Callable[[str], SurePhoto | None]
     ) -> Answer:
         """Look at a photo again, beside others; `locate` returns one of these by its result's JSON."""
 
-        def list_pictures() -> dict[str, Picture]:
+        def list_pictures() -> dict[str, SurePhoto]:
             found = ((json.loads(line)["pano"], locate(line)) for line in look.beside)
             return {name: picture for name, picture in found if picture}
 
-        def localize(path: Path) -> Result:
-            read = self.read_options
+        def localize(photo: Photo) -> Result:
             if look.first:
                 first = Result.from_json(look.first)
             else:
-                first = scan.localize_query(path, read, task.settings, None, task.calibration, look.focal)
+                first = scan.localize(photo, task.settings, look.focal)
             if not look.beside:
                 return replace(first, beside=None)
-            found, names = scan.localize_again(path, first, list_pictures, read, task.settings)
+            found, names = scan.localize_again(photo, first, list_pictures, task.settings)
             return replace(found, beside=Beside(names, look.asked_sha256))
 
         return self._answer(scan, task, localize)
 
-    def locate(self, scan: OpenedScan, line: str) -> Picture | None:
+    def locate(self, scan: OpenedScan, line: str) -> SurePhoto | None:
         """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
         result = Result.from_json(line)
-        pano = Path(result.pano)
+        photo, settings = self.ask(Path(result.pano))
         try:
-            return scan.locate(self.folder / pano, result, self.read_options, self.settings_of(pano))
+            return scan.locate(replace(photo, picture=self.folder / photo.path), result, settings)
         except (OSError, InputError) as error:
             if is_passing(error):
                 raise
         return None
 
-    def _answer(self, scan: OpenedScan, task: Task, localize: Callable[[Path], Result]) -> Answer:
-        """Return the answer by a function of the photo's path."""
-        with task.place(self.folder) as path, reading_once():
+    def _answer(self, scan: OpenedScan, task: Task, localize: Callable[[Photo], Result]) -> Answer:
+        """Return the answer by a function of the photo."""
+        name = task.photo.name
+        with task.place(self.folder) as photo, reading_once():
             try:
-                found = localize(path)
-                overlay, mask = self._pictures(scan, path, found)
+                found = localize(photo)
+                overlay, mask = self._pictures(scan, photo, found)
             except Exception as error:
-                name = str(task.pano)
-                return Answer(make_failed_result(scan, path, error, self.read_options, task.settings, name))
-        name = str(task.pano)
-        warnings = tuple(warning.replace(str(path), name) for warning in found.warnings)
+                return Answer(make_failed_result(scan, photo, error, task.settings, name))
+        warnings = tuple(warning.replace(photo.name, name) for warning in found.warnings)
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask)
 
     def wait_for(self, task: Task, wait: Callable[[], Answer], cloud_sha256: str | None) -> Answer:
         """Return the answer to a task, also to one whose workers were lost."""
+        name = task.photo.name
         try:
             return wait()
         except WorkerLostError as error:
-            text = f"{task.pano}: {error}"
-        settings = settings_json(task.settings, self.cloud_settings, self.read_options)
+            text = f"{name}: {error}"
+        settings = settings_json(task.settings, self.cloud_settings, task.photo)
         about = {"settings": settings, "source": Source(cloud_sha256)}
-        return Answer(unreadable_result(text, self.name, str(task.pano), is_passing=True, **about))
+        return Answer(unreadable_result(text, self.name, name, is_passing=True, **about))
 
-    def _pictures(self, scan: OpenedScan, pano: Path, result: Result) -> tuple[bytes | None, bytes | None]:
+    def _pictures(self, scan: OpenedScan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
         overlay = None
         mask = None
         pose = result.best_pose
         if pose is None:
             return overlay, mask
-        read_options = self.read_options.with_refined_camera(result.cameras, pano)
+        photo = photo.with_refined_camera(result.cameras)
         if self.makes_overlays:
-            panorama = read_panorama(pano, read_options)
-            overlay = overlay_png(scan.points, panorama, scan.from_world(pose), scan.workers)
+            overlay = overlay_png(scan.points, scan.read(photo), scan.from_world(pose), scan.workers)
         if self.makes_occlusion_masks:
-            mask = encode_image(scan.occlusion_mask(pano, pose, read_options), ".png")
+            mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask

@@ -5,12 +5,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from ..errors import InputError
 from ..files.json_file import read_text
+from ..photo import Photo, Vector
+from ..prior import Prior
 from ..scan_map.named_scans import check_within
-from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
 
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
@@ -23,25 +24,35 @@ DEFAULT_RADIUS = 5.0  # [m]
 HEIGHT_TOLERANCE = 0.3  # [m] either side of a height
 
 
+class Row(NamedTuple):
+    """A row of the table."""
+
+    prior: Prior
+    gravity_vector: Vector | None  # in place of that of all photos
+
+
 @dataclass(frozen=True)
 class PriorTable:
-    """A prior for each panorama named, in place of the one that all have."""
+    """Prior knowledge of single photos, by name; it goes before that of all."""
 
     path: Path
-    by_name: Mapping[str, Prior]
+    by_name: Mapping[str, Row]
     used: set[str] = field(default_factory=set)
 
-    def prior_of(self, pano: Path, general: Prior) -> Prior:
-        """Return the prior of a panorama, found by its path as given, or else by its file name."""
-        name = str(pano) if str(pano) in self.by_name else pano.name
+    def apply(self, photo: Photo, general: Prior) -> tuple[Photo, Prior]:
+        """Return a photo and its prior, by the row of its path as given, or else of its file name."""
+        name = photo.name if photo.name in self.by_name else photo.path.name
         self.used.add(name)
-        return self.by_name.get(name, general)
+        row = self.by_name.get(name)
+        if row is None:
+            return photo, general
+        return replace(photo, gravity_vector=row.gravity_vector or photo.gravity_vector), row.prior
 
     def check_scans(self, scan_map: ScanMap) -> None:
         """Refuse names that no scan of a map has."""
-        for name, prior in self.by_name.items():
+        for name, row in self.by_name.items():
             try:
-                check_within(scan_map, prior.within)
+                check_within(scan_map, row.prior.within)
             except InputError as error:
                 text = str(error).replace("`within`", f"{self.path}: within, of {name}")
                 raise InputError(text) from error
@@ -52,20 +63,22 @@ class PriorTable:
         return [name for name in self.by_name if name not in self.used]
 
 
-def _prior_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior) -> Prior:
-    """Return the prior of a row's numbers and names; `general` fills what they leave open."""
+def _row_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior) -> Row:
+    """Return a row of numbers and names; `general` fills what they leave open."""
     changes: dict[str, Any] = {"within": within or general.within}
     if "x" in row:
-        changes["near_world"] = (row["x"], row["y"], row.get("z"))
+        changes["near"] = (row["x"], row["y"], row.get("z"))
         changes["radius"] = row.get("radius", general.radius or DEFAULT_RADIUS)
     if "height" in row:
         changes["height"] = (row["height"] - HEIGHT_TOLERANCE, row["height"] + HEIGHT_TOLERANCE)
     if "heading" in row:
         changes["heading_deg"] = row["heading"]
         changes["heading_tolerance_deg"] = row.get("tolerance", general.heading_tolerance_deg)
+    gravity_vector = None
     if "gravity_x" in row:
-        changes["gravity_vector"] = tuple(row[column] for column in GRAVITY)
-    return replace(general, **changes)
+        x, y, z = (row[column] for column in GRAVITY)
+        gravity_vector = Photo(Path(), gravity_vector=(x, y, z)).gravity_vector
+    return Row(replace(general, **changes), gravity_vector)
 
 
 def read_priors(path: Path, general: Prior) -> PriorTable:
@@ -85,7 +98,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     if "name" not in names or odd or len(set(names)) < len(names):
         found = f"found a column {odd[0]!r}" if "name" in names and odd else f"found the columns {names}"
         raise InputError(f"{path}: {found}, {WANTED}")
-    by_name: dict[str, Prior] = {}
+    by_name: dict[str, Row] = {}
     for row in rows:
         where = f"{path}, line {rows.line_num}"
         name = (row.pop("name") or "").strip()
@@ -96,7 +109,7 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
         within = (row.pop("within", None) or "").split(BETWEEN_NAMES)
         numbers = _numbers(where, row)
         try:
-            by_name[name] = _prior_from(numbers, tuple(w.strip() for w in within if w.strip()), general)
+            by_name[name] = _row_from(numbers, tuple(w.strip() for w in within if w.strip()), general)
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     return PriorTable(path, by_name)

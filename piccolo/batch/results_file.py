@@ -17,7 +17,7 @@ LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
 GROUPS = ("prior", "cloud", "panorama")  # of settings, each of which an option sets
 OPTIONS = ("preset", "gravity", "min_confidence")  # of the other settings those that are options
-RENAMED = {"scale": "units", "calibration": "camera"}
+RENAMED = {"scale": "units"}
 Name = TypeVar("Name", Path, str)
 
 

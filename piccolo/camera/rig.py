@@ -68,7 +68,7 @@ def compute_extent(mounts: Sequence[Mount]) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Calibration:
-    """The cameras of a file: all of one picture or rig, or several of which a picture's size tells one."""
+    """Cameras of a calibration file; if it lists alternatives, the picture's size selects one."""
 
     path: str
     mounts: tuple[Mount, ...]

@@ -19,7 +19,8 @@ from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
-from ..panorama import ReadOptions, read_panorama
+from ..panorama import read_panorama
+from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
 from ..scene import QUERIES_NAME, read_scene, write_queries
 from .command import command, option, print_warnings
@@ -91,9 +92,8 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     workers = Workers(num_cores(), cloud.show)
     settings = CoarseToFineSettings(gravity="unknown")
     scan_map = prepare_map(cloud, workers, rotation_to_z(axis))
-    result = OpenedScan(scan_map, cloud.label, CloudSettings(), settings, workers, {}).localize_query(
-        photo, ReadOptions(), settings
-    )
+    scan = OpenedScan(scan_map, cloud.label, CloudSettings(), settings, workers, {})
+    result = scan.localize(Photo(photo), settings)
     up = result.pose.R_cam_from_world[2] if result.pose and result.status == LOCALIZED else None
     return up, f"{photo} is {result.status}"
 

@@ -1,21 +1,18 @@
 """localize.py --relative: photos with known poses relative to each other, localized as one camera."""
 
 import argparse
-from collections import Counter
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import find_scale, read_relative_poses
-from ..batch.results_file import WAYS, write_results
-from ..files.atomic import is_stream
-from ..jobs.stopwatch import Stopwatch
-from ..localization.settings import CoarseToFineSettings
+from ..files.journal import Journal
 from ..opened_scan import OpenedScan
+from ..panorama.photo import sha256_of
 from ..result import Result
 from .command import check_alone
-from .errors import UsageError, print_note
-from .executing import choose_exit_code
+from .together import Job, Report
 
 NOT_WITH = ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal")
 
@@ -26,36 +23,27 @@ def check_bundle_options(arguments: argparse.Namespace) -> None:
         check_alone(arguments, "--relative", NOT_WITH)
 
 
-def check_new_results(arguments: argparse.Namespace) -> None:
-    """Refuse a file of --out that has results, without --overwrite: all are written at once."""
-    out = arguments.out
-    if out and not is_stream(out) and out.exists() and out.stat().st_size and not arguments.overwrite:
-        raise UsageError(f"--out: {out} has results already; {WAYS}")
-
-
-def run_bundle(
+def make_bundle_job(
     arguments: argparse.Namespace,
     photos: Sequence[Path],
     localizer: Localizer,
-    open_scan: Callable[[], OpenedScan],
+    scan: OpenedScan,
     print_result: Callable[[Result, Sequence[str]], None],
-) -> int:
-    """Localize the photos together, write their results at once, return the exit code."""
-    if not isinstance(localizer.settings, CoarseToFineSettings):
-        raise UsageError("--relative: not an option of the preset paper")
-    check_new_results(arguments)
+) -> Job:
+    """Return the job of localizing photos as one camera; a stopped one begins again."""
     poses = read_relative_poses(arguments.relative, photos)
-    watch = Stopwatch()
-    with watch.stage("all"):
-        scan = open_scan()
+    more = {"relative_sha256": sha256_of(arguments.relative, None)}
+    given = {str(path): localizer.ask(path)[0] for path in photos}
+    fields = localizer.expect(scan.prepared.scan_sha256, more)
+
+    def run(_journal: Journal) -> list[Result]:
         scale = find_scale(arguments.relative)
-        results = scan.localize_bundle(
-            photos, poses, localizer.read_options, localizer.settings, relative_scale=scale
-        )
-    write_results(arguments.out, results)
-    for result in results:
-        print_result(result, result.warnings[len(scan.warnings) :])
-    counts = Counter(result.status for result in results)
-    words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
-    print_note(arguments, f"{len(results)} photos together in {watch.seconds['all']:.0f} s: {words}")
-    return choose_exit_code(counts)
+        found = scan.localize_bundle([localizer.ask(p)[0] for p in photos], poses, localizer.settings, scale)
+        return [replace(result, settings={**result.settings, **more}) for result in found]
+
+    def report(results: Sequence[Result]) -> Report:
+        for result in results:
+            print_result(result, result.warnings[len(scan.warnings) :])
+        return Report("")
+
+    return Job("photos together", given, fields, run, report)

@@ -133,7 +133,7 @@ def at_the_workers(
     where = f"--dask {arguments.dask}: not all workers can read {scan.name}"
     if not isinstance(scan.prepared, ScanMap):
         raise InputError(f"{where}; the preset paper needs it in a shared folder")
-    if (arguments.mask or isinstance(localizer.read_options.calibration, Path)) and not is_shared:
+    if (arguments.mask or isinstance(localizer.photo.calibration, Path)) and not is_shared:
         raise InputError(f"{where}; --mask and a folder of --camera need a shared folder")
     with TemporaryDirectory(prefix="piccolo-") as folder:
         path = Path(folder) / f"{Path(folder).name}.piccolo-map"

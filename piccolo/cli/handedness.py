@@ -26,7 +26,8 @@ def is_left_handed(localizer: Localizer, photos: Sequence[str], executor: Execut
     with temporary_folder() as folder:
         paths = [folder / f"{k}.png" for k in range(NUM_TRIED)]
         for path, photo in zip(paths, photos, strict=False):
-            panorama = read_panorama(Path(photo), localizer.read_options)
+            photo_asked, _ = localizer.ask(Path(photo))
+            panorama = read_panorama(photo_asked, localizer.cloud_settings.labels)
             shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
             path.write_bytes(encode_image(shown[:, ::-1], ".png"))
         pairs = executor.values(map(localizer.task, paths))

@@ -35,8 +35,8 @@ from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from .bundle import check_bundle_options, run_bundle
-from .coloring import check_coloring_options, run_coloring
+from .bundle import check_bundle_options, make_bundle_job
+from .coloring import check_coloring_options, make_coloring_job
 from .command import command
 from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
 from .executing import (
@@ -54,11 +54,13 @@ from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, locali
 from .outputs import check_distinct, check_suffix
 from .progress import progress_bar, show_progress, warn_once
 from .start import for_terminal
-from .walking import check_walk_options, run_walk, walk_frames
+from .together import run_together
+from .walking import check_walk_options, make_walk_job, walk_frames
 
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
+JOINT = ("walk", "video", "relative", "color_scan")  # options of photos that help each other
 Write = Callable[[str], object]
 
 
@@ -121,7 +123,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     masks = arguments.occlusion_mask is not None
     overlays = arguments.overlay is not None
     localizer = replace(localizer, priors=priors, makes_overlays=overlays, makes_occlusion_masks=masks)
-    rig = localizer.read_options.rig
+    rig = localizer.photo.instant
     is_one = rig.is_instant if rig else is_cube
     left_out = Counter[str]()
     named = list_panoramas(arguments.pano, sys.stdin, left_out, is_one)
@@ -131,7 +133,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     known = list(named)
     check_files(arguments, known, len(known))
     for pano in known:
-        localizer.settings_of(pano)
+        localizer.ask(pano)
     note_unused_priors(arguments, localizer)
     return Run(arguments, localizer, known, len(known), left_out, Counter())
 
@@ -324,17 +326,24 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
     return choose_exit_code(+counts)
 
 
-def run_frames(run: Run) -> int:
-    """Localize the frames of one walk, return the exit code."""
+def run_jointly(run: Run) -> int:
+    """Localize photos that help each other, return the exit code."""
     arguments = run.arguments
     settings = run.localizer.settings
     if not isinstance(settings, CoarseToFineSettings):
-        raise UsageError("--walk, --video: not options of the preset paper")
-    with walk_frames(arguments, list(run.panoramas)) as (frames, motion):
-        if run.left_out:
-            print_note(arguments, describe_left_out(run.left_out))
-        scan = open_scan(run, run.localizer, arguments.threads or num_cores())
-        return run_walk(arguments, frames, Walk(scan, run.localizer.read_options, settings, motion))
+        option = next(name for name in JOINT if getattr(arguments, name))
+        raise UsageError(f"--{option.replace('_', '-')}: not an option of the preset paper")
+    photos = list(run.panoramas)
+    opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
+    if arguments.walk or arguments.video:
+        with walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
+            if run.left_out:
+                print_note(arguments, describe_left_out(run.left_out))
+            walk = Walk(opening(), settings, motion)
+            return run_together(arguments, make_walk_job(arguments, frames, walk))
+    make_job = make_bundle_job if arguments.relative else make_coloring_job
+    printing = partial(print_result, arguments)
+    return run_together(arguments, make_job(arguments, photos, run.localizer, opening(), printing))
 
 
 @command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")
@@ -342,15 +351,9 @@ def main(arguments: argparse.Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
     watch = Stopwatch()
     run = prepare_run(arguments)
-    if arguments.walk or arguments.video:
-        return run_frames(run)
-    if arguments.relative or arguments.color_scan:
-        localizer = run.localizer
-        opening = partial(open_scan, run, localizer, arguments.threads or num_cores())
-        run_all = run_bundle if arguments.relative else run_coloring
-        printing = partial(print_result, arguments)
-        return run_all(arguments, list(run.panoramas), localizer, opening, printing)
-    rig = run.localizer.read_options.rig
+    if any(getattr(arguments, name) for name in JOINT):
+        return run_jointly(run)
+    rig = run.localizer.photo.instant
     with open_output(run) as (output, records):
         panoramas = iter(run.panoramas)
         if run.total is not None:

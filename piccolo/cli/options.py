@@ -8,18 +8,17 @@ from typing import Any, get_args, get_type_hints
 from .. import __version__
 from ..batch.frame_times import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
-from ..camera.files import open_calibration, read_rig
 from ..cloud.crs import check_crs
 from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import Settings
-from ..panorama import ReadOptions
-from ..panorama.model import Projection
+from ..panorama import check_labels
 from ..paper.settings import PaperSettings
+from ..photo import Photo, Projection
+from ..prior import Prior
 from ..scan_map.open_map import CachePolicy
-from ..scan_map.prior import Prior
 from ..walk.motion import MAX_SPEED, MAX_STEP
 from .command import check_least, option
 
@@ -198,20 +197,19 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
     option(group, "--max-memory GB", text)
 
 
-def read_options_from(arguments: argparse.Namespace) -> ReadOptions:
-    """Return the options with which panoramas are read."""
-    if arguments.camera and arguments.rig:
-        raise InputError("--camera, --rig: wanted only one of them")
-    calibration = open_calibration(arguments.camera) if arguments.camera else None
-    return ReadOptions(
-        fov_deg=arguments.fov,
+def photo_from(arguments: argparse.Namespace) -> Photo:
+    """Return the options of all photos, with no picture."""
+    gravity_vector = vars(arguments).get("gravity_vector")  # not of commands without priors
+    return Photo(
+        Path(),
         mask=arguments.mask,
         mask_nadir_deg=arguments.mask_nadir,
-        labels=_labels_from(arguments),
-        use_gps=arguments.crs != NONE,
-        projection=arguments.projection,
+        camera=arguments.camera,
+        rig=arguments.rig,
         focal_px=arguments.focal,
-        calibration=read_rig(arguments.rig) if arguments.rig else calibration,
+        fov_deg=arguments.fov,
+        projection=arguments.projection,
+        gravity_vector=gravity_vector and tuple(gravity_vector),
         refine_focal=arguments.refine_focal,
     )
 
@@ -241,9 +239,10 @@ def cache_from(arguments: argparse.Namespace) -> CachePolicy:
 
 def localizer_from(arguments: argparse.Namespace, paths: tuple[Path, ...] = ()) -> Localizer:
     """Return what localizes photos in the scan of some files as the options ask for."""
-    settings = settings_from(arguments)
     cloud_settings = cloud_settings_from(arguments)
-    return Localizer(paths, settings, cloud_settings, read_options_from(arguments), cache_from(arguments))
+    photo = photo_from(arguments)
+    check_labels(photo, cloud_settings.labels)
+    return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
 
 
 def settings_from(arguments: argparse.Namespace) -> Settings:
@@ -267,15 +266,15 @@ def settings_from(arguments: argparse.Namespace) -> Settings:
 
 def prior_from(options: dict[str, Any]) -> Prior:
     """Return what the options say of the poses of all photos; nothing of a command without them."""
-    within = tuple(options.get("within") or ())
-    given: dict[str, Any] = {"within": within, "heading_deg": options.get("heading")}
-    if near := options.get("near"):
-        given |= {"near_world": tuple(near[:3]), "radius": near[3]}
-    if height := options.get("height"):
-        given["height"] = tuple(height)
-    if gravity_vector := options.get("gravity_vector"):
-        given["gravity_vector"] = tuple(gravity_vector)
-    return Prior(**given)
+    near = options.get("near") or []
+    return Prior(
+        near=tuple(near[:3]) or None,
+        radius=near[3] if near else None,
+        height=options.get("height"),
+        heading_deg=options.get("heading"),
+        within=options.get("within") or (),
+        use_gps=options.get("crs") != NONE,
+    )
 
 
 def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:

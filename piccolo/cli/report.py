@@ -13,7 +13,6 @@ from ..optional import import_optional
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file
-from ..report.plan_image import OwnPlan
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
 from .command import check_least, command, option, print_warnings
@@ -69,13 +68,13 @@ def settings_from(arguments: argparse.Namespace) -> ReportSettings:
             raise UsageError(f"--own-plan: found storey {number!r}, wanted a number, 1 for the lowest")
     return ReportSettings(
         title=arguments.title or "",
-        storey_names=tuple(arguments.storeys),
+        storeys=arguments.storeys,
         images=arguments.images,
-        width=None if arguments.full_size else WIDTH,
-        is_self_contained=arguments.self_contained,
-        own_plans=tuple(OwnPlan(int(k), Path(image), Path(csv)) for k, image, csv in arguments.own_plan),
+        full_size=arguments.full_size,
+        self_contained=arguments.self_contained,
+        own_plans={int(k): (image, csv) for k, image, csv in arguments.own_plan},
         crs=arguments.crs or "",
-        is_forced=arguments.force,
+        force=arguments.force,
     )
 
 

@@ -1,9 +1,9 @@
 """Align localized photos with each other on the surfaces of a scan: where they look together, they agree.
 
 Minimised is the sum over points, and over the pairs of photos that see them, of a robust loss of the
-difference of their colours, with each pose's distance from where it was found before. All poses move at once,
-as those of neighbours hang together. After Zhou and Koltun, "Color Map Optimization for 3D Reconstruction
-with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time.
+difference of their colours, with each pose's distance from where it was found before. All poses are
+optimised jointly, because overlapping photos are coupled. After Zhou and Koltun, "Color Map Optimization
+for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time.
 """
 
 from collections.abc import Sequence

@@ -11,13 +11,14 @@ from ..cloud import open_cloud
 from ..cloud.colored_writer import SUFFIXES, write_colored
 from ..cloud.octree import recolor
 from ..errors import InputError
+from ..files.journal import Journal
 from ..geometry.pose import Array, Pose
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
-from ..opened_scan import OpenedScan, read_options_of
+from ..opened_scan import OpenedScan, labels_of, photo_of
 from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink
-from ..result import Result
+from ..result import FAILED, Result
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, align
@@ -47,27 +48,44 @@ def localize_by_colors(
     by_shape: Sequence[Result],
     localize: Callable[[ScanMap, int], Result],
     workers: Workers,
+    journal: Journal,
 ) -> list[Result]:
     """Localize photos in the colours that the others give to a map, by `localize(painted_map, photo)`.
 
     A photo that is refused there does not paint in the next round. One that sees hardly any paint of others
-    gets its result of `by_shape`.
+    gets its result of `by_shape`. Results that the journal has are not computed again.
     """
     results = list(by_shape)
     leaves = list_leaves(scan_map)
-    for _ in range(NUM_ROUNDS):
+    for number in range(NUM_ROUNDS):
         painters = [k for k, result in enumerate(results) if result.pose is not None]
         if len(painters) < LEAST_PHOTOS:
             break
-        brushes = dict(zip(painters, make_aligned_brushes(scan_map, results, workers), strict=True))
-        idle = [k for k in range(len(results)) if k not in brushes]
-        for own in filter(None, [*(painters[n::MOST_FOLDS] for n in range(MOST_FOLDS)), idle]):
+        idle = [k for k in range(len(results)) if k not in painters]
+        folds = [*filter(None, [*(painters[n::MOST_FOLDS] for n in range(MOST_FOLDS)), idle])]
+        steps = {k: f"colours, round {number + 1}: {by_shape[k].pano}" for own in folds for k in own}
+        recalled = journal.recall(steps.values(), lambda _, text: Result.from_json(text))
+        known = dict(zip(steps, recalled, strict=False))
+        if len(known) < len(steps):
+            brushes = dict(zip(painters, make_aligned_brushes(scan_map, results, workers), strict=True))
+        for own in folds:
+            left = [k for k in own if k not in known]
+            if not left:
+                continue
             paint = paint_points(leaves, [brush for k, brush in brushes.items() if k not in own], workers)
-            shown = [k for k in own if k in idle or sees_paint(brushes[k], leaves, paint)]
+            shown = [k for k in left if k in idle or sees_paint(brushes[k], leaves, paint)]
             painted = color_map(scan_map, paint, workers) if shown else scan_map
-            for k in workers.show(iter(own), len(own), "photos"):
-                results[k] = localize(painted, k) if k in shown else by_shape[k]
+            for k in workers.show(iter(left), len(left), "photos"):
+                known[k] = localize(painted, k) if k in shown else by_shape[k]
+                keep_step(journal, steps[k], known[k])
+        results = [known[k] for k in range(len(results))]
     return results
+
+
+def keep_step(journal: Journal, step: str, result: Result) -> None:
+    """Keep the result of a step, unless it failed and is to be tried again."""
+    if result.status != FAILED:
+        journal.append(step, result.to_json())
 
 
 def color_map(scan_map: ScanMap, paint: Paint, workers: Workers) -> ScanMap:
@@ -136,10 +154,9 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
 def read_unmasked(result: Result) -> Panorama:
     """Read the photo of a result as it was read when it was localized, without what was masked."""
     how: Any = result.settings.get("panorama") or {}
-    mask = Path(how["mask"]) if how.get("mask") else None
     nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
-    options = replace(read_options_of(result), mask=mask, mask_nadir_deg=nadir_deg)
-    return shrink(read_panorama(Path(result.pano), options), WIDTH)
+    photo = replace(photo_of(result), mask=how.get("mask"), mask_nadir_deg=nadir_deg)
+    return shrink(read_panorama(photo, labels_of(result)), WIDTH)
 
 
 def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:

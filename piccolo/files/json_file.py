@@ -89,7 +89,8 @@ def document_of(text: str, form: str, label: str) -> Iterator[Any]:
     except InputError:
         raise
     except DAMAGE as error:
-        raise InputError(f"{label}: found {error!r}, wanted one JSON object of format {form!r}") from error
+        found = repr(error).replace("`", "")  # of msgspec: in messages they are around options
+        raise InputError(f"{label}: found {found}, wanted one JSON object of format {form!r}") from error
 
 
 def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> list[Value]:

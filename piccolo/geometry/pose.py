@@ -277,7 +277,7 @@ def transform_points(points: Array, T_target_from_source: Array) -> Array:
 
 
 def carry(pose: Pose, beside: Pose, to: Pose) -> Pose:
-    """Return the pose that lies to `to` as `pose` does to `beside`: the same motion of the camera, elsewhere.
+    """Apply the relative motion from `beside` to `pose` to the pose `to`.
 
     Poses are in any one frame each: pose and beside in that of an odometry, say, and to in the map.
     """

@@ -105,7 +105,7 @@ def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> It
 
 
 class Cluster:
-    """The workers of a scheduler, of which each process opens once what it works with."""
+    """Workers of a Dask scheduler; each process opens the scan once."""
 
     def __init__(self, address: str, client: Any, distributed: Any) -> None:
         self.address = address

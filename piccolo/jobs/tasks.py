@@ -44,8 +44,7 @@ class Here:
 class InFlight:
     """Values of items that are worked on elsewhere, at most so many begun before the first of them is taken.
 
-    A thread takes the items, so that one that lets itself be waited for, as a name on standard input does,
-    keeps nobody from the values before it.
+    A thread reads the items, so a slow standard input does not delay values that are ready.
     """
 
     def __init__(self, submit: Callable[[Any], Any], items: Iterator[Any], limit: int) -> None:

@@ -114,9 +114,9 @@ class Workers:
 
     @contextmanager
     def beside(self, *functions: Callable[[], object]) -> Iterator[None]:
-        """Yield a context in which an idle core calls functions, in order, that keep what they work out.
+        """Compute cached values on another thread, in order, while the block runs.
 
-        At its end, those that have not begun are left. What they raise is left to who asks for the value.
+        Functions that have not begun at its end are left. Errors are raised where the value is asked for.
         """
         if self.num_threads == 1 or hasattr(_thread, "is_of_pool"):
             yield

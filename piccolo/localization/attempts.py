@@ -15,14 +15,14 @@ from ..geometry.pose import Pose
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once
 from ..local_features.hypotheses import count_matches, propose_poses
+from ..prior import NOTHING_KNOWN
 from ..scan_map.camera_positions import COARSE_SPACING
-from ..scan_map.prior import Prior
 from ..scan_map.scan_map import ScanMap
 from .beam import brief_query, refine_matches, refine_starts, score_mirror, score_starts
 from .comparison import score_pose
 from .prior import contradictions
 from .query import Query
-from .search import SearchedGravity, search_poses
+from .search import Tilts, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
 from .verification import verify
@@ -60,10 +60,10 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
         attempts.append((query, search_matches))
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
-        upright: SearchedGravity = "level" if is_partial and not query.photo.has_tilt else "known"
-        attempts.append((query, partial(search_views, gravity=upright)))
+        upright: Tilts = "level" if is_partial and not query.photo.has_tilt else "known"
+        attempts.append((query, partial(search_views, tilts=upright)))
     if method.uses_search and query.settings.gravity != "known":
-        attempts.append((query, partial(search_views, gravity="unknown", is_brief=looks_first)))
+        attempts.append((query, partial(search_views, tilts="any", is_brief=looks_first)))
     return attempts
 
 
@@ -116,13 +116,13 @@ def search_views(
     query: Query,
     known: list[Hypothesis],
     watch: Stopwatch,
-    gravity: SearchedGravity,
+    tilts: Tilts,
     is_brief: bool = False,
 ) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
-    asked = tilt_query(query) if is_brief else query
+    asked = thin_query(query) if is_brief else query
     with watch.stage("search"):
-        starts = search_poses(asked, gravity)
+        starts = search_poses(asked, tilts)
     with watch.stage("refine"):
         found = refine_starts(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
         found = known + add_verified(query, found)
@@ -142,11 +142,10 @@ def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]
 
 def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
     """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    gravity_alone = Prior(gravity_vector=query.settings.prior.gravity_vector)
-    is_asked = query.settings.prior != gravity_alone and query.method.uses_search and is_whole(query)
+    is_asked = not query.settings.prior.is_empty and query.method.uses_search and is_whole(query)
     if not is_asked:
         return []
-    settings = replace(query.settings, prior=gravity_alone)
+    settings = replace(query.settings, prior=NOTHING_KNOWN)
     anywhere = brief_query(replace(query, scan_map=scan_map, settings=settings))
     with watch.stage("search"):
         starts = search_poses(anywhere, "known")
@@ -169,7 +168,7 @@ def is_whole(query: Query) -> bool:
     return query.settings.gravity != "unknown" and not query.photo.is_partial
 
 
-def tilt_query(query: Query) -> Query:
+def thin_query(query: Query) -> Query:
     """Return a brief query with any tilt, for a whole photo that was searched as upright.
 
     It searches every other cell of the grid, with few rotations. That finds tilted photos without occluders;

@@ -38,7 +38,7 @@ LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
 
 
-class Picture(NamedTuple):
+class SurePhoto(NamedTuple):
     """A photo that is sure."""
 
     located: Located
@@ -46,11 +46,11 @@ class Picture(NamedTuple):
     gaussian: PoseGaussian | None  # its pose in the map with its covariance
 
 
-class Beside(NamedTuple):
+class Neighbor(NamedTuple):
     """A photo that shows what another shows."""
 
     name: str
-    picture: Picture
+    picture: SurePhoto
     matches: Matches
     pose: Pose  # of the other, by the matches
 
@@ -62,7 +62,7 @@ def locate(
     found: Localization,
     settings: CoarseToFineSettings,
     workers: Workers,
-) -> Picture:
+) -> SurePhoto:
     """Return the keypoints of a photo that is localized, and its pose with its errors."""
     if found.pose is None:
         raise ValueError("a photo without a pose")
@@ -72,7 +72,7 @@ def locate(
     if found.covariance is not None:
         in_map = turn_positions(found.covariance.matrix, scan_map.R_map_from_world)
         gaussian = split_errors(query, pose, in_map)
-    return Picture(place_keypoints(query, pose), found.confidence, gaussian)
+    return SurePhoto(place_keypoints(query, pose), found.confidence, gaussian)
 
 
 @one_blas_thread
@@ -80,7 +80,7 @@ def localize_beside(
     scan_map: ScanMap,
     panorama: Panorama,
     known: Sequence[Pose],
-    pictures: Mapping[str, Picture],
+    pictures: Mapping[str, SurePhoto],
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
@@ -116,8 +116,8 @@ def localize_beside(
 
 
 def list_agreeing(
-    judged: Localization, found: Sequence[Beside], matches: Sequence[Matches], scan_map: ScanMap
-) -> list[Beside]:
+    judged: Localization, found: Sequence[Neighbor], matches: Sequence[Matches], scan_map: ScanMap
+) -> list[Neighbor]:
     """List the photos whose matches (rays by the final camera) put a photo where it is by all evidence."""
     if judged.pose is None:
         return []
@@ -130,7 +130,7 @@ def list_agreeing(
     return agreeing
 
 
-def fuse(judged: Localization, other: Beside, ended: Found) -> PoseGaussian | None:
+def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | None:
     """Return the mean of a result's own pose and of that by the photo beside, in the map.
 
     Errors of the focal length and of the scan are common to both. None for a result that is ruled out, and if
@@ -168,7 +168,7 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
     return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
 
 
-def find_beside(query: Query, pictures: Mapping[str, Picture]) -> list[Beside]:
+def find_beside(query: Query, pictures: Mapping[str, SurePhoto]) -> list[Neighbor]:
     """Find the photos that show what a photo shows, those with the most matches first."""
     compared = query.workers.map(partial(match_picture, query), list(pictures.items()), "match")
     found = [pair for pair in compared if pair]
@@ -176,7 +176,7 @@ def find_beside(query: Query, pictures: Mapping[str, Picture]) -> list[Beside]:
     return [other for other, _ in ranked[:MOST_BESIDE]]
 
 
-def match_picture(query: Query, named: tuple[str, Picture]) -> tuple[Beside, int] | None:
+def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor, int] | None:
     """Match a photo with another, given with its name; None if fewer agree than a sure pose has.
 
     Returns also the number of those that agree.
@@ -186,4 +186,4 @@ def match_picture(query: Query, named: tuple[str, Picture]) -> tuple[Beside, int
     found = propose_poses(matches, None, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
     if not found or found[0].num_matches < SURE_MATCHES:
         return None
-    return Beside(name, picture, matches, found[0].pose), found[0].num_matches
+    return Neighbor(name, picture, matches, found[0].pose), found[0].num_matches

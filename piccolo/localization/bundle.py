@@ -88,7 +88,8 @@ def localize_bundle(
     members: dict[int, Member] = {}
 
     def localize_alone(k: int, panorama: Panorama) -> Localization:
-        query = prepare_search(scan_map, panorama, settings, workers)
+        with watch.stage("search"):
+            query = prepare_search(scan_map, panorama, settings, workers)
         if isinstance(query, Localization):
             return query
         search = find_by_edges if query.evidence == "shape" else find

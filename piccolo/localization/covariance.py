@@ -25,7 +25,7 @@ from .settings import ImageName
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
 LEAST_BLOCKS = 13  # fewer do not tell six dimensions
-MOST_SHARE = 1.001  # above 1, so that one block may hold all information
+ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
@@ -156,7 +156,7 @@ def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
     (the estimate CR3 of Bell and McCaffrey, 2002).
     """
     shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
-    return np.asarray(np.linalg.solve(MOST_SHARE * np.eye(6) - shares, gradients[..., None])[..., 0])
+    return np.asarray(np.linalg.solve(ONE_BLOCK * np.eye(6) - shares, gradients[..., None])[..., 0])
 
 
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:

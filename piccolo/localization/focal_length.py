@@ -61,7 +61,7 @@ MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
 LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
-MOST_SHARE = 0.7  # of a block in what fixes the focal length
+MOST_OF_BLOCK = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.25  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
@@ -294,7 +294,7 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
     offset = -np.linalg.solve(H, fitted[1 : 1 + num].sum(axis=1))
     slopes = fitted[1 : 1 + num].T + hessians @ offset
     shares = np.trace(hessians @ np.linalg.inv(H), axis1=1, axis2=2) / num
-    slopes /= (1.0 - np.clip(shares, 0.0, MOST_SHARE))[:, None]  # as if each had been left out, as in CR3
+    slopes /= (1.0 - np.clip(shares, 0.0, MOST_OF_BLOCK))[:, None]  # as if each had been left out, as in CR3
     information = H @ np.linalg.pinv(INFLATION * slopes.T @ slopes) @ H
     return Crest(middle + offset, information, motion)
 

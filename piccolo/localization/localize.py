@@ -53,10 +53,10 @@ def localize(
     method: MethodConfig = METHOD,
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
-    query = prepare_search(scan_map, panorama, settings, workers, method)
-    if isinstance(query, Localization):
-        return query
     with watch.stage("search"):
+        query = prepare_search(scan_map, panorama, settings, workers, method)
+        if isinstance(query, Localization):
+            return query
         query.photo.images.search()  # each search begins with it
     search = find_by_edges if query.evidence == "shape" else find
     found = search(query, scan_map, watch)

@@ -22,7 +22,7 @@ from ..panorama.texels import Texels, find_valid, pack_texels
 from .settings import ImageName, ImageScale, ImageScales
 
 WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
-MOST_SHARE = 0.98  # of the sphere: a photo that shows more counts as showing all cells
+ALL_SHOWN = 0.98  # of the sphere: a photo that shows more counts as showing all cells
 ACROSS = np.diag([1.0, -1.0, 1.0])  # mirrors a camera's axes left for right
 
 
@@ -68,7 +68,7 @@ class Photo:
     def find_shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
         """Return a mask (N,) of the grid cells around a pose that the photo shows."""
         grid = make_grid(num_rings)
-        if self.small.valid_share > MOST_SHARE:
+        if self.small.valid_share > ALL_SHOWN:
             return np.ones(len(grid), np.bool_)
         rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
         return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])

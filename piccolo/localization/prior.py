@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
+from ..prior import Prior
 from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
 from ..scan_map.named_scans import candidates_within, find_scan_at
-from ..scan_map.prior import NOTHING_KNOWN, Prior
 from ..scan_map.scan_map import ScanMap
 
 STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
@@ -17,10 +17,8 @@ STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no
 def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
     """Return the candidates (N,) that each option allows, with a margin of half a grid spacing."""
     allowed: dict[str, NDArray[np.bool_]] = {}
-    if prior.near_world is not None and prior.radius is not None:
-        allowed["`near_world`"] = (
-            distances_to(scan_map, prior.near_world) <= prior.radius + COARSE_SPACING / 2
-        )
+    if prior.near is not None and prior.radius is not None:
+        allowed["`near`"] = distances_to(scan_map, prior.near) <= prior.radius + COARSE_SPACING / 2
     if prior.height is not None:
         heights = heights_above_floor(scan_map.octree, scan_map.centers)
         low, high = prior.height
@@ -31,9 +29,9 @@ def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_
     return allowed
 
 
-def distances_to(scan_map: ScanMap, near_world: tuple[float, float, float | None]) -> NDArray[np.float64]:
+def distances_to(scan_map: ScanMap, near: tuple[float, float, float | None]) -> NDArray[np.float64]:
     """Return the distance (N,) [m] of each candidate from a place; along the ground if it has no z."""
-    x, y, z = near_world
+    x, y, z = near
     centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
     offsets = centers_world[:, :2] - (x, y) if z is None else centers_world - (x, y, z)
     return np.asarray(np.linalg.norm(offsets, axis=1))
@@ -46,12 +44,12 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
         return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
     counts = [f"{name} allows {mask.sum()}" for name, mask in check_options(scan_map, prior).items()]
     text = f"no position is left of the scan's {num}: {', '.join(counts)}"
-    if prior.near_world is None:
+    if prior.near is None:
         return text
-    distances = distances_to(scan_map, prior.near_world)
+    distances = distances_to(scan_map, prior.near)
     k = int(distances.argmin())
     x, y, z = scan_map.R_map_from_world.T @ scan_map.centers[k] + scan_map.origin_world
-    return f"{text}; the nearest to `near_world` is {x:.2f} {y:.2f} {z:.2f}, {distances[k]:.2f} m away"
+    return f"{text}; the nearest to `near` is {x:.2f} {y:.2f} {z:.2f}, {distances[k]:.2f} m away"
 
 
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
@@ -69,7 +67,7 @@ def allow_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDAr
     if prior.heading_deg is None:
         return R_cam_from_world
     off = heading_errors(R_cam_from_world, prior.heading_deg)
-    return np.asarray(R_cam_from_world[off <= max(np.radians(prior.heading_tolerance_deg), float(off.min()))])
+    return np.asarray(R_cam_from_world[off <= max(np.radians(prior.tolerance_deg), float(off.min()))])
 
 
 def heading_errors(R_cam_from_world: NDArray[np.float64], heading_deg: float) -> NDArray[np.float64]:
@@ -81,14 +79,14 @@ def heading_errors(R_cam_from_world: NDArray[np.float64], heading_deg: float) ->
 
 def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ...]:
     """Say how a pose of the map's frame contradicts the prior by more than a right pose may be off."""
-    if prior == NOTHING_KNOWN:
+    if prior.is_empty:
         return ()
     world = scan_map.to_world(pose)
     found = []
     if prior.within and (scan := find_scan_at(scan_map, pose.center_world)) not in prior.within:
         found.append(f"the pose found is in the scan {scan!r}, not in {', '.join(map(repr, prior.within))}")
-    if prior.near_world is not None and prior.radius is not None:
-        given = [value for value in prior.near_world if value is not None]
+    if prior.near is not None and prior.radius is not None:
+        given = [value for value in prior.near if value is not None]
         gap = math.dist(world.center_world[: len(given)], given)
         if gap > prior.radius + MAX_DISTANCE:
             found.append(f"the pose found is {gap:.2f} m from the place given, not within {prior.radius:g} m")
@@ -107,7 +105,7 @@ def find_contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
     if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:
         return []
     off = math.degrees(float(heading_errors(pose_world.R_cam_from_world[None], prior.heading_deg)[0]))
-    if off <= prior.heading_tolerance_deg + math.degrees(MAX_ANGLE):
+    if off <= prior.tolerance_deg + math.degrees(MAX_ANGLE):
         return []
-    limit = f"more than {prior.heading_tolerance_deg:g} deg"
+    limit = f"more than {prior.tolerance_deg:g} deg"
     return [f"the pose found looks {off:.0f} deg away from the heading given, {limit}"]

@@ -19,7 +19,7 @@ from ..local_features.matching import Matches, join_matches, match
 from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere
 from ..panorama import Panorama
 from ..panorama.edges import draw_edges
-from ..panorama.gpano import attitude_of_gravity, rotation_to_level
+from ..panorama.gpano import rotation_to_level
 from ..panorama.model import shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
@@ -111,7 +111,7 @@ class Query:
 
     def mirror(self) -> "Query":
         """Return the query by whole views of the mirrored photo, without the prior's heading."""
-        prior = replace(self.settings.prior, heading_deg=None)
+        prior = self.settings.prior.without_heading()
         return replace(
             self.by_views(),
             photo=self.photo.mirror(),
@@ -142,12 +142,12 @@ def prepare_query(
     method: MethodConfig = METHOD,
     rotations: Array | None = None,
 ) -> Query:
-    """Prepare a panorama for the search in a map; the prior or metadata give the camera's tilt.
+    """Prepare a panorama for the search in a map; the photo may give the camera's tilt.
 
     Of rotations (N, 3, 3), camera from map, only these are searched.
     """
     source = panorama
-    R_cam_from_level, has_tilt = find_tilt(panorama, settings)
+    R_cam_from_level, has_tilt = find_tilt(panorama)
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
         method = method._replace(uses_features=False, scales=SHAPE_SCALES)
@@ -181,11 +181,9 @@ def make_views(scan_map: ScanMap) -> RecentViews:
     return RecentViews(scan_map.octree, averaged)
 
 
-def find_tilt(panorama: Panorama, settings: CoarseToFineSettings) -> tuple[Array, bool]:
-    """Return R_cam_from_level (3, 3) of a camera, and True if the prior or metadata give its tilt."""
-    down_cam = settings.prior.gravity_vector
-    gpano = attitude_of_gravity(down_cam) if down_cam else panorama.gpano
-    R_level_from_cam = rotation_to_level(gpano) if gpano else None
+def find_tilt(panorama: Panorama) -> tuple[Array, bool]:
+    """Return R_cam_from_level (3, 3) of a camera, and True if the photo gives its tilt."""
+    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
     return (np.eye(3), False) if R_level_from_cam is None else (R_level_from_cam.T, True)
 
 

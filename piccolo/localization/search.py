@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..geometry.nearness import STARTING, STARTING_NARROW
 from ..geometry.pose import Pose
-from ..geometry.rotations import Gravity, R_cam_from_angles, uniform_rotations, uniform_yaws
+from ..geometry.rotations import R_cam_from_angles, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
 from ..geometry.suppression import non_maximum_suppression
 from ..jobs.memory import check_memory
@@ -25,7 +25,7 @@ from .query import Query
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB
 LOWEST = np.float32(-np.inf)
-SearchedGravity = Gravity | Literal["level"]
+Tilts = Literal["known", "level", "any"]  # of the camera that are searched: its own, about level, all
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 CANDIDATES_PER_START = 2
 POSES_PER_START = 12
@@ -176,7 +176,7 @@ def best_poses(
     return row, column, flat[top]
 
 
-def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
+def search_poses(query: Query, tilts: Tilts) -> Starts:
     """Search all candidates with all rotations in two stages; return the distinct best.
 
     The first scores wide cells of the sparse candidates, by matrix products, the second scores fine cells of
@@ -184,7 +184,7 @@ def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
     """
     m = query.scan_map
     settings = query.settings
-    rotations = list_rotations(query, gravity)
+    rotations = list_rotations(query, tilts)
     num_views = min(views_at_once(len(rotations)), len(m.sparse))
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
@@ -213,15 +213,15 @@ def search_poses(query: Query, gravity: SearchedGravity) -> Starts:
     return Starts(R[kept][order], centers[kept][order], candidate[order])
 
 
-def list_rotations(query: Query, gravity: SearchedGravity) -> NDArray[np.float64]:
+def list_rotations(query: Query, tilts: Tilts) -> NDArray[np.float64]:
     """Return the rotations (N, 3, 3), camera from map, to search: upright, about level, or all."""
     R_map_from_world = query.scan_map.R_map_from_world
     settings = query.settings
     if query.rotations is not None:
         rotations = query.rotations
-    elif gravity == "known":
+    elif tilts == "known":
         rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)
-    elif gravity == "level":
+    elif tilts == "level":
         headings = 360.0 / NUM_LEVEL_YAWS * np.arange(NUM_LEVEL_YAWS)
         tilted = [R_cam_from_angles(heading, pitch, 0.0) for pitch in PITCHES_DEG for heading in headings]
         rotations = query.photo.R_cam_from_level @ np.stack(tilted)

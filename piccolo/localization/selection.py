@@ -33,9 +33,9 @@ class Selection:
 
     @property
     def margin(self) -> float:
-        """Relative lead of the best over what both views show, in [-1, 1]; that of scores if it is less."""
-        of_scores = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
-        return 1.0 - min(max(self.rival_ratio, of_scores), 2.0)
+        """Relative lead of the best, at least -1: the lesser of those by score and over both views."""
+        by_score = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
+        return max(1.0 - max(self.rival_ratio, by_score), -1.0)
 
 
 NOTHING = Selection(Hypothesis(Pose(np.eye(3), np.zeros(3)), -1.0), ())

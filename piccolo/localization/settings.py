@@ -1,13 +1,14 @@
 """Settings of the default method."""
 
 from dataclasses import asdict, dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
+from ..arguments import check_fields
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
 from ..geometry.rotations import Gravity
 from ..optimize.refine import Solver
-from ..scan_map.prior import NOTHING_KNOWN, Prior
+from ..prior import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ViewConfig
 
@@ -28,11 +29,8 @@ class CoarseToFineSettings:
     min_confidence: float = MIN_CONFIDENCE  # below it a pose is not called localized
 
     def __post_init__(self) -> None:
-        """Refuse counts that mean nothing, naming the setting."""
-        for name, kind in (("gravity", Gravity), ("solver", Solver)):
-            if getattr(self, name) not in get_args(kind):
-                known = ", ".join(get_args(kind))
-                raise InputError(f"{name}: found {getattr(self, name)!r}, wanted one of {known}")
+        """Refuse values that mean nothing, naming the setting."""
+        check_fields(self)
         for name, most in MOST.items():
             if not 1 <= getattr(self, name) <= most:
                 raise InputError(f"{name}: found {getattr(self, name)}, wanted 1 to {most}")

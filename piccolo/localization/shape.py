@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..geometry.pose import Array, yaw_rotation
+from ..panorama.gpano import attitude_of_gravity
 from .beam import brief_query, score_starts
 from .query import Query, prepare_query
 from .search import search_poses
@@ -16,10 +17,9 @@ LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the hori
 
 
 def is_tilt_known(query: Query) -> bool:
-    """Return True if the settings, or the photo's metadata, say how the camera was tilted."""
+    """Return True if the settings, or the photo, say how the camera was tilted."""
     gravity = query.settings.gravity
-    has_attitude = query.settings.prior.gravity_vector is not None or query.source.gpano is not None
-    return gravity == "known" or (has_attitude and gravity != "unknown")
+    return gravity == "known" or (query.source.gpano is not None and gravity != "unknown")
 
 
 def is_explained(found: Selection, searched: Query) -> bool:
@@ -43,7 +43,7 @@ def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_le
 
 
 def align_level(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) -> Query:
-    """Return the query at the camera's tilt: level unless the photo or the settings say another."""
+    """Return the query at the camera's tilt: level unless the photo says another."""
     known = replace(query, settings=replace(query.settings, gravity="known"))
     return known.with_rotations(align_lines(yaw_of_walls, axes, query.photo.R_cam_from_level))
 
@@ -55,9 +55,9 @@ def find_tilts(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) 
     """
     tried = []
     for axis in axes:
-        prior = replace(query.settings.prior, gravity_vector=tuple((-axis).tolist()))
-        settings = replace(query.settings, prior=prior)
-        turned = prepare_query(query.source, query.scan_map, settings, query.workers, query.method)
+        x, y, z = -axis
+        source = replace(query.source, gpano=attitude_of_gravity((float(x), float(y), float(z))))
+        turned = prepare_query(source, query.scan_map, query.settings, query.workers, query.method)
         tried.append(align_level(turned, axes, yaw_of_walls))
     scores = []
     for one in tried:

@@ -129,8 +129,8 @@ def place_keypoints(query: Query, pose: Pose) -> Located:
 def match_beside(query: Query, other: Located) -> Matches:
     """Match a photo's features with those of another photo.
 
-    What both show in the same direction is left out: it may be carried along, as dirt on a lens is. A photo
-    whose mirror image has more matches has none.
+    What both show in the same direction is left out: it may be carried along, as dirt on a lens is. There
+    are no matches if the mirrored photo has more.
     """
     own = query.photo.seen().keypoints
     mine, theirs = match_pictures(own, other.keypoints)

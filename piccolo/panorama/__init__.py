@@ -1,15 +1,12 @@
 """Panoramas read from files of any format and shape, always as full spheres; masks and sizes."""
 
-from .model import GPano, Panorama, ReadOptions
-from .read import AS_STORED, panorama_of_array, panorama_size, read_panorama, read_photo
+from .model import GPano, Panorama
+from .read import check_labels, panorama_size, read_panorama
 
 __all__ = [
-    "AS_STORED",
     "GPano",
     "Panorama",
-    "ReadOptions",
-    "panorama_of_array",
+    "check_labels",
     "panorama_size",
     "read_panorama",
-    "read_photo",
 ]

@@ -6,24 +6,24 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..camera import Calibration, Mount
 from ..camera.files import find_calibration
 from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
 from ..camera.resampling import View, shrunk
 from ..camera.rig import compute_extent
 from ..errors import InputError
+from ..photo import Photo
 from .cube import face_pixels
 from .gpano import ASPECT_TOLERANCE
 from .masks import black_borders
-from .model import ReadOptions
 from .photo import read_focal_length
 from .picture import Picture
 
 # By EXIF's orientation: the stored picture's axes from those of the picture as it is shown; and how many
 # quarter turns to the left take it back to the stored one.
-TURNED: dict[object, tuple[NDArray[np.float64], int]] = {
+TURNED: dict[object, tuple[Array, int]] = {
     6: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]), 1),
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
@@ -47,37 +47,39 @@ class Cameras(NamedTuple):
     notes: tuple[str, ...] = ()  # what the user should know
 
 
-def cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
+def cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     """Return the cameras of a picture, by the options or by EXIF.
 
     Raises InputError if a calibration does not fit, or a pinhole is asked for and its field is unknown.
     """
-    found = _cameras_of(path, picture, options, has_gpano)
-    if not options.refine_focal:
+    found = _cameras_of(photo, picture, has_gpano)
+    if not photo.refine_focal:
         return found
     if len(found.mounts) != 1:
         what = f"{len(found.mounts)} cameras" if found.mounts else "a sphere or a part of one"
-        raise InputError(f"{path}: found {what}, wanted the photo of one camera: {GUESS}")
+        raise InputError(f"{photo.path}: found {what}, wanted the photo of one camera: {GUESS}")
     return found._replace(deviation=OF_GUESS)
 
 
-def _cameras_of(path: Path, picture: Picture, options: ReadOptions, has_gpano: bool) -> Cameras:
+def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     width, height = picture.size
-    if (calibration := find_calibration(options.calibration, path)) is not None:
-        mounts = _calibrate(path, picture, calibration)
+    if (calibration := find_calibration(photo.calibration, photo.path)) is not None:
+        mounts = _calibrate(photo.path, picture, calibration)
         return Cameras() if _is_sphere(mounts) else Cameras(mounts, OF_CALIBRATION, "`camera`")
-    if options.focal_px is not None:
-        return Cameras((Mount(pinhole(width, height, options.focal_px)),), OF_PIXELS, "`focal_px`")
-    lens = options.projection
-    if lens in ("pinhole", "fisheye") and options.fov_deg is not None:
-        return Cameras((Mount(camera_of_fov(lens, options.fov_deg, width, height)),), OF_FIELD, "`fov_deg`")
+    if photo.focal_px is not None:
+        return Cameras((Mount(pinhole(width, height, photo.focal_px)),), OF_PIXELS, "`focal_px`")
+    lens = photo.projection
+    if lens in ("pinhole", "fisheye") and photo.fov_deg is not None:
+        return Cameras((Mount(camera_of_fov(lens, photo.fov_deg, width, height)),), OF_FIELD, "`fov_deg`")
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
-    is_photo = lens is None and options.fov_deg is None and not has_gpano
+    is_photo = lens is None and photo.fov_deg is None and not has_gpano
     if not (is_photo or lens == "pinhole"):
         return Cameras()
     found = read_focal_length(picture.exif, picture.size)
     if found is None and lens == "pinhole":
-        raise InputError(f"{path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`")
+        raise InputError(
+            f"{photo.path}: found no focal length in EXIF, wanted `focal_px`, `fov_deg` or `camera`"
+        )
     if found is None or (is_two_to_one and lens is None):
         return Cameras(notes=(f"{AS_SPHERE}{found.source}",) if found else ())
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
@@ -108,7 +110,7 @@ def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[
 
 
 def read_views(
-    path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: NDArray[np.bool_]
+    path: Path, picture: Picture, mounts: tuple[Mount, ...], is_valid: Mask
 ) -> tuple[list[View], tuple[str, ...]]:
     """Return each camera with its part of a picture, black borders masked, and notes for the user.
 

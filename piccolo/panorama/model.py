@@ -1,23 +1,14 @@
-"""A panorama at any size, with its metadata, and the options with which it is read."""
+"""A panorama at any size, with its metadata."""
 
 import math
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal, get_args
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..camera import Calibration, Camera, Mount
-from ..camera.files import find_calibration
+from ..camera import Camera, Mount
 from ..camera.resampling import View, make_sphere
-from ..camera.rig import IDENTITY
-from ..errors import InputError
-from ..geometry.colors import Labels
-
-FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
-Projection = Literal["equirectangular", "pinhole", "fisheye"]
 
 
 @dataclass(frozen=True)
@@ -75,79 +66,6 @@ class Panorama:
         taken = self.resample(camera.change(math.log(focal_px / camera.focal[0])), self.rgb.shape[1])
         prior = replace(self.focal_prior, focal=focal_px, deviation=deviation, is_measured=True)
         return replace(taken, focal_prior=prior)
-
-
-@dataclass(frozen=True)
-class ReadOptions:
-    """Options for reading a picture that its file can't give."""
-
-    fov_deg: float | None = None  # horizontal; goes before metadata
-    mask: Path | None = None  # picture, white where the panorama is to be ignored, or a folder of such
-    mask_nadir_deg: float = 0.0  # the cap of this half angle about the camera's down axis is ignored
-    cube_order: str | None = None  # the picture is six cube faces in this order, such as rludfb
-    labels: Labels | None = None  # the picture holds labels, not colours
-    use_gps: bool = True  # a GPS position in the file narrows the search, where the scan's system is known
-    projection: Projection | None = None  # of a picture; None: of a sphere, if nothing speaks for a photo
-    focal_px: float | None = None  # of a pinhole [px], at the picture's own size
-    # of the camera, a folder of one for each photo, or of a rig whose pictures are in a folder
-    calibration: Calibration | Path | None = None
-    refine_focal: bool = False  # the focal length is a first guess
-
-    def __post_init__(self) -> None:
-        """Refuse values that mean nothing, naming the option."""
-        _check_number("`fov_deg`", self.fov_deg, 360.0)
-        _check_number("`focal_px`", self.focal_px, 1e6)
-        if not (math.isfinite(self.mask_nadir_deg) and 0.0 <= self.mask_nadir_deg <= 90.0):
-            raise InputError(f"`mask_nadir_deg`: found {self.mask_nadir_deg}, wanted 0 to 90")
-        if self.cube_order is not None and sorted(self.cube_order) != sorted(FACE_LETTERS):
-            wanted = f"wanted each of the letters {FACE_LETTERS} once (right, left, up, down, front, back)"
-            raise InputError(f"`cube_order`: found {self.cube_order}, {wanted}")
-        if self.projection is not None and self.projection not in get_args(Projection):
-            wanted = f"wanted one of {', '.join(get_args(Projection))}"
-            raise InputError(f"`projection`: found {self.projection!r}, {wanted}")
-        self._check_together()
-
-    @property
-    def rig(self) -> Calibration | None:
-        """Rig whose pictures make a panorama; None for single pictures."""
-        given = self.calibration
-        return given if isinstance(given, Calibration) and given.is_rig else None
-
-    def with_refined_camera(self, cameras: tuple[Mount, ...], pano: Path) -> "ReadOptions":
-        """Return the options with the refined camera of a photo as calibration of the stored picture."""
-        if len(cameras) != 1:
-            return self
-        given = find_calibration(self.calibration, pano)
-        R_lens_from_cam = IDENTITY if given is None or given.is_choice else given.mounts[0].R_lens_from_cam
-        mount = replace(cameras[0], R_lens_from_cam=R_lens_from_cam)
-        camera = Calibration("the refined camera", (mount,))
-        return replace(self, calibration=camera, focal_px=None, fov_deg=None, projection=None)
-
-    def _check_together(self) -> None:
-        """Refuse options that give one thing twice, or belong to different pictures."""
-        given = {
-            "`camera` or `rig`": self.calibration is not None,
-            "`focal_px`": self.focal_px is not None,
-            "`cube_order`": self.cube_order is not None,
-            "`fov_deg` or `projection`": self.fov_deg is not None or self.projection is not None,
-        }
-        if self.focal_px is not None and self.fov_deg is None and self.projection == "pinhole":
-            given["`fov_deg` or `projection`"] = False
-        names = [name for name, is_given in given.items() if is_given]
-        if self.labels and names:
-            raise InputError(f"`labels`: found {names[0]} too, wanted a picture of the full sphere")
-        if len(names) > 1:
-            raise InputError(f"{', '.join(names)}: wanted only one of them")
-        if self.projection == "fisheye" and self.fov_deg is None:
-            raise InputError(
-                "`projection` fisheye: found no `fov_deg`, wanted the angle that the width shows"
-            )
-
-
-def _check_number(option: str, value: float | None, largest: float) -> None:
-    """Refuse a number that is not above 0 and at most the largest."""
-    if value is not None and not (math.isfinite(value) and 0.0 < value <= largest):
-        raise InputError(f"{option}: found {value}, wanted above 0 and at most {largest:g}")
 
 
 def shrink(panorama: Panorama, width: int) -> Panorama:

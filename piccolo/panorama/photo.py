@@ -10,7 +10,6 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping
-from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat, cast
 
@@ -23,6 +22,7 @@ from ..camera import Calibration
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
 from ..files.json_file import read_bytes, reading_once
+from ..photo import File, Photo, as_photo
 from .cube import face_paths
 from .picture import PNG_MAGIC, WANTED, open_picture
 
@@ -74,16 +74,17 @@ def _digest(files: list[Path]) -> str:
     return digests[0] if len(files) == 1 else hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
-def read_photo_facts(photo: str | PathLike[str] | Bytes, rig: Calibration | None = None) -> PhotoFacts:
+def read_photo_facts(photo: File | Bytes | Photo) -> PhotoFacts:
     """Return the facts that a photo's file gives, or the first file of a folder of cube faces or of a rig.
 
     Pixels (H, W, 3) have a digest and a size. InputError if the file is missing or no picture. Metadata that
     are damaged count as missing.
     """
-    if isinstance(photo, np.ndarray):
-        height, width = photo.shape[:2]
-        return PhotoFacts(sha256_of_arrays(photo), (width, height), None, None)
-    files = _files_of(Path(photo), rig)
+    photo = as_photo(photo)
+    if isinstance(photo.picture, np.ndarray):
+        height, width = photo.picture.shape[:2]
+        return PhotoFacts(sha256_of_arrays(photo.picture), (width, height), None, None)
+    files = _files_of(photo.path, photo.instant)
     with reading_once(), open_picture(files[0], content := read_bytes(files[0], WANTED)) as image:
         exif: Mapping[int, Any]
         try:

@@ -1,24 +1,25 @@
 """A picture file or a folder of cube faces, read as a panorama: a full sphere, and the pixels that count."""
 
 from dataclasses import replace
-from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bytes, Mask
 from ..camera import Calibration, Mount
 from ..camera.resampling import View, make_sphere, sphere_width
 from ..camera.rig import MAX_OFFSET
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..jobs.memory import check_memory
+from ..photo import File, Photo, as_photo
 from .cameras import Cameras, cameras_of, read_views, rig_cameras
 from .cube import cube_of_cells, face_paths, read_cube_folder
 from .gpano import (
     ASPECT_TOLERANCE,
     CropRegion,
     attitude,
+    attitude_of_gravity,
     crop_region,
     embed_crop,
     full_size,
@@ -26,12 +27,11 @@ from .gpano import (
     region_of_fov,
 )
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
-from .model import FocalPrior, GPano, Panorama, ReadOptions
+from .model import FocalPrior, GPano, Panorama
 from .photo import elevation_deg
 from .picture import BYTES_PER_PIXEL, Picture, picture_orientation, picture_size, read_labels, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
-AS_STORED = ReadOptions()
 PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
 CHOICES = (
     "If a camera took it, give `focal_px` or `camera`; if its focal length is unknown, `projection` pinhole "
@@ -46,63 +46,83 @@ LIKE_A_PHOTO = (
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
 
-def read_panorama(path: Path, options: ReadOptions = AS_STORED) -> Panorama:
-    """Return the full sphere of a JPEG, PNG, TIFF, WebP or HEIC file or a folder of six cube faces.
+def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> Panorama:
+    """Return the full sphere of a JPEG, PNG, TIFF, WebP or HEIC file, a folder of six cube faces or an array.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
     valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Labels
-    become colours, and only masks and ignored labels are not valid.
+    become colours, and only masks and ignored labels are not valid. Of an array only masked pixels are not.
 
     InputError if the file is missing or damaged, of another format or projection, its size is out of range,
     or the part of the sphere that it shows is unknown.
     """
-    path = Path(path)
-    if options.labels:
-        return _read_labelled(path, options, options.labels)
-    if options.rig is not None:
-        return _read_rig(path, options.rig, options)
-    if path.is_dir():
-        return _embed_and_mask(path, read_cube_folder(path), CropRegion(), options, None)
-    return make_panorama(path, read_picture(path), options)
+    photo = as_photo(photo)
+    panorama = _read(photo, labels)
+    if photo.gravity_vector is None:
+        return panorama
+    return replace(panorama, gpano=attitude_of_gravity(photo.gravity_vector))
 
 
-def make_panorama(path: Path, picture: Picture, options: ReadOptions) -> Panorama:
-    """Return the panorama of a picture; `path` names it in errors and warnings."""
-    if cube := cube_of_cells(path, picture, options.cube_order):
-        return _embed_and_mask(path, cube, CropRegion(), options, None)
+def check_labels(photo: Photo, labels: Labels | None) -> None:
+    """Refuse a photo that does not show the full sphere where labels are compared."""
+    if labels and (ways := photo.list_ways()):
+        raise InputError(f"`labels`: found {ways[0]} too, wanted a picture of the full sphere")
+
+
+def _read(photo: Photo, labels: Labels | None) -> Panorama:
+    """Read a photo; its attitude is that of the file."""
+    check_labels(photo, labels)
+    if isinstance(photo.picture, np.ndarray):
+        return _read_array(photo, photo.picture)
+    if labels:
+        return _read_labelled(photo, labels)
+    if photo.instant is not None:
+        return _read_rig(photo, photo.instant)
+    if photo.path.is_dir():
+        return _embed_and_mask(photo, read_cube_folder(photo.path), CropRegion(), None)
+    return _read_picture(photo)
+
+
+def _read_picture(photo: Photo) -> Panorama:
+    """Read the photo in one file."""
+    path = photo.path
+    picture = read_picture(path)
+    if cube := cube_of_cells(path, picture, photo.cube_order):
+        return _embed_and_mask(photo, cube, CropRegion(), None)
     fields = gpano_fields(picture.xmp)
-    cameras = cameras_of(path, picture, options, bool(fields))
+    cameras = cameras_of(photo, picture, bool(fields))
     gpano = attitude(fields) if fields else None
     picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
     if cameras.mounts:
         if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
             gpano = GPano(elevation)
-        picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
-        return _on_sphere(path, [(path, picture, cameras.mounts)], options, gpano, cameras)
-    region, more = _region_of(path, picture, fields, options)
+        return _on_sphere(photo, [(path, picture, cameras.mounts)], gpano, cameras)
+    region, more = _region_of(photo, picture, fields)
     picture = replace(picture, warnings=(*picture.warnings, *more))
-    return _embed_and_mask(path, picture, region, options, gpano)
+    return _embed_and_mask(photo, picture, region, gpano)
 
 
-def panorama_of_array(rgb: NDArray[np.uint8], is_valid: NDArray[np.bool_], options: ReadOptions) -> Panorama:
-    """Return the panorama of an image (H, W, 3), of the camera in the options or a full sphere."""
-    path = Path("array")
+def _read_array(photo: Photo, rgb: Bytes) -> Panorama:
+    """Return the panorama of an image (H, W, 3), of the photo's camera or a full sphere."""
+    rgb = np.ascontiguousarray(rgb)
+    is_valid = ~photo.mask if isinstance(photo.mask, np.ndarray) else np.ones(rgb.shape[:2], np.bool_)
     picture = Picture(rgb, is_valid)
-    cameras = cameras_of(path, picture, options, has_gpano=True)
+    cameras = cameras_of(photo, picture, has_gpano=True)
     if cameras.mounts:
-        return _on_sphere(path, [(path, picture, cameras.mounts)], options, None, cameras)
+        return _on_sphere(photo, [(photo.path, picture, cameras.mounts)], None, cameras)
     if rgb.shape[1] != 2 * len(rgb):
         found = f"{rgb.dtype} of shape {rgb.shape}"
-        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
+        raise InputError(f"`picture`: found {found}, wanted RGB in uint8 of shape (H, 2 H, 3), or a camera")
     return Panorama(rgb, is_valid)
 
 
-def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
+def _read_rig(photo: Photo, rig: Calibration) -> Panorama:
     """Return the panorama of the pictures of one instant."""
+    folder = photo.path
     files = rig.images_in(folder)
     pictures = [read_picture(file) for file in files]
     shots = list(zip(files, pictures, rig_cameras(folder, pictures, rig), strict=True))
-    panorama = _on_sphere(folder, shots, options, None)
+    panorama = _on_sphere(photo, shots, None)
     if rig.extent <= MAX_OFFSET:
         return panorama
     note = f"the rig's cameras are up to {rig.extent:.2f} m from its origin: near objects appear displaced"
@@ -110,7 +130,7 @@ def _read_rig(folder: Path, rig: Calibration, options: ReadOptions) -> Panorama:
 
 
 def _on_sphere(
-    path: Path, shots: list[Shot], options: ReadOptions, gpano: GPano | None, of_one: Cameras | None = None
+    photo: Photo, shots: list[Shot], gpano: GPano | None, of_one: Cameras | None = None
 ) -> Panorama:
     """Project the pictures of one instant, each with its file and cameras, to one sphere, and apply masks.
 
@@ -119,12 +139,12 @@ def _on_sphere(
     cameras = tuple(mount for *_, mounts in shots for mount in mounts)
     width = sphere_width(cameras)
     num_bytes = width * width // 2 * BYTES_PER_PIXEL
-    check_memory(num_bytes, f"{path}: the sphere of {width} x {width // 2}", "make the picture smaller")
+    check_memory(num_bytes, f"{photo.path}: the sphere of {width} x {width // 2}", "make the picture smaller")
     views: list[View] = []
     notes: list[str] = []
     counts = None
     for file, picture, mounts in shots:
-        masks = _user_masks(file, [picture.size, (width, width // 2)], options, notes)
+        masks = _user_masks(file, [picture.size, (width, width // 2)], photo, notes)
         if 1 in masks:
             counts = masks[1] if counts is None else counts & masks[1]
         is_valid = picture.is_valid & masks[0] if 0 in masks else picture.is_valid
@@ -133,7 +153,7 @@ def _on_sphere(
         notes += [*picture.warnings, *more]
     rgb, is_valid = make_sphere(views, width)
     panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
-    masked = _mask(path, panorama, counts, options)
+    masked = _mask(photo, panorama, counts)
     if of_one is None or len(cameras) > 1:
         return masked
     is_hidden = is_valid & ~masked.is_valid
@@ -156,32 +176,29 @@ def panorama_size(path: Path) -> tuple[int, int]:
     return 4 * size, 2 * size
 
 
-def _read_labelled(path: Path, options: ReadOptions, labels: Labels) -> Panorama:
+def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
     """Read the panorama in a PNG of labels. No automatic masks: a black border is a label too."""
+    path = photo.path
     picture = read_labels(path, labels)
     width, height = picture.size
     if width != 2 * height:
         raise InputError(f"{path}: found labels of {width} x {height}, wanted the full sphere, W = 2 H")
     notes = list(picture.warnings)
-    counts = _user_masks(path, [picture.size], options, notes).get(0)
+    counts = _user_masks(path, [picture.size], photo, notes).get(0)
     fields = gpano_fields(picture.xmp)
     gpano = attitude(fields) if fields else None
-    return _mask(path, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts, options)
+    return _mask(photo, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts)
 
 
-def _region_of(
-    path: Path, picture: Picture, fields: dict[str, str], options: ReadOptions
-) -> tuple[CropRegion, list[str]]:
+def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[CropRegion, list[str]]:
     """Return the part of the sphere that a picture shows, by the user or metadata, and warnings."""
     width, height = picture.size
-    if options.fov_deg is not None:
-        notes = (
-            [LIKE_A_PHOTO] if options.projection is None and not fields and _is_like_photo(picture) else []
-        )
-        return region_of_fov(options.fov_deg, width, height), notes
+    if photo.fov_deg is not None:
+        notes = [LIKE_A_PHOTO] if photo.projection is None and not fields and _is_like_photo(picture) else []
+        return region_of_fov(photo.fov_deg, width, height), notes
     name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
-        raise InputError(f"{path}: its metadata names the projection {name!r}, wanted equirectangular")
+        raise InputError(f"{photo.path}: its metadata names the projection {name!r}, wanted equirectangular")
     notes = []
     region = crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
@@ -189,13 +206,13 @@ def _region_of(
         region = CropRegion()
         notes = ["the crop in the metadata is invalid or has another shape; read as a full sphere"]
     if region is None or (region.is_full and not is_two_to_one):
-        wrong = "no field of view is given" if options.projection else "no focal length in EXIF"
+        wrong = "no field of view is given" if photo.projection else "no focal length in EXIF"
         wrong = "a crop in the metadata that does not fit it" if region is None else wrong
         found = f"found a picture of {width} x {height}, which is no full panorama (2:1), and {wrong}"
-        raise InputError(f"{path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
+        raise InputError(f"{photo.path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
     if region.is_full and is_dual_fisheye(picture.rgb):
         found = "two fisheye pictures side by side, wanted their calibration as `camera` (docs/CAMERAS.md)"
-        raise InputError(f"{path}: {found}, or a panorama that the camera's program has stitched")
+        raise InputError(f"{photo.path}: {found}, or a panorama that the camera's program has stitched")
     return region, notes
 
 
@@ -205,13 +222,12 @@ def _is_like_photo(picture: Picture) -> bool:
     return any(abs(ratio / camera_ratio - 1.0) <= ASPECT_TOLERANCE for camera_ratio in CAMERA_RATIOS)
 
 
-def _embed_and_mask(
-    path: Path, picture: Picture, region: CropRegion, options: ReadOptions, gpano: GPano | None
-) -> Panorama:
+def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, gpano: GPano | None) -> Panorama:
     """Embed the picture in the full sphere, and mask all pixels that do not count."""
+    path = photo.path
     size = full_size(path, region, picture.size)
     notes = [*picture.warnings]
-    masks = _user_masks(path, [size, picture.size], options, notes)
+    masks = _user_masks(path, [size, picture.size], photo, notes)
     is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
     borders = black_borders(picture.rgb, is_valid, region.is_full)
     if borders is not None:
@@ -225,61 +241,32 @@ def _embed_and_mask(
         if half_angle:
             notes.append(f"masked a {pole} patch of {half_angle:.1f} deg")
             is_valid = mask_pole(is_valid, pole, half_angle)
-    return _mask(path, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0), options)
+    return _mask(photo, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0))
 
 
-def _mask(path: Path, panorama: Panorama, counts: NDArray[np.bool_] | None, options: ReadOptions) -> Panorama:
+def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:
     """Return the panorama without pixels removed by a mask of its size or the option for the nadir."""
     is_valid = panorama.is_valid if counts is None else panorama.is_valid & counts
-    is_valid = mask_pole(is_valid, "nadir", options.mask_nadir_deg)
+    is_valid = mask_pole(is_valid, "nadir", photo.mask_nadir_deg)
     if not is_valid.any():
-        raise InputError(f"{path}: no pixel is left: all are masked, black, or of ignored labels")
+        raise InputError(f"{photo.path}: no pixel is left: all are masked, black, or of ignored labels")
     return replace(panorama, is_valid=np.ascontiguousarray(is_valid))
 
 
-def _user_masks(
-    path: Path, sizes: list[tuple[int, int]], options: ReadOptions, notes: list[str]
-) -> dict[int, NDArray[np.bool_]]:
+def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: list[str]) -> dict[int, Mask]:
     """Return the user's mask, True where pixels count, by the index of the size whose shape it has."""
-    if options.mask is None:
+    if photo.mask is None or isinstance(photo.mask, np.ndarray):
         return {}
-    file = find_mask(options.mask, path)
+    file = find_mask(Path(photo.mask), path)
     if file is None:
-        notes.append(f"found no mask {path.stem} in {options.mask}")
+        notes.append(f"found no mask {path.stem} in {photo.mask}")
         return {}
     index, counts = read_mask(file, sizes)
     return {index: counts}
 
 
-def _sphere_fraction(is_there: NDArray[np.bool_], region: CropRegion) -> float:
+def _sphere_fraction(is_there: Mask, region: CropRegion) -> float:
     """Return the fraction of the sphere that a part (H, W) of a picture of `region` covers."""
     rows = (np.arange(len(is_there)) + 0.5) / len(is_there) * region.height + region.top
     per_row = is_there.mean(axis=1) * np.sin(np.clip(rows, 0.0, 1.0) * np.pi)
     return float(per_row.mean() * region.width * region.height * np.pi / 2.0)
-
-
-def read_photo(
-    panorama: str | PathLike[str] | NDArray[np.uint8],
-    options: ReadOptions,
-    is_masked: NDArray[np.bool_] | None = None,
-) -> Panorama:
-    """Read the panorama in a file; or take that of an array (H, W, 3), with a mask (H, W) of ignored pixels.
-
-    An array without a camera in the options is a full sphere.
-    """
-    if not isinstance(panorama, np.ndarray):
-        if is_masked is not None:
-            raise InputError("mask: found an array and a panorama's path, wanted a picture's path as mask")
-        return read_panorama(Path(panorama), options)
-    if panorama.dtype != np.uint8 or panorama.ndim != 3 or panorama.shape[2] != 3 or not panorama.size:
-        found = f"{panorama.dtype} of shape {panorama.shape}"
-        raise InputError(f"panorama: found {found}, wanted RGB in uint8 of shape (H, W, 3)")
-    is_crop = options.fov_deg is not None and options.projection not in ("pinhole", "fisheye")
-    if options.mask or options.mask_nadir_deg or options.cube_order or options.rig or is_crop:
-        raise InputError("panorama: fov_deg, cube_order, mask_nadir_deg, rig and a mask's path need a file")
-    is_valid = np.ones(panorama.shape[:2], np.bool_)
-    if is_masked is not None:
-        if is_masked.shape != is_valid.shape or is_masked.dtype != np.bool_:
-            raise InputError(f"mask: wanted an array of bool of shape {is_valid.shape}, as the panorama's")
-        is_valid = ~is_masked
-    return panorama_of_array(np.ascontiguousarray(panorama), is_valid, options)

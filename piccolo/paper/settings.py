@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass
 from typing import Literal
 
+from ..arguments import check_fields
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
 from ..geometry.rotations import Gravity
@@ -36,6 +37,7 @@ class PaperSettings(DescentSettings):
 
     def __post_init__(self) -> None:
         """Refuse values that mean nothing, naming the setting."""
+        check_fields(self)
         counts = ("num_translations", "num_by_loss", "num_by_histogram", "num_iterations", "num_culls")
         for name in (*counts, "patience"):
             if getattr(self, name) < 1:

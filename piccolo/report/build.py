@@ -3,7 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,17 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .. import __version__
-from ..arguments import check_arguments
-from ..cloud.settings import UpAxis
+from ..arguments import check_fields, check_kind
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..files.cache import digest_of_sources
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
-from ..jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
-from ..opened_scan import File, read_options_of
-from ..opening import Units, open_scan
+from ..jobs.threads import Workers
+from ..opened_scan import photo_of
 from ..panorama.photo import read_photo_facts
+from ..photo import File
 from ..result import FAILED, UNREADABLE, Result, check_scan
 from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
@@ -29,7 +28,7 @@ from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
 from .entries import Entry, collect_entries, document_of_entry, shorten_names, unique_names
 from .pictures import extract_frames, make_pictures
-from .plan_image import OwnPlan, PlanImage, draw_plan, own_plan
+from .plan_image import PlanImage, draw_plan, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 
 FORMAT = "piccolo-report/1"
@@ -41,16 +40,50 @@ MAKERS = ("report", "views", "confidence", "panorama", "camera")  # folders whos
 
 @dataclass(frozen=True)
 class ReportSettings:
-    """Settings of a report, apart from its results and its scan."""
+    """Settings of a report, apart from its results and its scan.
 
-    title: str = ""  # of the page; by default the scan's name
-    storey_names: tuple[str, ...] = ()  # the lowest first; by default they are numbered
-    images: Path | None = None  # folder of the photos, where they are no more at the results' paths
-    width: int | None = WIDTH  # [px] of spheres, at most; None for the photos' own
-    is_self_contained: bool = False  # one file, of few photos
-    own_plans: tuple[OwnPlan, ...] = ()  # in place of those drawn from the scan
-    crs: str = ""  # coordinate system of the scan, if its map names none
-    is_forced: bool = False  # results of another scan are shown all the same, and the page says so
+    Parameters
+    ----------
+    title
+        Title of the page, by default the scan's name.
+    storeys
+        Names of the storeys, the lowest first, by default numbers.
+    images
+        Folder of the photos, if they are no longer at the paths in the results.
+    full_size
+        Keep the size of the photos. By default spheres are at most 2048 px wide.
+    self_contained
+        Write one HTML file, of at most 50 photos.
+    own_plans
+        Plans in place of the drawn ones, by storey (1 is the lowest): paths of an image and of a CSV file of
+        two or more control points, with the columns u, v [px] and x, y [m].
+    crs
+        Coordinate system of the scan, for an arrow to grid north, if the scan does not name it.
+    force
+        Show results of another scan too, with a note on the page. Otherwise they raise InputError.
+    """
+
+    _: KW_ONLY
+    title: str = ""
+    storeys: Sequence[str] = ()
+    images: File | None = None
+    full_size: bool = False
+    self_contained: bool = False
+    own_plans: Mapping[int, tuple[File, File]] | None = None
+    crs: str = ""
+    force: bool = False
+
+    def __post_init__(self) -> None:
+        """Refuse values of another type, naming the option."""
+        check_fields(self)
+
+    @property
+    def width(self) -> int | None:
+        """Width [px] of spheres, at most; None for the photos' own."""
+        return None if self.full_size else WIDTH
+
+
+DEFAULT = ReportSettings()
 
 
 class Report(NamedTuple):
@@ -76,18 +109,18 @@ def build_report(
     """Write the report of results in a scan: a folder, or one file."""
     if not entries:
         raise InputError("report: found no result")
-    if settings.is_self_contained and len(entries) > MAX_SELF_CONTAINED:
+    if settings.self_contained and len(entries) > MAX_SELF_CONTAINED:
         found = f"found {len(entries)} photos, wanted {MAX_SELF_CONTAINED} or fewer"
         raise InputError(f"`self_contained`: {found}; without it the report is a folder")
     note = check_settings(settings, scan_map, entries)
-    with temporary_folder() if settings.is_self_contained else nullcontext(out) as folder:
-        if not settings.is_self_contained:
+    with temporary_folder() if settings.self_contained else nullcontext(out) as folder:
+        if not settings.self_contained:
             check_folder(out)
         begin_folder(folder)
         tasks = [make_task(entry, scan_map, settings) for entry in entries]
         warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
         document = {**document_of(tasks, scan_map, folder, settings), "note": note}
-        if not settings.is_self_contained:
+        if not settings.self_contained:
             finish_folder(folder, document)
             return Report(out / "index.html", document, warnings)
         write_atomically(out, self_contained(folder, document).encode())
@@ -97,14 +130,14 @@ def build_report(
 def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequence[Entry]) -> str:
     """Refuse storeys that are not there, and results of another scan; if forced, return words on these."""
     found = max(len(scan_map.storeys.storeys), 1)
-    if settings.storey_names and len(settings.storey_names) != found:
-        names = f"found {len(settings.storey_names)} names"
+    if settings.storeys and len(settings.storeys) != found:
+        names = f"found {len(settings.storeys)} names"
         raise InputError(f"`storeys`: {names}, wanted {found}, as the scan has storeys, the lowest first")
-    for plan in settings.own_plans:
-        if not 1 <= plan.storey <= found:
-            raise InputError(f"{plan.image}: found storey {plan.storey}, wanted 1 to {found}")
+    for storey, (image, _) in (settings.own_plans or {}).items():
+        if not 1 <= storey <= found:
+            raise InputError(f"{image}: found storey {storey}, wanted 1 to {found}")
     results = [entry.result for entry in entries]
-    return check_scan(results, scan_map.scan_sha256, "that given", settings.is_forced)
+    return check_scan(results, scan_map.scan_sha256, "that given", settings.force)
 
 
 def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
@@ -112,9 +145,9 @@ def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task
     result = entry.result
     photo = Path(result.pano)
     if settings.images is not None:
-        photo = settings.images / photo.name
+        photo = Path(settings.images) / photo.name
     try:
-        digest = read_photo_facts(photo, read_options_of(result).rig).sha256
+        digest = read_photo_facts(photo_of(result, photo)).sha256
     except (OSError, InputError):
         digest = ""
     parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
@@ -192,14 +225,15 @@ def storey_documents(
     if not found:
         storey = np.zeros(len(scan_map.centers), np.int64)
         height = np.full(len(scan_map.centers), CAMERA_HEIGHT)
-    own = {plan.storey - 1: plan for plan in settings.own_plans}
+    given = (settings.own_plans or {}).items()
+    own = {storey - 1: own_plan(Path(image), Path(csv), scan_map) for storey, (image, csv) in given}
     for k in range(max(len(found), 1)):
-        name = settings.storey_names[k] if settings.storey_names else f"Storey {k + 1}"
+        name = settings.storeys[k] if settings.storeys else f"Storey {k + 1}"
         is_here = storey == k
         places = scan_map.centers[is_here]
         floors = scan_map.centers[is_here, 2] - height[is_here]
         floor = found[k].floor if found else float(np.median([*floors, 0.0]))
-        plan = own_plan(own[k], scan_map) if k in own else draw_plan(scan_map.points, places, floors)
+        plan = own.get(k) or draw_plan(scan_map.points, places, floors)
         document = plan and write_plan(plan, folder)
         yield {"name": name, "floor": floor, "level": round(origin + floor, 3), "plan": document}
 
@@ -214,24 +248,8 @@ def write_plan(plan: PlanImage, folder: Path) -> dict[str, Any]:
     return {"file": f"plans/{key}.png", "matrix": plan.matrix, **size}
 
 
-def write_report(  # noqa: PLR0913  options by name
-    results: File | Iterable[File | Result],
-    scan: File | Sequence[File] | Scan,
-    out: File,
-    *,
-    title: str = "",
-    storeys: Sequence[str] = (),
-    images: File | None = None,
-    full_size: bool = False,
-    self_contained: bool = False,
-    own_plans: Mapping[int, tuple[File, File]] | None = None,
-    crs: str = "",
-    force: bool = False,
-    units: Units = "m",
-    up: UpAxis = "auto",
-    cache: bool | File = True,
-    num_threads: int | None = None,
-    progress: ProgressCallback | None = None,
+def write_report(
+    results: File | Iterable[File | Result], scan: Scan, out: File, settings: ReportSettings = DEFAULT
 ) -> Path:
     """Write a page that shows the photos on plans of the scan, and each photo over the scan.
 
@@ -240,35 +258,16 @@ def write_report(  # noqa: PLR0913  options by name
     results
         Results, or paths of files of JSON lines that localize.py wrote; one path or several items.
     scan
-        The open `Scan`; or the path of a scan or of a prepared map, or several paths.
+        The open `Scan`, whose threads and progress are used.
     out
         Folder that is new, empty, or has an earlier report, of which only the changed parts are written.
-    title
-        Title of the page, by default the scan's name.
-    storeys
-        Names of the storeys, the lowest first, by default numbers.
-    images
-        Folder of the photos, if they are no longer at the paths in the results.
-    full_size
-        Keep the size of the photos. By default spheres are at most 2048 px wide.
-    self_contained
-        Write one HTML file at `out`, of at most 50 photos.
-    own_plans
-        Plans in place of the drawn ones, by storey (1 is the lowest): paths of an image and of a CSV file of
-        two or more control points, with the columns u, v [px] and x, y [m].
-    crs
-        Coordinate system of the scan, for an arrow to grid north, if the scan does not name it.
-    force
-        Show results of another scan too, with a note on the page. Otherwise they raise InputError.
-    units, up, cache
-        As in `open_scan`, if `scan` is a path.
-    num_threads, progress
-        As in `open_scan`.
+    settings
+        The page's title, the storeys' names and more.
 
     Returns
     -------
     Path
-        The page: index.html in `out`, or `out` itself if `self_contained`.
+        The page: index.html in `out`, or `out` itself if it is `self_contained`.
 
     Raises
     ------
@@ -281,28 +280,19 @@ def write_report(  # noqa: PLR0913  options by name
     >>> import piccolo
     >>> scan = piccolo.open_scan("room/cloud.ply")
     >>> result = scan.localize("room/images/clean_0.jpg")
-    >>> piccolo.write_report([result], scan, "report", storeys=["Ground floor"])
+    >>> settings = piccolo.ReportSettings(storeys=["Ground floor"])
+    >>> piccolo.write_report([result], scan, "report", settings)
     PosixPath('report/index.html')
     """
-    check_arguments(write_report, locals())
-    show = report_progress(progress) if progress else no_progress
-    workers = Workers(num_cores() if num_threads is None else num_threads, show)
-    if not isinstance(scan, Scan):
-        scan = open_scan(scan, units=units, up=up, cache=cache, num_threads=num_threads, progress=progress)
-    settings = ReportSettings(
-        title=title,
-        storey_names=tuple(storeys),
-        images=None if images is None else Path(images),
-        width=None if full_size else WIDTH,
-        is_self_contained=self_contained,
-        own_plans=tuple(OwnPlan(k, Path(image), Path(csv)) for k, (image, csv) in (own_plans or {}).items()),
-        crs=crs,
-        is_forced=force,
-    )
-    scan_map = scan._opened.prepared
-    if not isinstance(scan_map, ScanMap):
+    check_kind("results", results, File | Iterable[File | Result])
+    check_kind("scan", scan, Scan)
+    check_kind("out", out, File)
+    check_kind("settings", settings, ReportSettings)
+    opened = scan._opened
+    if not isinstance(opened.prepared, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
-    return build_report(collect_entries(_items(results)), scan_map, Path(out), settings, workers).page
+    entries = collect_entries(_items(results))
+    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page
 
 
 def _items(results: File | Iterable[File | Result]) -> list[Path | Result]:

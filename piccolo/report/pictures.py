@@ -25,7 +25,7 @@ from ..errors import InputError
 from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose, yaw_rotation
 from ..jobs.threads import Workers
-from ..opened_scan import read_options_of
+from ..opened_scan import labels_of, photo_of
 from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink
 from ..panorama.video import frames_at
@@ -57,7 +57,7 @@ def make_pictures(
 
     Spheres are at most `width` px wide, None for the photo's own size. Without a pose there is no scan.
     """
-    panorama = read_panorama(photo, read_options_of(result))
+    panorama = read_panorama(photo_of(result, photo), labels_of(result))
     surfels, points = scan
     full = min(panorama.rgb.shape[1], width or MAX_WIDTH)
     small = shrink(panorama, full)

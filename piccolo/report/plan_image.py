@@ -144,14 +144,6 @@ def _walls(columns: Int64s, rows: Int64s, above: Array, shape: tuple[int, int]) 
     return np.asarray(cv2.dilate(closed, square) > 0)
 
 
-class OwnPlan(NamedTuple):
-    """A plan of a storey."""
-
-    storey: int  # 1 for the lowest
-    image: Path
-    control_points: Path  # CSV
-
-
 def read_control_points(path: Path) -> Array:
     """Rows u, v [px], x, y [m, world] (N, 4) of a CSV file."""
     rows = csv.DictReader(read_text(path, WANTED).splitlines())
@@ -192,12 +184,12 @@ def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]
     return (*linear.T.ravel().tolist(), *shift.tolist()), error
 
 
-def own_plan(plan: OwnPlan, scan_map: ScanMap) -> PlanImage:
-    """Return the user's plan in the map's frame."""
-    points = read_control_points(plan.control_points)
+def own_plan(image: Path, control_points: Path, scan_map: ScanMap) -> PlanImage:
+    """Return the user's plan, an image and a CSV file, in the map's frame."""
+    points = read_control_points(control_points)
     world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
     places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]
-    rgb: Bytes = read_picture(plan.image).rgb
+    rgb: Bytes = read_picture(image).rgb
     scale = min(1.0, MAX_OWN_SIDE / max(rgb.shape[:2]))
     size = math.ceil(rgb.shape[1] * scale), math.ceil(rgb.shape[0] * scale)
     if scale < 1.0:
@@ -205,5 +197,5 @@ def own_plan(plan: OwnPlan, scan_map: ScanMap) -> PlanImage:
     try:
         matrix, _ = plan_matrix(points[:, :2] * scale, places)
     except InputError as error:
-        raise InputError(f"{plan.control_points}: {error}") from error
+        raise InputError(f"{control_points}: {error}") from error
     return PlanImage(rgb, matrix)

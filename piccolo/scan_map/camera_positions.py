@@ -28,7 +28,7 @@ NEAR = 0.3  # [m] clearance below which the grid is refined
 MAX_POSITIONS = 250_000  # looked at, and views rendered: some ten minutes on two cores, 1.9 GB
 ADVICE = (
     "the most that are searched; if its unit is not the metre, set `units`, else say where the camera was "
-    "(`near_world` and `radius`) or cut out a part"
+    "(`near` and `radius`) or cut out a part"
 )
 BASES = 1 << 14  # cells on surfaces, around which others are supported, or centres, at a time
 LONG = 60.0  # [s] a warning says how long the views take, if more

@@ -18,9 +18,9 @@ from ..geometry.pose import rotate_points
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once, Workers
 from ..local_features.feature_map import FeatureMap
+from ..prior import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .named_scans import name_scan
-from .prior import NOTHING_KNOWN, Prior
 from .scan_addition import add_scan
 from .scan_map import ScanMap, add_features, prepare_map
 
@@ -86,7 +86,7 @@ def open_map(
 def write_map(scan_map: ScanMap, path: Path, workers: Workers) -> None:
     """Write a map with its local features; InputError if it covers only a part of a scan."""
     if scan_map.is_partial:
-        raise InputError(f"{path}: found a map prepared within `near_world` only, wanted a whole map")
+        raise InputError(f"{path}: found a map prepared within `near` only, wanted a whole map")
     save_map(add_features(scan_map, workers), path)
 
 

@@ -19,10 +19,10 @@ from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.stopwatch import Stopwatch
 from ..jobs.threads import Once, Workers
 from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
+from ..prior import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from ..views.view import ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
-from .prior import NOTHING_KNOWN, Prior
 from .storeys import Storeys, find_storeys
 
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
@@ -149,10 +149,10 @@ def find_candidates(
     try:
         return candidate_centers(octree, workers), ()
     except TooManyPositionsError:
-        if prior.near_world is None or prior.radius is None:
+        if prior.near is None or prior.radius is None:
             raise
-    near = R_map_from_world @ (np.array(prior.near_world) - origin_world)
-    part = f"prepared within {prior.radius:g} m of `near_world`, for this run only"
+    near = R_map_from_world @ (np.array(prior.near) - origin_world)
+    part = f"prepared within {prior.radius:g} m of `near`, for this run only"
     text = f"the scan is too large as a whole: {part}"
     centers = candidate_centers(octree, workers, Ball(near, prior.radius))
     workers.warn(text)

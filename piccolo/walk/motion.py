@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from itertools import pairwise
 
+from ..arguments import check_fields
 from ..errors import InputError
 from ..scan_map.camera_positions import COARSE_SPACING
 
@@ -17,14 +18,27 @@ JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place t
 
 @dataclass(frozen=True)
 class Motion:
-    """The motion of a carried camera."""
+    """The motion of a carried camera.
 
-    max_speed: float | None = None  # given [m/s]; of frames without times [m] from one to the next
-    max_acceleration: float = MAX_ACCELERATION  # [m/s^2] standard deviation along each axis, of timed frames
-    is_timed: bool = True  # False if only the order of the frames is known
+    Parameters
+    ----------
+    max_speed
+        Largest speed of the camera [m/s], 2 by default. If frames have no times, it is the largest
+        distance [m] between consecutive frames, 5 by default.
+    max_acceleration
+        Standard deviation of the acceleration along each axis [m/s^2]: less smooths the path more.
+    is_timed
+        False if the times of the frames are only their order.
+    """
+
+    _: KW_ONLY
+    max_speed: float | None = None
+    max_acceleration: float = MAX_ACCELERATION
+    is_timed: bool = True
 
     def __post_init__(self) -> None:
         """Refuse speeds and accelerations that are not above 0."""
+        check_fields(self)
         for name in ("max_speed", "max_acceleration"):
             value = getattr(self, name)
             if value is not None and not 0.0 < value < math.inf:

@@ -15,9 +15,9 @@ from ..localization.query import Query
 from .beliefs import Belief, believe
 from .frames import Frame
 from .path import EVEN, Path, build_lattice
-from .tracker import Expected, Found, Tracker, find_near, refine_state
+from .tracker import Expected, Followed, Tracker, find_near, refine_state
 
-Find = Callable[[Query], Found | None]
+Find = Callable[[Query], Followed | None]
 
 
 @one_blas_thread
@@ -119,7 +119,7 @@ def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Belief], k: int) -> li
     return sorted(filter(None, sides), key=lambda side: abs(frames[side[0]].time - frames[k].time))
 
 
-def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Found) -> None:
+def _hang(frames: list[Frame], path: Path, k: int, sure: int, found: Followed) -> None:
     """Give a frame a pose beside a sure one, whose key frame is then its key frame too."""
     key = sure if frames[sure].is_key else frames[sure].key
     chosen = None if key is None else path.choose(key)

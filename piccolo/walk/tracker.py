@@ -57,7 +57,7 @@ class Expected(NamedTuple):
     pose: Pose  # predicted
 
 
-class Found(NamedTuple):
+class Followed(NamedTuple):
     """The pose of a frame that was found from another's."""
 
     state: State
@@ -154,7 +154,7 @@ class Tracker:
             frame.arrived = found.state.pose
             frame.key = key
 
-    def find(self, query: Query, frame: Frame, near: Sequence[tuple[int, Pose]]) -> Found | None:
+    def find(self, query: Query, frame: Frame, near: Sequence[tuple[int, Pose]]) -> Followed | None:
         """Find a frame from others, the last of them first, by their numbers and poses.
 
         A narrow photo is matched with those of them that are sure by themselves.
@@ -282,7 +282,7 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
     return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
 
 
-def find_near(query: Query, expected: Expected) -> Found | None:
+def find_near(query: Query, expected: Expected) -> Followed | None:
     """Find a frame where it is expected, unless a place within reach looks better than a copy of that would.
 
     If it is not found there, the best place within reach is tried. What is not where it was expected is to be
@@ -304,7 +304,7 @@ def find_near(query: Query, expected: Expected) -> Found | None:
         return None
     how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
     state = replace(end, gain=compute_gain(query, near))
-    return Found(state, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
+    return Followed(state, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
 
 
 def compute_gain(query: Query, near: Query) -> float:

@@ -5,10 +5,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo.arrays import Array
 from piccolo.cloud import FORMATS
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_text
-from piccolo.geometry.pose import Array, Pose, check_transform
+from piccolo.geometry.pose import Pose, check_transform
 from piccolo.geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM
 from piccolo.panorama.picture import read_picture
 

@@ -188,7 +188,7 @@ def run_scenes(
     """
     query_result.check_variants(scenes, variants)
     check_output(path)
-    settings = settings_json(config.settings, config.cloud_settings, config.read_options)
+    settings = settings_json(config.settings, config.cloud_settings, config.photo)
     with open_locked(path) as file, ExitStack() as stack:
         rows, size = query_result.read_run(path)
         query_result.check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
@@ -236,7 +236,7 @@ class Evaluation:
         if cluster:
             cluster.forget()  # a worker may not have room for the last scene's map and this one's
         localizer = replace(self.config, paths=(scene.cloud,))
-        if has_labels := localizer.read_options.labels is not None:
+        if has_labels := localizer.cloud_settings.labels is not None:
             queries = self.select_labelled(scene, queries)
         num_jobs = count_jobs(self.arguments, len(queries))
         with ExitStack() as stack:

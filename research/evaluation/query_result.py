@@ -10,12 +10,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from piccolo.arrays import Array
 from piccolo.batch.results_file import check_as_expected
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.errors import InputError, printable
 from piccolo.files.json_file import document_of, parse_lines, read_bytes
 from piccolo.files.line_file import whole_size
-from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Array, Pose, pose_errors
+from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.opened_scan import OpenedScan
 from piccolo.result import Result
 from piccolo.scene import Query, Scene, document_of_pose, pose_of

@@ -7,8 +7,8 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from piccolo.arrays import Array
 from piccolo.errors import printable
 from piccolo.export.formats import cell
 
@@ -29,7 +29,7 @@ class Counts(NamedTuple):
     num_wrong: int  # of the localized
 
 
-def quartiles(values: Sequence[float]) -> NDArray[np.float64]:
+def quartiles(values: Sequence[float]) -> Array:
     """Return the PERCENTS (3,) of values, some of which may be infinite."""
     found = np.percentile(np.minimum(values, HUGE), PERCENTS)
     return np.where(found > 1e-6 * HUGE, np.inf, found)

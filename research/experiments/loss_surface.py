@@ -15,9 +15,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import minimum_filter
 
+from piccolo.arrays import Array, Int64s, Mask
 from piccolo.cli.command import command, option, print_warnings
 from piccolo.cli.errors import checking_options
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
@@ -26,7 +26,7 @@ from piccolo.cli.progress import progress_bar
 from piccolo.cloud.soa import LocalCloud, PackedPoints
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Array, Pose
+from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optimize.sampling_loss import sampling_loss
@@ -56,7 +56,7 @@ class PoseGrid(NamedTuple):
     x: Array  # (nx,) [m]
     y: Array  # (ny,) [m]
     heights: Array  # (nz,) [m]
-    R_cam_from_local: NDArray[np.float64]  # (rotations, 3, 3)
+    R_cam_from_local: Array  # (rotations, 3, 3)
 
     @property
     def num_poses(self) -> int:
@@ -69,8 +69,8 @@ class LossSurface(NamedTuple):
 
     loss: Array  # (ny, nx) [0, sqrt(3)], inf where masked pixels hide too much at every pose
     height: Array  # (ny, nx) [m] of the best pose
-    rotation: NDArray[np.int64]  # (ny, nx) index of its rotation
-    is_free: NDArray[np.bool_]  # (ny, nx) false too near to a point, or outside of the cloud
+    rotation: Int64s  # (ny, nx) index of its rotation
+    is_free: Mask  # (ny, nx) false too near to a point, or outside of the cloud
 
     def lowest(self) -> tuple[int, int]:
         """Return row and column of the least loss in free space; of all places if none is free.

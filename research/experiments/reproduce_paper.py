@@ -15,8 +15,8 @@ from zlib import crc32
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
 from piccolo.cli.command import check_least, command, option
 from piccolo.cli.errors import EXIT_BAD_INPUT, checking_options, print_error
@@ -29,12 +29,13 @@ from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
-from piccolo.geometry.pose import Array, Pose, move, transform_points
+from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.geometry.rotations import random_rotation
 from piccolo.jobs.memory import limit_memory
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import ReadOptions, read_panorama
+from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
+from piccolo.photo import Photo
 from piccolo.scan_map.open_map import CachePolicy
 from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
@@ -73,7 +74,7 @@ def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     return replace(scene, cloud=_write_cloud(folder, points, cloud.colors), queries=queries)
 
 
-def _write_cloud(folder: Path, points: Array, colors: NDArray[np.uint8]) -> Path:
+def _write_cloud(folder: Path, points: Array, colors: Bytes) -> Path:
     path = folder / CLOUD_NAME
     write_ply(path, vertex_rows(points, colors))
     return path
@@ -281,7 +282,6 @@ def run_condition(
     """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
     cloud_settings = CloudSettings(labels=labels)
-    read_options = ReadOptions(labels=labels)
     transformed = []
     num_failed = 0
     with tempfile.TemporaryDirectory(prefix="piccolo-") as temporary:
@@ -294,7 +294,7 @@ def run_condition(
                 print_error(arguments, str(error), EXIT_BAD_INPUT)
                 num_failed += len(scene.queries)
         cache = CachePolicy(True, Path(temporary))
-        config = Localizer((), condition.settings, cloud_settings, read_options, cache)
+        config = Localizer((), condition.settings, cloud_settings, Photo(Path()), cache)
         variants = condition.variants or arguments.variants  # those of a condition are of the wanted
         path = out / file_name(condition)
         rows, num_failed_later = run_scenes(arguments, path, config, transformed, variants)

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from piccolo.arrays import Array
 from piccolo.cli.command import option
 from piccolo.confidence.confidence import (
     AMBIGUOUS,
@@ -45,7 +45,6 @@ regions of the covariance.
 """
 PENALTY = 0.05  # on squared weights of features of deviation 1: without, easy trials ask for ever larger ones
 TENTHS = [k / 10 for k in range(11)]
-Array = NDArray[np.float64]
 Case = tuple[str, str, bool]  # what was tried, the status, and whether the best pose is right
 
 

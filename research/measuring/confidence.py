@@ -17,7 +17,8 @@ from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import ReadOptions, read_panorama, read_photo
+from piccolo.panorama import read_panorama
+from piccolo.photo import Photo
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scene import Scene, document_of_pose, read_scene
 
@@ -184,7 +185,7 @@ def run(arguments: argparse.Namespace) -> int:
             scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
                 settings = CoarseToFineSettings(gravity=trial.gravity)
-                photo = read_photo(trial.rgb, ReadOptions(focal_px=trial.focal_px), trial.is_masked)
+                photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
                 found = localize(scan_map, photo, settings, workers, Stopwatch())
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(found.pose, truth)

@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from piccolo.arrays import Array32, Bytes
 from piccolo.cloud import Cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, yaw_rotation
@@ -19,7 +19,7 @@ NUM_ROUNDS = 15
 MAX_POINTS = 1_000_000
 
 
-def coherent_map(num_pixels: int, width: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def coherent_map(num_pixels: int, width: int) -> tuple[Array32, Array32]:
     """Return a smooth map of about `num_pixels` that runs over a whole image of `width` x width / 2."""
     side = round(num_pixels**0.5)
     u, v = np.meshgrid(np.linspace(4, width - 5, side), np.linspace(4, width // 2 - 5, side))
@@ -39,7 +39,7 @@ def medians(contenders: dict[str, Callable[[], object]], num_rounds: int) -> dic
     return {name: float(np.median(values)) for name, values in seconds.items()}
 
 
-def kernel_table(cloud: Cloud, rgb: NDArray[np.uint8]) -> Table:
+def kernel_table(cloud: Cloud, rgb: Bytes) -> Table:
     """Time the kernels on a scan and a panorama (H, W, 3), the camera at the middle of the points.
 
     The reference is cv2.remap: 8-bit, 3 channels, bilinear, one thread, a coherent map, a pixel a point.

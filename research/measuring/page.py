@@ -15,6 +15,7 @@ import numpy as np
 from scipy.stats import chi2
 
 import piccolo
+from piccolo.arrays import Bytes
 from piccolo.cli.command import check_least, option
 from piccolo.cli.errors import print_note
 from piccolo.cloud import read_cloud
@@ -30,7 +31,7 @@ from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
-from ..synthetic.photos import PHOTO_FOV_DEG, Image, cut_photo, write_photo
+from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
 from .kernels import kernel_table
 from .scaling import clean_queries, size_table
@@ -52,37 +53,31 @@ CONFIDENCES = (0.0, 0.5, 0.9, 0.99, 1.0)
 MAX_WRONG = 20  # lines
 COLUMNS = ("queries", "right", "localized", "wrong of these", "outside", "mm", "deg", "s")
 
-PANORAMAS = "Panoramas as they are"
-DAMAGE = "Damaged panoramas and scans"
-PHOTOS = "Phone photos"
-PAPER = "Against the preset `paper`"
-SIZE = "Time and memory by the size of the scan"
-KERNELS = "Kernels against `cv2.remap`"
-TEXTS = {
-    PANORAMAS: """\
+PARTS = {  # title and text of each
+    "panoramas": """\
+## Panoramas as they are
 All panoramas of each scene. clean: as the scan was made; tilt: the camera in any rotation; photo: other
 exposure and colours, noise, blur; change: furniture moved, people and things added.""",
-    DAMAGE: """\
+    "damage": """\
+## Damaged panoramas and scans
 Seeded damage to panoramas of all scenes. Panoramas that are mirrored or of another place have no right pose:
 each one that is localized is wrong.""",
-    PHOTOS: f"""\
+    "photos": f"""\
+## Phone photos
 Pinhole photos of {PHOTO_FOV_DEG:g} degrees, cut out of the panoramas in random directions, so they are soft.
 EXIF has the focal length in whole millimetres. Photos of a scene's own come with their calibrations.
 The corridor's true poses are ARKit's, good to about 2 cm and 0.5 degrees, so `outside` says little there.""",
-    PAPER: """\
+    "paper": """\
+## Against the preset `paper`
 The same panoramas by both methods, gravity known. The preset is Algorithm 1 of the paper.""",
-    SIZE: """\
+    "size": """\
+## Time and memory by the size of the scan
 Each row is measured in a process of its own, gravity known and unknown. A scene is resampled; rooms are those
-of `tools/make_room.py`, 50,000 points each. The peak of memory is that of the whole process.""",
-    KERNELS: "The reference is `cv2.remap`, one thread: 8 bits, 3 channels, bilinear, a pixel a point.",
-}
-PARTS = {
-    "panoramas": PANORAMAS,
-    "damage": DAMAGE,
-    "photos": PHOTOS,
-    "paper": PAPER,
-    "size": SIZE,
-    "kernels": KERNELS,
+of `tools/make_room.py`, 50,000 points each. Features: with the map's file. The peak of memory is that of the
+whole process.""",
+    "kernels": """\
+## Kernels against `cv2.remap`
+The reference is `cv2.remap`, one thread: 8 bits, 3 channels, bilinear, a pixel a point.""",
 }
 HEAD = """\
 # Benchmark
@@ -141,11 +136,7 @@ class Bench:
             raise InputError(f"{empty[0].folder}: found no queries, wanted pictures with true poses")
         self.of_photos = [scene for scene in scenes if camera_path(scene, scene.queries[0]).exists()]
         self.of_panoramas = [scene for scene in scenes if scene not in self.of_photos]
-        self.rows: dict[str, list[QueryResult]] = {part: [] for part in TEXTS}
-
-    def is_wanted(self, part: str) -> bool:
-        """Return True if a part is measured."""
-        return part in {PARTS[name] for name in self.arguments.only}
+        self.rows: dict[str, list[QueryResult]] = {part: [] for part in PARTS}
 
     def add(self, part: str, label: str, query: str, true_pose: Pose | None, result: Result) -> None:
         """Keep the result of a query, the label of the table's line as its variant."""
@@ -159,27 +150,27 @@ class Bench:
         for number, scene in enumerate(self.of_panoramas):
             others = [*self.of_panoramas[number + 1 :], *self.of_panoramas[:number]]
             self.measure_panoramas(scene, others)
-        for scene in self.of_photos if self.is_wanted(PHOTOS) else []:
+        for scene in self.of_photos if "photos" in self.arguments.only else []:
             scan = piccolo.open_scan(scene.cloud, cache=False)
             for query in scene.queries:
-                result = scan.localize(query.image, camera=camera_path(scene, query))
-                self.add(PHOTOS, f"{scene.name}, own photos", query.image.name, query.pose, result)
+                result = scan.localize(piccolo.Photo(query.image, camera=camera_path(scene, query)))
+                self.add("photos", f"{scene.name}, own photos", query.image.name, query.pose, result)
 
     def measure_panoramas(self, scene: Scene, others: Sequence[Scene]) -> None:
         """Localize the panoramas of a scene, and what is made of them."""
         scan = piccolo.open_scan(scene.cloud, cache=False)
-        if self.is_wanted(PANORAMAS):
+        if "panoramas" in self.arguments.only:
             for query in scene.queries:
                 label = f"{scene.name}, {query.variant}"
-                self.add(PANORAMAS, label, query.image.name, query.pose, scan.localize(query.image))
-        if self.is_wanted(DAMAGE):
+                self.add("panoramas", label, query.image.name, query.pose, scan.localize(query.image))
+        if "damage" in self.arguments.only:
             self.measure_damage(scene, scan, read_foreign(others))
-        if self.is_wanted(PHOTOS):
+        if "photos" in self.arguments.only:
             self.measure_photos(scene, scan)
-        if self.is_wanted(PAPER):
+        if "paper" in self.arguments.only:
             self.measure_paper(scene, scan)
 
-    def measure_damage(self, scene: Scene, scan: piccolo.Scan, others: Sequence[Image]) -> None:
+    def measure_damage(self, scene: Scene, scan: piccolo.Scan, others: Sequence[Bytes]) -> None:
         """Localize damaged panoramas, and panoramas in damaged scans."""
         queries = clean_queries(scene, self.arguments.damaged)
         panoramas = [read_panorama(query.image).rgb for query in queries]
@@ -190,15 +181,16 @@ class Bench:
             elsewhere = Trial("another place", other, None)
             for trial in (taken, *damage_trial(taken, other, rng), elsewhere):
                 name = f"{scene.name}/{query.image.name}"
-                result = scan.localize(trial.rgb, mask=trial.is_masked)
-                self.add(DAMAGE, trial.case, name, trial.true_pose, result)
+                result = scan.localize(piccolo.Photo(trial.rgb, mask=trial.is_masked))
+                self.add("damage", trial.case, name, trial.true_pose, result)
         cloud = read_cloud(scene.cloud)
         points: Points = (cloud.points + cloud.origin_world, cloud.colors)
         for label, change in DAMAGED_SCANS.items():
-            damaged_scan = piccolo.open_scan(*change(points, np.random.default_rng(61)))
+            damaged_points, colors = change(points, np.random.default_rng(61))
+            damaged_scan = piccolo.open_scan(piccolo.Cloud(damaged_points, colors=colors))
             for query in queries:
                 name = f"{scene.name}/{query.image.name}"
-                self.add(DAMAGE, label, name, query.pose, damaged_scan.localize(query.image))
+                self.add("damage", label, name, query.pose, damaged_scan.localize(query.image))
 
     def measure_photos(self, scene: Scene, scan: piccolo.Scan) -> None:
         """Localize photos that are cut out of panoramas, with exact and with rounded focal lengths."""
@@ -210,10 +202,10 @@ class Bench:
                 path = Path(folder) / f"{scene.name}_{number}.jpg"
                 photo = cut_photo(read_panorama(query.image).rgb, query.pose, PHOTO_FOV_DEG, rng)
                 write_photo(photo, path)
-                exact = scan.localize(path, focal_px=photo.focal_px)
-                self.add(PHOTOS, f"{scene.name}, exact focal length", path.name, photo.pose, exact)
+                exact = scan.localize(piccolo.Photo(path, focal_px=photo.focal_px))
+                self.add("photos", f"{scene.name}, exact focal length", path.name, photo.pose, exact)
                 rounded = scan.localize(path)
-                self.add(PHOTOS, f"{scene.name}, focal length by EXIF", path.name, photo.pose, rounded)
+                self.add("photos", f"{scene.name}, focal length by EXIF", path.name, photo.pose, rounded)
 
     def measure_paper(self, scene: Scene, scan: piccolo.Scan) -> None:
         """Localize the same panoramas by both methods."""
@@ -221,37 +213,37 @@ class Bench:
         for query in clean_queries(scene, NUM_BY_PAPER):
             name = f"{scene.name}/{query.image.name}"
             for label, one in {"preset paper": by_paper, "default method": scan}.items():
-                self.add(PAPER, label, name, query.pose, one.localize(query.image, gravity="known"))
+                self.add("paper", label, name, query.pose, one.localize(query.image, gravity="known"))
 
     def sections(self) -> Iterator[str]:
         """Yield the parts of the page after its head, measured by now or as they come."""
         for part, rows in self.rows.items():
             if rows:
-                yield f"## {part}\n{TEXTS[part]}\n\n{accuracy_table(rows).markdown()}"
-            if rows and part == PAPER:
+                yield f"{PARTS[part]}\n\n{accuracy_table(rows).markdown()}"
+            if rows and part == "paper":
                 yield f"The preset takes {time_ratio(rows):.1f} times as long.\n"
-        rows = [row for part, own in self.rows.items() if part != PAPER for row in own]
+        rows = [row for part, own in self.rows.items() if part != "paper" for row in own]
         if rows:
             stated = [row.result.confidence for row in rows]
             table = reliability_table("confidence", stated, [row.is_correct() for row in rows], CONFIDENCES)
             text = "All queries above but those of the preset comparison."
             yield f"## Confidences\n{text}\n\n{table.markdown()}\n{wrong_lines(rows)}"
-        if self.of_panoramas and self.is_wanted(SIZE):
+        if self.of_panoramas and "size" in self.arguments.only:
             scene = self.of_panoramas[0]
             sizes = size_table(scene, self.arguments.points, self.arguments.rooms, self.note)
-            yield f"## {SIZE}\n{TEXTS[SIZE]}\n\n{sizes.markdown()}"
-        if self.of_panoramas and self.is_wanted(KERNELS):
+            yield f"{PARTS['size']}\n\n{sizes.markdown()}"
+        if self.of_panoramas and "kernels" in self.arguments.only:
             scene = self.of_panoramas[0]
             rgb = read_panorama(scene.queries[0].image).rgb
             speeds = kernel_table(read_cloud(scene.cloud), rgb)
-            yield f"## {KERNELS}\n{TEXTS[KERNELS]}\n{speeds.markdown()}"
+            yield f"{PARTS['kernels']}\n{speeds.markdown()}"
 
     def note(self, text: str) -> None:
         """Print progress."""
         print_note(self.arguments, text)
 
 
-def read_foreign(scenes: Sequence[Scene]) -> list[Image]:
+def read_foreign(scenes: Sequence[Scene]) -> list[Bytes]:
     """Return panoramas of other places: of the first other scene, or of a made room."""
     if scenes:
         return [read_panorama(query.image).rgb for query in clean_queries(scenes[0], 4)]

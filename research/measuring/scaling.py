@@ -5,23 +5,19 @@ import tempfile
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from piccolo.cloud import Cloud, read_cloud, stream_points
-from piccolo.cloud.readers.reader import RawCloud
-from piccolo.geometry.pose import Pose, is_correct
+import piccolo
+from piccolo.arrays import Bytes, Floats
+from piccolo.cloud import read_cloud
+from piccolo.geometry.pose import is_correct
 from piccolo.geometry.rotations import Gravity
-from piccolo.jobs.stopwatch import Stopwatch
 from piccolo.jobs.threads import Workers, num_cores
-from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import Panorama, read_panorama
-from piccolo.scan_map.map_file import load_map, save_map
-from piccolo.scan_map.scan_map import ScanMap, prepare_map
+from piccolo.panorama import read_panorama
 from piccolo.scene import Query, Scene
 
 from ..evaluation.tables import Table
@@ -34,7 +30,17 @@ COLUMNS = (
     "right", "peak MB",
 )  # fmt: skip
 
-Case = tuple[Cloud, list[tuple[Panorama, Pose]]]  # a cloud, and panoramas in it with their true poses
+
+class Case(NamedTuple):
+    """A scan, and panoramas in it with their true poses."""
+
+    points: Floats  # (N, 3) [m]
+    colors: Bytes  # (N, 3)
+    queries: list[tuple[Bytes, piccolo.Pose]]
+
+    def open_scan(self, every: int = 1) -> piccolo.Scan:
+        """Prepare one of `every` so many points."""
+        return piccolo.open_scan(piccolo.Cloud(self.points[::every], colors=self.colors[::every]))
 
 
 def clean_queries(scene: Scene, count: int) -> list[Query]:
@@ -53,10 +59,8 @@ def scene_case(scene: Scene, num_points: int) -> Case:
     points = cloud.points[index]
     if num_points > len(cloud.points):
         points = points + rng.normal(0.0, 0.005, points.shape).astype(np.float32)
-    taken = clean_queries(scene, NUM_QUERIES)
-    queries = [(read_panorama(query.image), query.pose) for query in taken]
-    raw = RawCloud(points + cloud.origin_world, cloud.colors[index])
-    return stream_points(scene.cloud, raw).read(), queries
+    queries = [(read_panorama(q.image).rgb, q.pose) for q in clean_queries(scene, NUM_QUERIES)]
+    return Case(points + cloud.origin_world, cloud.colors[index], queries)
 
 
 def rooms_case(num_rooms: int) -> Case:
@@ -65,19 +69,7 @@ def rooms_case(num_rooms: int) -> Case:
     world = make_world(11, np.array([5.0, 4.0, 2.6]), num_rooms)
     points, colors, _ = scan_world(world, 50_000 * num_rooms, workers)
     taken = [make_query(world, k, "clean", 1024, workers) for k in range(NUM_QUERIES)]
-    queries = [(Panorama(q.rgb, np.ones(q.rgb.shape[:2], dtype=bool)), q.pose) for q in taken]
-    return stream_points(Path("rooms"), RawCloud(points.astype(np.float64), colors)).read(), queries
-
-
-def measure_file(scan_map: ScanMap) -> tuple[str, str]:
-    """Return the size [MB] of a map's file, and the time [ms] to open it once it has been checked."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "scan.map"
-        save_map(replace(scan_map, scan_sha256=64 * "0"), path)  # whatever the scan is
-        load_map(path, remembers=True)
-        begin = time.perf_counter()
-        load_map(path, remembers=True)
-        return f"{path.stat().st_size / 1e6:.1f}", f"{1000.0 * (time.perf_counter() - begin):.0f}"
+    return Case(points, colors, [(query.rgb, query.pose) for query in taken])
 
 
 def peak_memory_mb() -> float:
@@ -88,30 +80,31 @@ def peak_memory_mb() -> float:
 
 def measure(label: str, make: Callable[[], Case]) -> tuple[str, ...]:
     """Return one row of the table."""
-    cloud, queries = make()
-    workers = Workers(num_cores())
-    every = max(1, len(cloud.points) // 20_000)
-    small = Cloud(cloud.points[::every], cloud.colors[::every], cloud.origin_world)
+    case = make()
+    small = case.open_scan(every=max(1, len(case.points) // 20_000))
     for gravity in GRAVITIES:  # compiles
-        settings = CoarseToFineSettings(gravity=gravity)
-        localize(prepare_map(small, workers), queries[0][0], settings, workers, Stopwatch())
+        small.localize(case.queries[0][0], gravity=gravity)
     begin = time.perf_counter()
-    scan_map = prepare_map(cloud, workers, has_features=False)
-    columns = [label, f"{len(cloud.points):,}", f"{time.perf_counter() - begin:.1f}"]
-    begin = time.perf_counter()
-    scan_map.features_now(workers)
-    columns.append(f"{time.perf_counter() - begin:.1f}")
-    columns += measure_file(scan_map)
+    scan = case.open_scan()
+    columns = [label, f"{len(case.points):,}", f"{time.perf_counter() - begin:.1f}"]
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scan.map"
+        begin = time.perf_counter()
+        scan.save(path)
+        columns += [f"{time.perf_counter() - begin:.1f}", f"{path.stat().st_size / 1e6:.1f}"]
+        piccolo.open_scan(path)  # which checks it
+        begin = time.perf_counter()
+        piccolo.open_scan(path)
+        columns.append(f"{1000.0 * (time.perf_counter() - begin):.0f}")
     for gravity in GRAVITIES:
-        settings = CoarseToFineSettings(gravity=gravity)
         times = []
         correct = 0
-        for panorama, truth in queries:
+        for rgb, truth in case.queries:
             begin = time.perf_counter()
-            found = localize(scan_map, panorama, settings, workers, Stopwatch())
+            found = scan.localize(rgb, gravity=gravity)
             times.append(time.perf_counter() - begin)
-            correct += is_correct(found.pose, truth)
-        columns += [f"{np.median(times):.2f}", f"{correct}/{len(queries)}"]
+            correct += is_correct(found.best_pose, truth)
+        columns += [f"{np.median(times):.2f}", f"{correct}/{len(case.queries)}"]
     return (*columns, f"{peak_memory_mb():.0f}")
 
 

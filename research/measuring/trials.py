@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo.arrays import Bytes, Floats, Mask
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import Gravity
 
 from ..synthetic.photos import (
     UPSIDE_DOWN,
-    Image,
     blur,
     compress,
     draw_fractal_noise,
@@ -25,21 +25,21 @@ from ..synthetic.photos import (
 POINT_NOISE = 0.05  # [m]
 JPEG_QUALITY = 10
 FOVS_DEG = (90.0, 120.0, 65.0)  # of narrow photos
-Points = tuple[NDArray[np.floating], NDArray[np.uint8]]
+Points = tuple[Floats, Bytes]
 
 
 class Trial(NamedTuple):
     """A photo to be localized."""
 
     case: str
-    rgb: Image  # (H, W, 3)
+    rgb: Bytes  # (H, W, 3)
     true_pose: Pose | None  # None if it was not taken in the scan, or not as a camera would
     gravity: Gravity = "auto"
-    is_masked: NDArray[np.bool_] | None = None  # (H, W) what the photo does not show
+    is_masked: Mask | None = None  # (H, W) what the photo does not show
     focal_px: float | None = None  # of a pinhole photo; None for a sphere
 
 
-def damage_trial(trial: Trial, other: Image, rng: np.random.Generator) -> Iterator[Trial]:
+def damage_trial(trial: Trial, other: Bytes, rng: np.random.Generator) -> Iterator[Trial]:
     """Yield a panorama after each kind of damage, which is then its case; pieces of `other` hide it."""
     rgb = trial.rgb
     height, width = rgb.shape[:2]

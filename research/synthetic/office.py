@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from piccolo.arrays import Array, Int64s
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Array
 
 from .room import (
     DOOR_ROOM,
@@ -129,7 +128,7 @@ class Office:
 
     world: World  # the rooms, then parts of corridors and halls; each with the boxes of all
     num_rooms: int
-    copies: NDArray[np.int64]  # (num_rooms,) the room of which a room is a copy; itself if of none
+    copies: Int64s  # (num_rooms,) the room of which a room is a copy; itself if of none
     levels: Array  # (S,) heights of the floors [m]
     flights: tuple[Flight, ...]
 

@@ -6,12 +6,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+import PIL.Image
 from numpy.typing import NDArray
-from PIL import Image as PillowImage
 from scipy.ndimage import gaussian_filter
 
+from piccolo.arrays import Array, Bytes, Mask
 from piccolo.camera.model import camera_of_fov
-from piccolo.geometry.pose import Array, Pose, exp_so3, yaw_rotation
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays, solid_angles
 
 PHOTO_SIZE = (1024, 768)  # [px]
@@ -24,18 +25,17 @@ LEAST_RADIUS = math.radians(8.0)  # of an occluder
 MOST_RADIUS = math.radians(28.0)
 ASPECT = 0.75  # height by width of a narrow photo
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])  # half a turn about the view axis
-Image = NDArray[np.uint8]
 
 
 class Photo(NamedTuple):
     """A phone photo cut out of a panorama."""
 
-    rgb: Image  # (H, W, 3)
+    rgb: Bytes  # (H, W, 3)
     pose: Pose
     focal_px: float
 
 
-def cut_photo(rgb: Image, pose: Pose, fov_deg: float, rng: np.random.Generator) -> Photo:
+def cut_photo(rgb: Bytes, pose: Pose, fov_deg: float, rng: np.random.Generator) -> Photo:
     """Cut a pinhole photo out of a panorama (H, W, 3) taken at `pose`, in any direction but steep ones."""
     camera = camera_of_fov("pinhole", fov_deg, *PHOTO_SIZE)
     pitch, roll = np.radians(rng.uniform([-15.0, -5.0], [15.0, 5.0]))
@@ -52,14 +52,14 @@ def cut_photo(rgb: Image, pose: Pose, fov_deg: float, rng: np.random.Generator) 
 
 def write_photo(photo: Photo, path: Path) -> None:
     """Write a JPEG with its focal length in EXIF in whole millimetres, as phones write it."""
-    image = PillowImage.fromarray(photo.rgb)
+    image = PIL.Image.fromarray(photo.rgb)
     exif = image.getexif()
     focal_35mm = round(photo.focal_px / math.hypot(*PHOTO_SIZE) * DIAGONAL_35MM)
     exif.get_ifd(EXIF_IFD).update({EXIF_FOCAL_35MM: focal_35mm, EXIF_FOCAL: 4.25})
     image.save(path, quality=93, exif=exif)
 
 
-def change_sensor(rgb: Image, rng: np.random.Generator) -> Image:
+def change_sensor(rgb: Bytes, rng: np.random.Generator) -> Bytes:
     """Process a photo (H, W, 3) as another phone would.
 
     Exposure, white balance, tone curve, sharpening, noise and JPEG compression are drawn at random.
@@ -73,7 +73,7 @@ def change_sensor(rgb: Image, rng: np.random.Generator) -> Image:
     return compress(noisy, quality)
 
 
-def compress(rgb: Array, quality: int) -> Image:
+def compress(rgb: Array, quality: int) -> Bytes:
     """Store a photo (H, W, 3) of levels up to 255 as a JPEG, and read it again."""
     levels = rgb.clip(0.0, 255.0).astype(np.uint8)
     _, content = cv2.imencode(".jpg", levels, [cv2.IMWRITE_JPEG_QUALITY, quality])
@@ -86,9 +86,7 @@ def blur(image: NDArray[np.generic], sigma: float) -> Array:
     return np.asarray(gaussian_filter(image.astype(float), (sigma, sigma, 0.0), mode=mode))
 
 
-def change_light(
-    rgb: NDArray[np.uint8], rng: np.random.Generator, noise: np.random.Generator
-) -> NDArray[np.uint8]:
+def change_light(rgb: Bytes, rng: np.random.Generator, noise: np.random.Generator) -> Bytes:
     """Return the image (H, W, 3) with another exposure, white balance and gamma, blurred and noisy.
 
     `noise` may be `rng`; photos of one light have the same `rng` each, and other noise.
@@ -99,7 +97,7 @@ def change_light(
     return np.asarray(np.round(noisy.clip(0.0, 1.0) * 255.0).astype(np.uint8))
 
 
-def occlude(rgb: Image, other: Image, fraction: float, rng: np.random.Generator) -> Image:
+def occlude(rgb: Bytes, other: Bytes, fraction: float, rng: np.random.Generator) -> Bytes:
     """Hide a fraction of the sphere of a photo (H, W, 3) behind round pieces of another."""
     height, width = rgb.shape[:2]
     rays = pixel_rays(width)
@@ -116,7 +114,7 @@ def occlude(rgb: Image, other: Image, fraction: float, rng: np.random.Generator)
     return shown
 
 
-def light_unevenly(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
+def light_unevenly(rgb: Bytes, stops: float, rng: np.random.Generator) -> Bytes:
     """Put a photo (H, W, 3) under patches of light that differ by some stops."""
     noise = blur(rng.normal(size=rgb.shape[:2])[..., None], 0.08 * rgb.shape[1])
     gain = 2.0 ** (0.5 * stops * noise / noise.std())
@@ -124,14 +122,14 @@ def light_unevenly(rgb: Image, stops: float, rng: np.random.Generator) -> Image:
     return np.asarray(255.0 * linear.clip(0.0, 1.0) ** (1.0 / 2.2), np.uint8)
 
 
-def take_at_night(rgb: Image, rng: np.random.Generator) -> Image:
+def take_at_night(rgb: Bytes, rng: np.random.Generator) -> Bytes:
     """Dim and tint the light by four stops, and add the noise of a sensor that makes up for most of it."""
     linear = (rgb / 255.0) ** 2.2 * 2.0**-4 * np.array([1.3, 0.8, 0.6])
     noisy = rng.poisson(900.0 * linear) / 900.0 + rng.normal(0.0, 0.004, rgb.shape)
     return np.asarray(255.0 * (5.0 * noisy).clip(0.0, 1.0) ** (1.0 / 2.2), np.uint8)
 
 
-def mask_outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.bool_]:
+def mask_outside_field(width: int, fov_deg: float, yaw: float) -> Mask:
     """Return the mask (H, W) of a sphere outside a level pinhole photo that looks along azimuth `yaw`."""
     x, y, z = np.moveaxis(pixel_rays(width), -1, 0)
     forward = math.cos(yaw) * x + math.sin(yaw) * y
@@ -140,7 +138,7 @@ def mask_outside_field(width: int, fov_deg: float, yaw: float) -> NDArray[np.boo
     return np.asarray((forward <= 0.0) | (np.abs(left) > reach) | (np.abs(z) > ASPECT * reach))
 
 
-def draw_fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Image:
+def draw_fractal_noise(shape: tuple[int, ...], rng: np.random.Generator) -> Bytes:
     """Draw smooth noise of several scales (H, W, 3), with the contrast of a photo."""
     total = np.zeros(shape)
     for scale in (0.004, 0.015, 0.06):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from piccolo.geometry.pose import Array
+from piccolo.arrays import Array, Int64s
 from piccolo.jobs.threads import Workers
 from piccolo.kernels.jit import inline_kernel, kernel
 
@@ -77,7 +77,7 @@ def second_color_fraction(pattern: Integer, s: float, t: float, scale: float, se
 
 
 @kernel
-def hit_boxes(origin: Array, directions: Array, boxes: Array, ranges: Array, hits: NDArray[np.int64]) -> None:
+def hit_boxes(origin: Array, directions: Array, boxes: Array, ranges: Array, hits: Int64s) -> None:
     """Write the range [m] of each ray (N, 3) to its first hit or inf, and 3 * box + axis of the face or -1.
 
     A box around the origin is not hit. Boxes outside, rays inside: the inner loop has no branch to stop SIMD.
@@ -122,7 +122,7 @@ def shade(
     origin: Array,
     directions: Array,
     ranges: Array,
-    hits: NDArray[np.int64],
+    hits: Int64s,
     boxes: Array,
     materials: Array,
     lights: Array,
@@ -158,9 +158,7 @@ def shade(
             rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
 
-def boxes_ahead(
-    origin: Array, directions: NDArray[np.float64], boxes: NDArray[np.float64]
-) -> tuple[NDArray[np.intp], Array]:
+def boxes_ahead(origin: Array, directions: Array, boxes: Array) -> tuple[NDArray[np.intp], Array]:
     """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and from what range on [m]."""
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere
@@ -175,8 +173,8 @@ def boxes_ahead(
 
 
 def cast_rays(
-    room: Room, origin: Array, directions: NDArray[np.float64], workers: Workers, label: str
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    room: Room, origin: Array, directions: Array, workers: Workers, label: str
+) -> tuple[Array, Array, Int64s]:
     """Ranges (N,) [m], colours (N, 3) in [0, 1] and labels (N,) along unit world `directions` (N, 3).
 
     Where nothing is hit the range is inf, the colour black and the label 0. Quickest where directions that

@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from piccolo.geometry.pose import Array
+from piccolo.arrays import Array, Int64s
 
 PLAIN, PLANKS, TILES, STRIPES, CHECKS, PICTURE = range(6)
 WALL_THICKNESS = 0.1  # [m]
@@ -105,17 +105,17 @@ class Room(NamedTuple):
 
     corner: Array  # (3,) least corner of the free space [m]
     size: Array  # (3,) [m]
-    boxes: NDArray[np.float64]  # (B, 7) center (3) [m], half size (3) [m], yaw [rad]
-    materials: NDArray[np.float64]  # (B, 9) pattern, scale [m], two colours (3) in [0, 1], seed
+    boxes: Array  # (B, 7) center (3) [m], half size (3) [m], yaw [rad]
+    materials: Array  # (B, 9) pattern, scale [m], two colours (3) in [0, 1], seed
     light: Array  # (3,) position of the lamp [m], or (B, 3) of each box's
-    labels: NDArray[np.int64]  # (B,) see LABEL_NAMES
+    labels: Int64s  # (B,) see LABEL_NAMES
 
     def clearance(self, position: Array) -> float:
         """Distance [m] from `position` (3,) to the nearest surface; negative inside a box, unseen by rays."""
         return float(box_distances(self.boxes, position).min())
 
 
-def box_distances(boxes: NDArray[np.float64], position: Array) -> Array:
+def box_distances(boxes: Array, position: Array) -> Array:
     """Return the distance (B,) [m] from `position` (3,) to each box (B, 7); negative inside of it."""
     offset = position - boxes[:, :3]
     c = np.cos(boxes[:, 6])

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from piccolo.arrays import Bytes
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
@@ -56,7 +56,7 @@ class WalkOptions:
 class Frame(NamedTuple):
     """One picture of a walk."""
 
-    rgb: NDArray[np.uint8]  # (H, W, 3)
+    rgb: Bytes  # (H, W, 3)
     pose: Pose  # of the camera, whatever the picture shows
     time: float  # [s] from the walk's beginning
     kind: str  # the walk's variant, or one of BAD_KINDS

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter1d
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from piccolo.geometry.pose import Array, Pose, exp_so3, yaw_rotation
+from piccolo.arrays import Array, Int32s, Int64s, Mask
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 
 from .office import FLIGHT_WIDTH, Flight, Office
 
@@ -43,14 +43,14 @@ STRIDES = 1.8  # [1/s]
 NEAR_FRACTION = 0.7  # of the rooms visited next, those among the nearest
 NUM_NEAR = 6
 
-Cells = NDArray[np.int64]
+Cells = Int64s
 
 
 class Reach(NamedTuple):
     """The cheapest ways from a cell to all others."""
 
     costs: Array  # (N,) inf for what can't
-    before: NDArray[np.int32]  # (N,) the cell before each on its way, negative at the start
+    before: Int32s  # (N,) the cell before each on its way, negative at the start
 
 
 class Floors:
@@ -79,7 +79,7 @@ class Floors:
         self.stairs = {(self.cell(f.foot - landing), self.cell(f.top + landing)): f for f in office.flights}
         self.costs = _costs(self.clearance, self.stairs)
 
-    def _block(self, is_blocked: NDArray[np.bool_], box: Array) -> None:
+    def _block(self, is_blocked: Mask, box: Array) -> None:
         """Mark the cells (Y, X) whose middle is in a box (7,) or less than half a cell off it."""
         reach = float(np.hypot(box[3], box[4])) + CELL
         x0, y0 = np.maximum(((box[:2] - reach - self.origin) / CELL).astype(int), 0)

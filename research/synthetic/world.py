@@ -12,10 +12,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo.arrays import Array, Array32, Bytes, Int64s
 from piccolo.camera import Calibration, Mount
 from piccolo.camera.rig import compute_extent
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Array, Pose, exp_so3, yaw_rotation
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.rotations import uniform_rotations
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
@@ -55,7 +56,7 @@ def free_position(room: Room, rng: np.random.Generator, heights: tuple[float, fl
 
 def scan_room(
     room: Room, num_points: int, rng: np.random.Generator, workers: Workers
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
+) -> tuple[Array32, Bytes, Int64s]:
     """Points (N, 3) [m], colours (N, 3) and labels (N,) of a room, N = num_points, from three stations."""
     num_stations = 3
     width = 2 * int(np.ceil(np.sqrt(1.15 * num_points / num_stations / 2.0)))
@@ -73,9 +74,7 @@ def scan_room(
     return points[chosen], colors[chosen], labels[chosen]
 
 
-def photograph(
-    room: Room, pose: Pose, width: int, workers: Workers, meanwhile: Sequence[Pose] = ()
-) -> NDArray[np.uint8]:
+def photograph(room: Room, pose: Pose, width: int, workers: Workers, meanwhile: Sequence[Pose] = ()) -> Bytes:
     """Equirectangular image (width / 2, width, 3) of a room at `pose`.
 
     With poses that the camera has `meanwhile`, a multiple of four of them, it is the mean over these.
@@ -99,7 +98,7 @@ def photograph(
     return rgb
 
 
-def render_picture(mount: Mount, room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
+def render_picture(mount: Mount, room: Room, pose: Pose, workers: Workers) -> Bytes:
     """Render the picture (H, W, 3) of a room by a camera, its rig at `pose`; black where it shows nothing."""
     camera = mount.camera
     u = (np.arange(SUPERSAMPLING * camera.width) + 0.5) / SUPERSAMPLING
@@ -113,7 +112,7 @@ def render_picture(mount: Mount, room: Room, pose: Pose, workers: Workers) -> ND
     return np.asarray(np.round(small * 255.0), np.uint8)
 
 
-def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Workers) -> NDArray[np.uint8]:
+def picture_of_all(mounts: Sequence[Mount], room: Room, pose: Pose, workers: Workers) -> Bytes:
     """Render the picture of which each camera has a part, such as a dual fisheye's."""
     width, height = compute_extent(mounts)
     rgb = np.zeros((height, width, 3), np.uint8)
@@ -135,7 +134,7 @@ class World(NamedTuple):
 class Query(NamedTuple):
     """A panorama with the pose at which it was taken."""
 
-    rgb: NDArray[np.uint8]  # (H, W, 3)
+    rgb: Bytes  # (H, W, 3)
     pose: Pose
     variant: str
 
@@ -156,9 +155,7 @@ def make_world(seed: int, size: Array, num_rooms: int = 1) -> World:
     return World(seed, tuple(rooms))
 
 
-def scan_world(
-    world: World, num_points: int, workers: Workers
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
+def scan_world(world: World, num_points: int, workers: Workers) -> tuple[Array32, Bytes, Int64s]:
     """Points (num_points, 3) [m], colours (num_points, 3) and labels (num_points,) of all rooms."""
     counts = np.diff(np.linspace(0, num_points, len(world.rooms) + 1).astype(int))
     rng = np.random.default_rng([world.seed, 10])
@@ -214,7 +211,7 @@ def check_cameras(cameras: Calibration) -> None:
 
 def make_photos(
     world: World, index: int, variant: str, cameras: Calibration, workers: Workers
-) -> tuple[list[tuple[str, NDArray[np.uint8]]], Pose]:
+) -> tuple[list[tuple[str, Bytes]], Pose]:
     """Render the pictures (H, W, 3) by the cameras of query `index` of a variant; return the rig's pose too.
 
     Each picture has a file name, "" of one that stands alone.

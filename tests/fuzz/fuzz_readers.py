@@ -19,9 +19,9 @@ from piccolo.cloud.settings import IN_METRES
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
+from piccolo.prior import Prior
 from piccolo.result import Result
 from piccolo.scan_map.map_file import load_map
-from piccolo.scan_map.prior import Prior
 from piccolo.scene import read_scene
 
 READERS = {suffix[1:]: form.open_source for form in FORMATS for suffix in form.suffixes}
