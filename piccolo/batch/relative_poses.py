@@ -7,9 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError
 from ..files.json_file import DAMAGE, describe, read_json, read_text
-from ..geometry.pose import Array, Pose, check_transform, rotation_from_quaternion_wxyz
+from ..geometry.pose import Pose, check_transform, rotation_from_quaternion_wxyz
 from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
 from ..localization.bundle_adjustment import RelativeScale
 

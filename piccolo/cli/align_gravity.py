@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..arrays import Array
 from ..cloud import CloudStream, open_cloud
 from ..cloud.octree import build_octree
 from ..cloud.ply_writer import write_transformed
@@ -14,7 +15,7 @@ from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
-from ..geometry.pose import Array, move, orthonormal, rotation_to_z, yaw_rotation
+from ..geometry.pose import move, orthonormal, rotation_to_z, yaw_rotation
 from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array32
 from ..camera import Camera, Mount
 from ..camera.files import read_calibration
 from ..cloud.soa import LocalCloud
@@ -198,7 +198,7 @@ def shot_of(pano: str, pose: Pose, mounts: tuple[Mount, ...]) -> Shot:
     return Shot(pano, mounts[0].pose(pose), mounts[0].camera) if len(mounts) == 1 else Shot(pano, pose, None)
 
 
-def depth_file(depth: NDArray[np.float32], suffix: str) -> bytes:
+def depth_file(depth: Array32, suffix: str) -> bytes:
     """Depth (H, W) [m] as the file that the suffix names."""
     if suffix == ".png":
         millimetres = np.minimum(np.rint(depth * 1000.0), 65535.0)

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Bytes
 from ..files.atomic import replacing
 from ..files.temporary import temporary_folder
-from ..geometry.pose import Array
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 from .ply_writer import needs_double, vertex_rows, writing_ply
@@ -21,8 +21,8 @@ SUFFIXES = (".ply", ".las", ".laz", ".e57")
 UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])  # quaternion of a scan in the axes of its file
 LAS_STEP = 1e-4  # [m] of coordinates in LAS
 E57_BYTES = 45  # of a point, beside the array of it that is held, while the file is written
-Colors = tuple[NDArray[np.uint8], NDArray[np.uint8]]  # RGB (N, 3), and how many photos (N,) gave each
-Add = Callable[[Array, NDArray[np.uint8], NDArray[np.uint8]], None]  # points (N, 3) in the files' unit
+Colors = tuple[Bytes, Bytes]  # RGB (N, 3), and how many photos (N,) gave each
+Add = Callable[[Array, Bytes, Bytes], None]  # points (N, 3) in the files' unit
 
 
 def write_colored(
@@ -49,7 +49,7 @@ def writing_ply_rows(out: Path, box: Array, scale: float, _crs: str) -> Iterator
     """Yield a function that adds points to a PLY file."""
     dtype = np.float64 if needs_double(box * scale, np.eye(4), scale) else np.float32
 
-    def rows(points: Array, colors: NDArray[np.uint8], num_photos: NDArray[np.uint8]) -> NDArray[np.void]:
+    def rows(points: Array, colors: Bytes, num_photos: Bytes) -> NDArray[np.void]:
         return vertex_rows(points.astype(dtype), colors, photos=num_photos)
 
     empty = rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.uint8))
@@ -71,7 +71,7 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
     how = {"mode": "w", "header": header, "do_compress": is_packed, "closefd": False}
     with replacing(out) as file, laspy.open(file, **how) as writer:
 
-        def add(points: Array, colors: NDArray[np.uint8], num_photos: NDArray[np.uint8]) -> None:
+        def add(points: Array, colors: Bytes, num_photos: Bytes) -> None:
             record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
             record.x, record.y, record.z = points.T
             record.red, record.green, record.blue = colors.T.astype(np.uint16) * 257
@@ -88,7 +88,7 @@ def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add
     middle = np.floor(box.mean(axis=0))  # coordinates are written in float32
     parts: list[tuple[Any, ...]] = []
 
-    def add(points: Array, colors: NDArray[np.uint8], _num_photos: NDArray[np.uint8]) -> None:
+    def add(points: Array, colors: Bytes, _num_photos: Bytes) -> None:
         parts.append((*(points - middle).T, *colors.T))
         count = sum(len(part[0]) for part in parts)
         check_memory(E57_BYTES * count, f"{out}: {count} points at once", "write LAZ or PLY")

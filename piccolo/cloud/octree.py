@@ -4,8 +4,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s
 from ..geometry.vectors import Triple
 from ..jobs.memory import check_memory
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
@@ -21,12 +21,12 @@ DIAGONAL = 1.75  # of a voxel, and a little more for rounding: all in it is so n
 class Octree(NamedTuple):
     """Nodes of all levels, coarsest first, in Morton order within a level; kernels take it as an argument."""
 
-    nodes: NDArray[np.float32]  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
-    first_child: NDArray[np.int32]  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
-    level_start: NDArray[np.int32]  # (levels + 1,)
+    nodes: Array32  # (nodes, 6) mean x, y, z [m], r, g, b in [0, 1]
+    first_child: Int32s  # (nodes + 1,) children of i are first_child[i]:first_child[i + 1]
+    level_start: Int32s  # (levels + 1,)
     leaf_size: float  # [m]
 
-    def level(self, size: float) -> NDArray[np.float32]:
+    def level(self, size: float) -> Array32:
         """Return the nodes of the level whose voxels are nearest to `size` [m]."""
         finest = len(self.level_start) - 2
         level = finest - int(np.clip(np.rint(np.log2(size / self.leaf_size)), 0, finest))
@@ -42,7 +42,7 @@ class Octree(NamedTuple):
 def build_octree(voxels: Voxels) -> Octree:
     """Return the octree whose leaves are the voxels."""
     codes = voxels.codes
-    firsts: list[NDArray[np.int32]] = []  # of each level but the finest: its nodes' first children there
+    firsts: list[Int32s] = []  # of each level but the finest: its nodes' first children there
     for _ in range(NUM_LEVELS - 1):
         check_memory(len(codes) * LEVEL_BYTES, f"the scan: a level of {len(codes)} voxels", THIN)
         codes = codes >> 3  # children of a parent follow each other
@@ -64,7 +64,7 @@ def build_octree(voxels: Voxels) -> Octree:
     return Octree(nodes, first_child, start, LEAF_SIZE)
 
 
-def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: NDArray[np.float32]) -> None:
+def average(children: Array32, first: Int32s, parents: Array32) -> None:
     """Write the means (M, 6) of the children (N, 6) that begin at `first` (M,)."""
     for begin in range(0, len(first), AT_ONCE):
         part = slice(begin, begin + AT_ONCE)
@@ -76,7 +76,7 @@ def average(children: NDArray[np.float32], first: NDArray[np.int32], parents: ND
             parents[part, k] = np.add.reduceat(column, places, dtype=np.float64) / counts
 
 
-def recolor(octree: Octree, colors: NDArray[np.float32], weights: NDArray[np.float32]) -> Octree:
+def recolor(octree: Octree, colors: Array32, weights: Array32) -> Octree:
     """Return the octree with leaves of other colours (leaves, 3), in [0, 1], and weights (leaves,).
 
     A leaf of weight 0 gets its colour from those around it, the nearer level first.
@@ -102,7 +102,7 @@ def recolor(octree: Octree, colors: NDArray[np.float32], weights: NDArray[np.flo
 
 
 @inline_kernel
-def uniform_level(least_distance: NDArray[np.float32], level: int, low: Scalar, high: Scalar) -> int:
+def uniform_level(least_distance: Array32, level: int, low: Scalar, high: Scalar) -> int:
     """Return the one level at which all below a node is drawn; 0 if there is none.
 
     All of it is at distances from `low` to `high`; `level` is that of the node's children.
@@ -115,12 +115,12 @@ def uniform_level(least_distance: NDArray[np.float32], level: int, low: Scalar, 
 
 @inline_kernel
 def take_all(
-    nodes: NDArray[np.float32],
+    nodes: Array32,
     first: int | np.int64,
     last: int | np.int64,
     center: Triple,
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
+    found: Int32s,
+    directions: Array32,
     count: int,
 ) -> None:
     """Write the nodes from first to last, and their positions relative to the centre, from `count` on."""
@@ -136,15 +136,15 @@ def take_all(
 
 @inline_kernel
 def take_far(
-    nodes: NDArray[np.float32],
+    nodes: Array32,
     first: int | np.int64,
     last: int | np.int64,
     center: Triple,
     least: Scalar,
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
+    found: Int32s,
+    directions: Array32,
     count: int,
-    stack: NDArray[np.int32],
+    stack: Int32s,
     top: int,
 ) -> tuple[int, int]:
     """Write the nodes at a squared distance of at least `least` [m^2], like `take_all`; return both counts.
@@ -169,13 +169,7 @@ def take_far(
 
 
 @kernel
-def collect(
-    tree: Octree,
-    center: NDArray[np.float64],
-    voxel_per_range: float,
-    found: NDArray[np.int32],
-    directions: NDArray[np.float32],
-) -> int:
+def collect(tree: Octree, center: Array, voxel_per_range: float, found: Int32s, directions: Array32) -> int:
     """Write the nodes that, seen from `center`, are small enough, or leaves; return their number.
 
     Small enough are voxels of at most `voxel_per_range` times their distance. `directions` (3, N) get the

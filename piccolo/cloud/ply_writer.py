@@ -11,8 +11,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Bytes, Floats
 from ..files.atomic import replacing
-from ..geometry.pose import Array, transform_points
+from ..geometry.pose import transform_points
 from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK, HEAD_SIZE
 from .stream import CloudStream
@@ -30,9 +31,7 @@ NORMALS = ("nx", "ny", "nz")
 MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
 
 
-def vertex_rows(
-    points: NDArray[np.floating[Any]], colors: NDArray[np.uint8] | None, **more: NDArray[Any] | None
-) -> Rows:
+def vertex_rows(points: Floats, colors: Bytes | None, **more: NDArray[Any] | None) -> Rows:
     """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB if any, more (N,)."""
     columns = dict(zip(AXES, points.T, strict=True))
     columns.update({} if colors is None else dict(zip(COLOR_NAMES, colors.T, strict=True)))
@@ -118,7 +117,7 @@ def write_transformed(
     dtype = np.float64 if needs_double(cloud.box, T_target_from_source, cloud.scale) else np.float32
     channel = cloud.sources[0].channel
 
-    def rows_of(points: NDArray[np.floating[Any]], colors: NDArray[np.uint8]) -> Rows:
+    def rows_of(points: Floats, colors: Bytes) -> Rows:
         intensity = colors[:, 0] if channel == "intensity" else None
         return vertex_rows(points, colors if cloud.has_colors else None, intensity=intensity)
 

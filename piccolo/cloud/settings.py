@@ -6,9 +6,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError
 from ..geometry.colors import Labels
-from ..geometry.pose import Array, rotation_to_z
+from ..geometry.pose import rotation_to_z
 from ..optional import import_optional
 
 # of points: what photos are compared with

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32
 from ..geometry.colors import colors_of_edges
-from ..geometry.pose import Array
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
 
@@ -50,7 +50,7 @@ def paint_shape(octree: Octree, workers: Workers) -> Octree:
     return painted
 
 
-def color_edges(nodes: NDArray[np.float32], around: Surroundings, workers: Workers) -> NDArray[np.float32]:
+def color_edges(nodes: Array32, around: Surroundings, workers: Workers) -> Array32:
     """Return the colours (N, 3), in [0, 1], of the edges at nodes (N, 6) in grey, z up."""
     strength, vertical = find_edges(nodes[:, :3].astype(np.float64), around, workers).T
     return np.asarray(colors_of_edges(strength, vertical, nodes[:, 3]) / np.float32(255.0), np.float32)

@@ -5,9 +5,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Int32s
 from ..errors import InputError
 from ..geometry.colors import pack_rgbx
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 
 FARTHEST = 1e7  # [m] from the local origin; squares stay finite in float32 and the loss is inf beyond
 
@@ -16,10 +17,10 @@ FARTHEST = 1e7  # [m] from the local origin; squares stay finite in float32 and 
 class PackedPoints:
     """Coloured points, one contiguous array a coordinate, in the order in which they are to be summed."""
 
-    x: NDArray[np.float32]  # (N,) [m]
-    y: NDArray[np.float32]  # (N,) [m]
-    z: NDArray[np.float32]  # (N,) [m]
-    rgbx: NDArray[np.int32]  # (N,) as pack_rgbx
+    x: Array32  # (N,) [m]
+    y: Array32  # (N,) [m]
+    z: Array32  # (N,) [m]
+    rgbx: Int32s  # (N,) as pack_rgbx
 
     def __len__(self) -> int:
         """Return the number of points."""
@@ -60,7 +61,7 @@ class LocalCloud:
         return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
 
 
-def pack_points(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> PackedPoints:
+def pack_points(points: Array32, colors: Bytes) -> PackedPoints:
     """Pack points (N, 3) [m] with colours (N, 3)."""
     x, y, z = np.ascontiguousarray(points.T, dtype=np.float32)
     return PackedPoints(x, y, z, pack_rgbx(colors))

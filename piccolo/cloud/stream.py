@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Floats, Mask
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
-from ..geometry.pose import MAX_COORDINATE, Array, rotate_points
+from ..geometry.pose import MAX_COORDINATE, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
 from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness
@@ -25,7 +26,7 @@ FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
 COARSE = 0.01  # [m] steps between float32 numbers that are reported, from 131 km on
 MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
-Chunk = tuple[NDArray[np.float64], NDArray[np.uint8]]  # finite points (N, 3) [m], colours (N, 3)
+Chunk = tuple[Array, Bytes]  # finite points (N, 3) [m], colours (N, 3)
 ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
 
 
@@ -42,7 +43,7 @@ class PointValidator:
 
     def filter(self, raw: RawCloud) -> Chunk:
         """Count the points of a chunk; return the finite ones in metres."""
-        is_finite: NDArray[np.bool_] = np.all(np.isfinite(raw.points_world), axis=1)
+        is_finite: Mask = np.all(np.isfinite(raw.points_world), axis=1)
         num_finite = int(np.count_nonzero(is_finite))
         colors = raw.colors
         with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
@@ -83,7 +84,7 @@ class PointValidator:
         return tuple(f"{self.path}: {text}" for text in found)
 
 
-def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
+def unit_warnings(label: str, points: Array32) -> tuple[str, ...]:
     """Return a warning if points (N, 3) look like millimetres, or are too far apart for float32.
 
     It looks like millimetres if 98 % of the points span more than 2,000 along at least two axes.
@@ -104,15 +105,15 @@ def unit_warnings(label: str, points: NDArray[np.float32]) -> tuple[str, ...]:
 class Cloud:
     """Coloured points near a local origin, in an order that does not depend on the file's."""
 
-    points: NDArray[np.float32]  # (N, 3) world minus origin_world [m], all finite, Morton order
-    colors: NDArray[np.uint8]  # (N, 3) RGB
-    origin_world: NDArray[np.float64]  # (3,) what was subtracted from the file's coordinates [m]
+    points: Array32  # (N, 3) world minus origin_world [m], all finite, Morton order
+    colors: Bytes  # (N, 3) RGB
+    origin_world: Array  # (3,) what was subtracted from the file's coordinates [m]
     num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
     up: UpAxis = "z"  # the axis that points up according to the files
     has_colors: bool = True  # else greys, by the intensity or all alike
 
-    def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
+    def voxels(self, R_map_from_world: Array) -> Voxels:
         """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
         table = VoxelTable("cloud")
         table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
@@ -185,7 +186,7 @@ class CloudStream:
         pairs = zip(self.sources, validators, strict=True)
         return [line for source, validator in pairs for line in (*source.warnings, *validator.warnings())]
 
-    def voxels(self, R_map_from_world: NDArray[np.float64]) -> Voxels:
+    def voxels(self, R_map_from_world: Array) -> Voxels:
         """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
         validators: list[PointValidator] = []
         table = VoxelTable(self.label)
@@ -214,7 +215,7 @@ class CloudStream:
         return Cloud(points, colors, origin_world, num_dropped, warnings, self.up, self.has_colors)
 
 
-def stream_of_arrays(points: NDArray[np.floating[Any]], colors: NDArray[Any] | None) -> CloudStream:
+def stream_of_arrays(points: Floats, colors: NDArray[Any] | None) -> CloudStream:
     """Return a cloud in memory: points (N, 3), and colours (N, 3): uint8, uint16, floats in [0, 1], None."""
     if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"

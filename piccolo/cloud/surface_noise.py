@@ -5,9 +5,8 @@ scans are shifted against each other, each surface is there twice, and a pose ma
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..arrays import Array, Int64s
 from .octree import Octree
 
 CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the scan is thin
@@ -56,7 +55,7 @@ def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
     return normals, of_sheets + NOISE_SHARE**2 * (across - of_sheets)
 
 
-def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
+def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, Int64s, Int64s]:
     """Return the leaves (N, 3) [m] of a level's fuller cells, and each cell's first one and their number."""
     level = len(octree.level_start) - 2 - levels_up
     edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)

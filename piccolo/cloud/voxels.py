@@ -7,8 +7,8 @@ nor their chunks change a bit, unless more than MAX_COUNT points are in one voxe
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Int32s, Int64s
 from ..errors import InputError
 from ..jobs.memory import check_memory
 from ..kernels.jit import inline_kernel, kernel
@@ -60,21 +60,21 @@ def spread_bits(cell: np.int64) -> np.int64:
 
 
 @kernel
-def interleave(cells: NDArray[np.int64], codes: NDArray[np.int64]) -> None:
+def interleave(cells: Int64s, codes: Int64s) -> None:
     """Write the 63-bit Morton code (N,) of each cell (N, 3), int64 in [0, 2^21); x has the lowest bit."""
     for i in range(len(cells)):
         x, y, z = spread_bits(cells[i, 0]), spread_bits(cells[i, 1]), spread_bits(cells[i, 2])
         codes[i] = x | (y << 1) | (z << 2)
 
 
-def morton_codes(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def morton_codes(cells: Int64s) -> Int64s:
     """Return the Morton code (N,) of each cell (N, 3) in [0, 2^21)."""
     codes = np.empty(len(cells), dtype=np.int64)
     interleave(cells, codes)
     return codes
 
 
-def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDArray[np.int64]:
+def morton_order(points: Array32, colors: Bytes) -> Int64s:
     """Return indices (N,) that sort points (N, 3) [m] and colours (N, 3) along Morton's curve.
 
     The cells are cubes, 2^21 along the longest side of the bounding box. Within a cell coordinates and then
@@ -103,15 +103,13 @@ def morton_order(points: NDArray[np.float32], colors: NDArray[np.uint8]) -> NDAr
 class Voxels(NamedTuple):
     """The voxels that contain points, in Morton order."""
 
-    codes: NDArray[np.int64]  # (M,) Morton codes; the three lowest bits choose among a parent's children
-    nodes: NDArray[np.float32]  # (M, 6) mean x, y, z [m] less `origin`, mean r, g, b in [0, 1]
-    origin: NDArray[np.float64]  # (3,) middle of their box in the map's axes, in whole metres
+    codes: Int64s  # (M,) Morton codes; the three lowest bits choose among a parent's children
+    nodes: Array32  # (M, 6) mean x, y, z [m] less `origin`, mean r, g, b in [0, 1]
+    origin: Array  # (3,) middle of their box in the map's axes, in whole metres
     warnings: tuple[str, ...] = ()  # one line each, for the user
 
 
-def join_voxels(
-    first: NDArray[np.float32], second: NDArray[np.float32], origin: NDArray[np.float64]
-) -> Voxels:
+def join_voxels(first: Array32, second: Array32, origin: Array) -> Voxels:
     """Join the nodes (N, 6) of two clouds, relative to one origin (3,), to the voxels of both.
 
     A voxel that one cloud has keeps its bits; one that both have gets the mean of the two means.
@@ -137,9 +135,7 @@ def first_slot(x: np.int64, y: np.int64, z: np.int64, num_slots: int) -> np.int6
 
 
 @inline_kernel
-def find_slot(
-    index: NDArray[np.int32], rows: NDArray[np.int32], x: np.int64, y: np.int64, z: np.int64
-) -> np.int64:
+def find_slot(index: Int32s, rows: Int32s, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
     """Return the slot that holds a cell's row, or else the free slot where it belongs."""
     slot = first_slot(x, y, z, len(index))
     while index[slot] != 0:
@@ -152,12 +148,7 @@ def find_slot(
 
 @kernel
 def add_points(
-    points: NDArray[np.float64],
-    colors: NDArray[np.uint8],
-    base: NDArray[np.int64],
-    index: NDArray[np.int32],
-    rows: NDArray[np.int32],
-    num_voxels: int,
+    points: Array, colors: Bytes, base: Int64s, index: Int32s, rows: Int32s, num_voxels: int
 ) -> tuple[int, int]:
     """Add points (N, 3) [m] with colours (N, 3) to the rows (n, 10) of `num_voxels` voxels.
 
@@ -198,7 +189,7 @@ def add_points(
 
 
 @kernel
-def fill_index(rows: NDArray[np.int32], num_voxels: int, index: NDArray[np.int32]) -> None:
+def fill_index(rows: Int32s, num_voxels: int, index: Int32s) -> None:
     """Enter the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
     for k in range(num_voxels):
         x, y, z = np.int64(rows[k, CELL]), np.int64(rows[k, CELL + 1]), np.int64(rows[k, CELL + 2])
@@ -215,7 +206,7 @@ class VoxelTable:
         self.rows = np.empty((FIRST_ROWS, NUM_COLUMNS), np.int32)
         self.index = np.zeros(2 * FIRST_ROWS, np.int32)
 
-    def add(self, points: NDArray[np.float64], colors: NDArray[np.uint8]) -> None:
+    def add(self, points: Array, colors: Bytes) -> None:
         """Add finite points (N, 3) [m], in the map's axes, with colours (N, 3)."""
         points = np.ascontiguousarray(points)  # one kernel for all
         colors = np.ascontiguousarray(colors)
@@ -281,7 +272,7 @@ class VoxelTable:
                 nodes[part, 3 + k] = taken[:, COLOR + k] / counts / 255.0
         return Voxels(codes[order], nodes, origin, warnings)
 
-    def _without_far(self, rows: NDArray[np.int32]) -> tuple[NDArray[np.int32], tuple[str, ...]]:
+    def _without_far(self, rows: Int32s) -> tuple[Int32s, tuple[str, ...]]:
         """Return the rows of voxels near the rest, and a warning if others were left out."""
         is_near = np.ones(len(rows), dtype=np.bool_)
         for column in rows[:, :COUNT].T:

@@ -10,10 +10,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s, Int64s
 from ..cloud.octree import Octree
-from ..geometry.pose import Array, Pose, log_so3, step
+from ..geometry.pose import Pose, log_so3, step
 from ..geometry.sphere import pixel_jacobian
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, kernel
@@ -43,7 +43,6 @@ NOISE = 10.0  # [8-bit levels] of one
 NUM_ALIKE = 30.0  # points whose differences err alike: with fewer, weak constraints outweigh where poses were
 NUM_STEPS = 15  # a round, at most
 SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
-Array32 = NDArray[np.float32]
 
 
 class Anchor(NamedTuple):
@@ -56,10 +55,10 @@ class Anchor(NamedTuple):
 class Sightings(NamedTuple):
     """Which photos see which points; of point n those from first[n] to first[n + 1], in order of photos."""
 
-    first: NDArray[np.int64]  # (N + 1,)
-    point: NDArray[np.int64]  # (S,)
-    photo: NDArray[np.int64]  # (S,)
-    own: list[NDArray[np.int64]]  # those of each photo
+    first: Int64s  # (N + 1,)
+    point: Int64s  # (S,)
+    photo: Int64s  # (S,)
+    own: list[Int64s]  # those of each photo
 
 
 class Readings(NamedTuple):
@@ -197,9 +196,9 @@ def measure_step(pose: Pose, other: Pose) -> Array:
 @kernel
 def read_photo(
     points: Array32,
-    own: NDArray[np.int64],
-    point: NDArray[np.int64],
-    texels: NDArray[np.int32],
+    own: Int64s,
+    point: Int64s,
+    texels: Int32s,
     width: int,
     gains: Array32,
     R_cam_from_map: Array,
@@ -234,13 +233,7 @@ def read_photo(
 
 @kernel
 def add_pairs(
-    first: NDArray[np.int64],
-    photo: NDArray[np.int64],
-    values: Array32,
-    rows: Array32,
-    scale: float,
-    matrix: Array,
-    gradient: Array,
+    first: Int64s, photo: Int64s, values: Array32, rows: Array32, scale: float, matrix: Array, gradient: Array
 ) -> float:
     """Add the normal equations (6 K, 6 K), (6 K,) of the pairs of sightings of each point; return the loss.
 

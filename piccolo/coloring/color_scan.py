@@ -7,12 +7,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..arrays import Array, Array32
 from ..cloud import open_cloud
 from ..cloud.colored_writer import SUFFIXES, write_colored
 from ..cloud.octree import recolor
 from ..errors import InputError
 from ..files.journal import Journal
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan, labels_of, photo_of
@@ -22,7 +23,7 @@ from ..result import FAILED, Result
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, align
-from .painting import WIDTH, Array32, Brush, Paint, make_brushes, paint_points, sees_paint
+from .painting import WIDTH, Brush, Paint, make_brushes, paint_points, sees_paint
 
 LEAST_PHOTOS = 2
 NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before

@@ -1,7 +1,8 @@
 """Gains of photos, by which their exposures and white balances agree where they see the same points."""
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..arrays import Array, Array32, Int64s
 
 DARKEST = 8.0  # [8-bit levels] darker and brighter colours say nothing of gains
 BRIGHTEST = 247.0
@@ -9,9 +10,7 @@ SCALE = 0.2  # of the logarithm of a ratio, beyond which it counts little: the p
 NUM_ROUNDS = 4
 
 
-def balance(
-    point: NDArray[np.int64], photo: NDArray[np.int64], values: NDArray[np.float32], num_photos: int
-) -> NDArray[np.float32]:
+def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> Array32:
     """Return the gains (photos, 3) by which the colours of photos are multiplied to be alike.
 
     `values` (S, 3) are what `photo` (S,) shows at `point` (S,), sorted by points. The logarithms of gains are
@@ -37,13 +36,7 @@ def balance(
     return np.exp(gains).astype(np.float32)
 
 
-def solve(
-    i: NDArray[np.int64],
-    j: NDArray[np.int64],
-    loads: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    count: int,
-) -> NDArray[np.float64]:
+def solve(i: Int64s, j: Int64s, loads: Array, weights: Array, count: int) -> Array:
     """Return x (count, 3) of least squares weights (P,) on x[i] - x[j] = loads / weights (P, 3), mean 0."""
     cross = np.bincount(i * count + j, weights, count * count).reshape(count, count)
     cross = cross + cross.T

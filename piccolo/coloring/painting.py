@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Bytes, Int32s
 from ..cloud.octree import Octree
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, HALF, kernel
 from ..panorama import Panorama
@@ -29,7 +29,6 @@ SAMPLES = 1 << 21  # of photos at points, that a task holds
 LEAST_PAINTED = 0.25  # of what a photo sees: of 17 right ones with less, colours refused 14
 MOST_PHOTOS = 255  # that are counted for a point
 FULL = np.float32(255.0)
-Array32 = NDArray[np.float32]
 
 
 class Brush(NamedTuple):
@@ -44,8 +43,8 @@ class Brush(NamedTuple):
 class Paint(NamedTuple):
     """Colours of points."""
 
-    colors: NDArray[np.uint8]  # (N, 3) RGB, 0 where no photo looks
-    num_photos: NDArray[np.uint8]  # (N,) that see the point
+    colors: Bytes  # (N, 3) RGB, 0 where no photo looks
+    num_photos: Bytes  # (N,) that see the point
 
 
 def make_brushes(
@@ -90,7 +89,7 @@ def sees_paint(brush: Brush, points: Array32, paint: Paint) -> bool:
 @kernel
 def read_colors(
     points: Array32,
-    texels: NDArray[np.int32],
+    texels: Int32s,
     width: int,
     gains: Array32,
     R_cam_from_map: Array,
@@ -114,9 +113,7 @@ def read_colors(
 
 
 @kernel
-def find_medians(
-    colors: Array32, weights: Array32, medians: NDArray[np.uint8], counts: NDArray[np.uint8]
-) -> None:
+def find_medians(colors: Array32, weights: Array32, medians: Bytes, counts: Bytes) -> None:
     """Write weighted medians (N, 3) of colours (K, N, 3), and how many (N,) of weights (K, N) are above 0.
 
     Half of the weight is of colours that are not above the median.

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32
 from ..cloud.octree import Octree
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import direction_to_pixel, pixel_rays
 from ..kernels.jit import F0, kernel, whole
 from ..local_features.view_image import render_gray
@@ -24,8 +24,8 @@ LEAST_RANGE = 0.3  # [m] nearer surfaces count as much as this
 class Sight(NamedTuple):
     """The surfaces around a photo."""
 
-    ranges: NDArray[np.float32]  # (H, W) [m], 0 where nothing is seen
-    weights: NDArray[np.float32]  # (H, W) cosine of the angle to the surface's normal / range^2 [1 / m^2]
+    ranges: Array32  # (H, W) [m], 0 where nothing is seen
+    weights: Array32  # (H, W) cosine of the angle to the surface's normal / range^2 [1 / m^2]
 
 
 def look(octree: Octree, pose: Pose) -> Sight:
@@ -44,12 +44,12 @@ def look(octree: Octree, pose: Pose) -> Sight:
 
 @kernel
 def weigh_points(
-    points: NDArray[np.float32],
-    ranges: NDArray[np.float32],
-    weights: NDArray[np.float32],
+    points: Array32,
+    ranges: Array32,
+    weights: Array32,
     R_cam_from_map: Array,
     center_map: Array,
-    found: NDArray[np.float32],
+    found: Array32,
 ) -> None:
     """Write how well a photo sees each of some points (N, 3) of the map, 0 for what is hidden."""
     pose = pose_float32(R_cam_from_map, center_map)

@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
+from ..arrays import Array
 from ..errors import InputError
-from ..geometry.pose import Array
 from ..geometry.pose_gaussian import probability_within
 
 LOCALIZED = "localized"

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.pose import Array, ByValue
+from ..arrays import Array
+from ..geometry.pose import ByValue
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 
 SAME_STD_RATIO = 1.5  # deviations that differ by less have no such direction

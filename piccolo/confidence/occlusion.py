@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes, Mask
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import solid_angles
@@ -44,9 +45,9 @@ LEVEL = 100  # 8-bit level of the thresholds in maps that are enlarged
 class Occlusion:
     """Photo and scan compared at a pose, on a small equirectangular grid."""
 
-    difference: NDArray[np.float32]  # (H, W) squared deviations of local contrast, smoothed
-    coverage: NDArray[np.float32]  # (H, W) fraction of the neighbourhood that both show
-    is_valid: NDArray[np.bool_]  # (H, W) where the photo shows anything
+    difference: Array32  # (H, W) squared deviations of local contrast, smoothed
+    coverage: Array32  # (H, W) fraction of the neighbourhood that both show
+    is_valid: Mask  # (H, W) where the photo shows anything
 
     def fractions(self) -> tuple[float, float]:
         """Return the fractions of the photo, by solid angle, that are explained and that contradict."""
@@ -85,7 +86,7 @@ def _fill_view(points: PackedPoints, pose: Pose) -> View:
     return view
 
 
-def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDArray[np.uint8]:
+def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> Bytes:
     """Draw the comparison (H, W) at the panorama's size: EXPLAINED, NOT_SCANNED or CONTRADICTED.
 
     Masked pixels count as not scanned.
@@ -93,7 +94,7 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDAr
     small = compare_occlusion(points, panorama, pose)
     shape = panorama.is_valid.shape
 
-    def exceeds(values: NDArray[np.float32], threshold: float) -> NDArray[np.bool_]:
+    def exceeds(values: Array32, threshold: float) -> Mask:
         levels = np.clip(values * np.float32(LEVEL / threshold), 0.0, 255.0).astype(np.uint8)
         return _enlarge(levels, shape) > LEVEL
 
@@ -106,12 +107,8 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> NDAr
 
 
 def _squared_difference(
-    of_photo: NDArray[np.float32],
-    of_scan: NDArray[np.float32],
-    is_shared: NDArray[np.bool_],
-    weight: NDArray[np.float32],
-    global_weight: float,
-) -> NDArray[np.float32]:
+    of_photo: Array32, of_scan: Array32, is_shared: Mask, weight: Array32, global_weight: float
+) -> Array32:
     """Return the squared differences (H, W) of the photo's contrast from the scan's range within one cell.
 
     An edge that is displaced by less than a cell, or blurred, makes no difference.
@@ -127,12 +124,7 @@ def _squared_difference(
 
 @kernel
 def write_squares(
-    channels: NDArray[np.float32],
-    photo: NDArray[np.float32],
-    scan: NDArray[np.float32],
-    low: NDArray[np.float32],
-    high: NDArray[np.float32],
-    squares: NDArray[np.float32],
+    channels: Array32, photo: Array32, scan: Array32, low: Array32, high: Array32, squares: Array32
 ) -> None:
     """Write the squared distances (H, W) of the photo's contrast from a range (H, W, 3), `low` to `high`.
 
@@ -153,9 +145,7 @@ def write_squares(
             squares[i, j] = total
 
 
-def _statistics(
-    channels: NDArray[np.float32], weight: NDArray[np.float32], global_weight: float
-) -> NDArray[np.float32]:
+def _statistics(channels: Array32, weight: Array32, global_weight: float) -> Array32:
     """Return local means and 1 / deviations (H, W, 6) of channels (H, W, 3), mixed with the global ones."""
     moments = np.empty((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
     local_normalization.block_moments(channels, weight, moments)
@@ -168,7 +158,7 @@ def _statistics(
     return _enlarge(sums[..., 1:], weight.shape)
 
 
-def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _smooth(values: Array32) -> Array32:
     """Smooth a map (H, W) by a narrow Gaussian on the sphere: rows, wider at the poles, then columns."""
     height, width = values.shape
     cosine = np.cos((0.5 - (np.arange(height) + 0.5) / height) * math.pi)
@@ -180,9 +170,7 @@ def _smooth(values: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.maximum(columns, 0.0).astype(np.float32)
 
 
-def _extreme(
-    channels: NDArray[np.float32], is_shared: NDArray[np.bool_], of: Any, unseen: float
-) -> NDArray[np.float32]:
+def _extreme(channels: Array32, is_shared: Mask, of: Any, unseen: float) -> Array32:
     """Return the extreme (H, W, 3), by cv2.erode or cv2.dilate, of a cell and its eight neighbours."""
     seen = np.where(is_shared[..., None], channels, np.float32(unseen))
     padded = np.concatenate([seen[:, -1:], seen, seen[:, :1]], axis=1)
@@ -225,7 +213,7 @@ def measure_agreement(points: PackedPoints, panorama: Panorama, pose: Pose) -> A
     of_view = normalize_locally(view.rgb, is_shared, SIGMA_DEG)
     of_panorama = normalize_locally(small.rgb.astype(np.float32) / np.float32(255.0), is_shared, SIGMA_DEG)
 
-    def total(values: NDArray[np.float32]) -> float:
+    def total(values: Array32) -> float:
         return float((weights[..., None] * values).sum(dtype=np.float64))
 
     energy = math.sqrt(total(of_view**2) * total(of_panorama**2))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..arrays import Array as Array  # noqa: PLC0414  # other rooms import it from here
+from ..arrays import Array
 from ..errors import InputError
 
 NEWTON_STEPS = 4  # from an error of 5 % to rounding

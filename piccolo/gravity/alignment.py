@@ -8,10 +8,9 @@ lintels, beams and walls divide the space below ceilings. Each cue is the logari
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int64s, Mask
 from ..cloud.octree import Octree
-from ..geometry.pose import Array
 
 # Chosen by hand; the noise of scanners (2 to 5 mm) is far below the spacing of the points
 SPACING = 0.08  # of the points that are used [m]
@@ -38,7 +37,7 @@ class PointNormals(NamedTuple):
 
     points: Array  # (M, 3) [m]
     normals: Array  # (M, 3) unit, of either sign
-    is_flat: NDArray[np.bool_]  # (M,) the neighbourhood is a plane
+    is_flat: Mask  # (M,) the neighbourhood is a plane
 
 
 class Planes(NamedTuple):
@@ -54,7 +53,7 @@ def dot(vectors: Array, axis: Array) -> Array:
     return np.asarray(np.einsum("ni,i->n", vectors, axis))
 
 
-def estimate_normals(points: NDArray[np.float32]) -> PointNormals:
+def estimate_normals(points: Array32) -> PointNormals:
     """Return normals of an evenly strided sample of a cloud (N, 3) [m], by PCA of the nearest points."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who asks for up waits for it
 
@@ -96,9 +95,7 @@ def ransac_planes(cloud: PointNormals) -> Planes:
     return Planes(np.reshape(normals, (-1, 3)), np.reshape(centers, (-1, 3)), np.array(areas))
 
 
-def _are_inliers(
-    cloud: PointNormals, some: NDArray[np.int64], normals: Array, points: Array
-) -> NDArray[np.bool_]:
+def _are_inliers(cloud: PointNormals, some: Int64s, normals: Array, points: Array) -> Mask:
     """Return which of some points (S,) lie on planes (H, S) by normals and points (H, 3)."""
     offsets = np.einsum("hi,hi->h", normals, points)[:, None]
     distances = np.einsum("hi,ji->hj", normals, cloud.points[some]) - offsets
@@ -203,7 +200,7 @@ def find_levels(planes: Planes, axis: Array) -> Array:
     return np.array(sorted(levels))
 
 
-def furniture_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array) -> float:
+def furniture_cue(heights: Array, is_level: Mask, levels: Array) -> float:
     """Compare level faces as high as furniture above levels (L,) with those as far below."""
     next_level = np.searchsorted(levels, heights[is_level])
     above = heights[is_level] - np.append(-np.inf, levels)[next_level]
@@ -215,7 +212,7 @@ def furniture_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array) ->
     return float(np.log((standing + few) / (hanging + few)))
 
 
-def passage_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array, places: Array) -> float:
+def passage_cue(heights: Array, is_level: Mask, levels: Array, places: Array) -> float:
     """Compare how far space that is free for a person is in one piece above levels (L,) and below them.
 
     That is the mean, over the free area of a level, of the fraction that the piece has of the level's.
@@ -226,7 +223,7 @@ def passage_cue(heights: Array, is_level: NDArray[np.bool_], levels: Array, plac
     cell = max(CELL, float(np.sqrt(np.prod(high - low) / 4e6)))
     edges = [np.arange(a, b + cell, cell) for a, b in zip(low, high, strict=True)]
 
-    def grid(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def grid(mask: Mask) -> Mask:
         return np.asarray(np.histogramdd(places[mask], edges)[0] > 0)
 
     pieces = np.full((2, 2), FEW_CELLS)  # above, below: free cells times their piece's fraction; free cells

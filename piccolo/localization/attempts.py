@@ -113,11 +113,7 @@ def refine_matched(query: Query, poses: list[Pose], known: list[Hypothesis], wat
 
 
 def search_views(
-    query: Query,
-    known: list[Hypothesis],
-    watch: Stopwatch,
-    tilts: Tilts,
-    is_brief: bool = False,
+    query: Query, known: list[Hypothesis], watch: Stopwatch, tilts: Tilts, is_brief: bool = False
 ) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
     asked = thin_query(query) if is_brief else query

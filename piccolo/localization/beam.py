@@ -7,11 +7,11 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Int64s
 from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
 from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.suppression import non_maximum_suppression
 from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
@@ -84,9 +84,7 @@ def keep_ends(ends: Ends, count: int) -> Starts:
     return poses.take(best_and_alternatives(poses.R_cam_from_map, poses.center_map, count, DESCENDING))
 
 
-def best_and_alternatives(
-    rotations: NDArray[np.float64], centers: NDArray[np.float64], count: int, near: Nearness
-) -> NDArray[np.int64]:
+def best_and_alternatives(rotations: Array, centers: Array, count: int, near: Nearness) -> Int64s:
     """Return the indices of `count` of the ranked poses (n, 3, 3), (n, 3), best first, in ascending order.
 
     Three quarters are the best poses that differ a little, a quarter the best that lie far apart.
@@ -161,7 +159,7 @@ def descend_starts(
     num_iterations: int,
     tolerance: float,
     cone: Cone,
-    row: NDArray[np.int64],
+    row: Int64s,
     R_cam_from_map: Array,
     center_map: Array,
     scores: Array,

@@ -11,9 +11,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import Array
 from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
-from ..geometry.pose import Array, Pose, skew
+from ..geometry.pose import Pose, skew
 from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch

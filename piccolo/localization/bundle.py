@@ -13,10 +13,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import Array
 from ..confidence.confidence import LOCALIZED
 from ..confidence.focal_length import MOST_CONFLICT, Consensus
 from ..confidence.localization import Localization
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.blas import one_blas_thread
 from ..jobs.stopwatch import Stopwatch

@@ -10,7 +10,8 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from ..geometry.pose import Array, Pose
+from ..arrays import Array
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
 
 RelativeScale = Literal["metres", "unknown"]  # of the positions of relative poses

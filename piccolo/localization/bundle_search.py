@@ -8,11 +8,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import Array
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CONTRADICTED, posterior
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_IN_BUNDLE
-from ..geometry.pose import Array, Pose, angle_between
+from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .comparison import compare, score_pose

@@ -9,10 +9,10 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s, Mask
 from ..confidence.alternatives import Hypothesis
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
@@ -27,15 +27,13 @@ LEAST_SHARED = 0.3  # fraction of what the poorer view shows
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
 
-Array32 = NDArray[np.float32]
-
 
 class Comparison(NamedTuple):
     """Agreement of photo and scan at a pose, by blocks of the photo."""
 
-    correlation: NDArray[np.float64]  # (blocks,) of locally normalised colours, 0 where nothing is shared
-    area: NDArray[np.float64]  # (blocks,) fractions of the sphere that both show and do not contradict
-    visible_area: NDArray[np.float64]  # (blocks,) that both show
+    correlation: Array  # (blocks,) of locally normalised colours, 0 where nothing is shared
+    area: Array  # (blocks,) fractions of the sphere that both show and do not contradict
+    visible_area: Array  # (blocks,) that both show
     valid_area: float  # of the sphere that the photo shows
 
     @property
@@ -45,7 +43,7 @@ class Comparison(NamedTuple):
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
     @property
-    def contradicts(self) -> NDArray[np.bool_]:
+    def contradicts(self) -> Mask:
         """Mask (blocks,) of those that contradict the scan: an occluder, or the wrong pose."""
         return (self.correlation < CONTRADICTS) & (self.visible_area > 0.0)
 
@@ -119,12 +117,7 @@ def normalize(colors: Array32, shared: Array32, view: ViewArrays, normalized: Ar
 
 @kernel
 def correlate_blocks(
-    first: Array32,
-    second: Array32,
-    shared: Array32,
-    blocks: NDArray[np.int32],
-    correlation: Array,
-    area: Array,
+    first: Array32, second: Array32, shared: Array32, blocks: Int32s, correlation: Array, area: Array
 ) -> None:
     """Write the correlation and the area (blocks,) of two sets of channels (3, N) over the shared cells."""
     energy = np.zeros((len(area), 2))
@@ -151,8 +144,8 @@ def compare_cells(
     R_cam_from_map: Array,
     center: Array,
     view: ViewArrays,
-    num_columns: NDArray[np.int32],
-    first_cell: NDArray[np.int32],
+    num_columns: Int32s,
+    first_cell: Int32s,
     correlation: Array,
     area: Array,
     visible_area: Array,
@@ -242,7 +235,7 @@ def mask_occluders(query: Query, seen: Comparison) -> Query:
 
 
 @lru_cache(maxsize=1)
-def pixel_blocks() -> NDArray[np.int32]:
+def pixel_blocks() -> Int32s:
     """Return the block in which each pixel (h, 2 h) of a mask lies."""
     rays = pixel_rays(MASK_WIDTH).astype(np.float32)
     return find_cell(rays.reshape(-1, 3), BLOCK_RINGS).reshape(rays.shape[:2])

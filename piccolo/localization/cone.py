@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Array
+from ..arrays import Array, Int64s
 from ..geometry.sphere import pixel_rays
 from ..geometry.vectors import rotate
 from ..kernels.jit import inline_kernel
@@ -38,7 +38,7 @@ def select_cells(
     cone: Cone,
     R_cam_from_map: Array,
     center: Array,
-    kept: NDArray[np.int64],
+    kept: Int64s,
 ) -> int:
     """Write the indices of the cells with offsets (3, N) that lie in a cone; return their number."""
     axis = rotate(R_cam_from_map.T, cone.axis_cam)

@@ -9,8 +9,8 @@ import threading
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes, Int8s, Int64s, Mask
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, kernel
 
@@ -20,7 +20,7 @@ MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
 BLOCK = 512  # views a matrix product, at most
 LEAST_SEEN = 0.3  # of what a photo shows, by a view that it is compared with
 FLAT = 6.0  # [levels] a smaller deviation counts as this
-Samples = NDArray[np.float32]
+Samples = Array32
 
 
 class TurnedPanorama(NamedTuple):
@@ -59,8 +59,8 @@ def weigh_by_area(samples: Samples, validity: Samples, area: Samples, most_seen:
 
 @kernel
 def unpack_views(
-    features: NDArray[np.int8],
-    seen: NDArray[np.uint8],
+    features: Int8s,
+    seen: Bytes,
     area: Samples,
     values: Samples,
     fractions: Samples,
@@ -102,11 +102,7 @@ def thread_block(num_views: int, num_cells: int) -> list[Samples]:
 
 
 def masked_correlation(
-    features: NDArray[np.int8],
-    seen: NDArray[np.uint8],
-    panorama: TurnedPanorama,
-    workers: Workers,
-    is_centered: bool = False,
+    features: Int8s, seen: Bytes, panorama: TurnedPanorama, workers: Workers, is_centered: bool = False
 ) -> Samples:
     """Return the correlation (views, rotations), up to a factor, over the cells that both show.
 
@@ -219,12 +215,12 @@ def subtract_means(
 
 @kernel
 def correlate_pairs(
-    features: NDArray[np.int8],
-    is_seen: NDArray[np.bool_],
+    features: Int8s,
+    is_seen: Mask,
     area: Samples,
     panorama: TurnedPanorama,
-    row: NDArray[np.int64],
-    rotation: NDArray[np.int64],
+    row: Int64s,
+    rotation: Int64s,
     scores: Samples,
 ) -> None:
     """Write the masked correlation, up to a factor, of each pair of a view's row and a turned panorama.

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..geometry.pose import Array, Pose, log_so3, rotate_points, step, yaw_rotation
+from ..arrays import Array, Int64s, Mask
+from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
 from ..kernels.jit import kernel
@@ -89,7 +90,7 @@ def fill_symmetric(upper: Array) -> Array:
     return matrix
 
 
-def take(points: Cells, which: NDArray[np.bool_] | NDArray[np.intp]) -> Cells:
+def take(points: Cells, which: Mask | NDArray[np.intp]) -> Cells:
     """Return some of the points, by a mask or by their indices in a new order."""
     offsets, channels, weights = (np.ascontiguousarray(values[..., which]) for values in points[:3])
     return Cells(offsets, channels, weights, points.center_map)
@@ -102,7 +103,7 @@ def remove_poles(points: Cells, pose: Pose) -> Cells:
     return take(points, np.abs(heights) < math.cos(math.radians(POLE_DEG)) * ranges)
 
 
-def remove_hidden(points: Cells, is_valid: NDArray[np.bool_], pose: Pose) -> Cells:
+def remove_hidden(points: Cells, is_valid: Mask, pose: Pose) -> Cells:
     """Remove the points around a pose that lie in pixels (H, W) of the photo that are not valid."""
     rays_cam = rotate_points(points.offsets.T.astype(np.float64), pose.R_cam_from_world)
     return take(points, is_valid[compute_indices(rays_cam, is_valid.shape[1])])
@@ -124,7 +125,7 @@ def compute_hessian(problem: ChannelProblem, pose: Pose, steps: DifferenceSteps)
     return np.asarray(0.5 * (rows + rows.T))
 
 
-def sort_by_block(points: Cells) -> tuple[Cells, NDArray[np.int64]]:
+def sort_by_block(points: Cells) -> tuple[Cells, Int64s]:
     """Sort the points around a camera by the block of the sphere in which each lies.
 
     Return also where each block begins, and the number of points (B + 1,).
@@ -135,7 +136,7 @@ def sort_by_block(points: Cells) -> tuple[Cells, NDArray[np.int64]]:
     return take(points, np.argsort(blocks, kind="stable")), begins
 
 
-def sum_by_block(problem: ChannelProblem, pose: Pose, begins: NDArray[np.int64]) -> Array:
+def sum_by_block(problem: ChannelProblem, pose: Pose, begins: Int64s) -> Array:
     """Sum the normal equations (B, 29) over each block's points around a pose, from its `begins` (B + 1,)."""
     sums = np.empty((len(begins) - 1, NUM_SUMS))
     equations_by_part(problem, pose.R_cam_from_world, np.zeros(3), begins, sums)
@@ -196,7 +197,7 @@ def make_problem(points: Cells, image: Texels) -> ChannelProblem:
     )
 
 
-def score_halves(sums: Array, is_ahead: NDArray[np.bool_]) -> Array:
+def score_halves(sums: Array, is_ahead: Mask) -> Array:
     """Score (S,) if halves ask for poses of their own, from blocks' sums (B, 29); 1 in the mean by chance.
 
     `is_ahead` (S, B) tells the half of each block. The score is g^T A^-1 g of both halves' gradients at the

@@ -15,13 +15,13 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Mask
 from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
 from ..confidence.focal_length import MOST_CONFLICT, SLIPS, Opinion
 from ..confidence.localization import FocalLength
-from ..geometry.pose import Array, Pose, exp_so3, log_so3, rotate_points
+from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
 from ..local_features.matching import NO_MATCHES
@@ -256,7 +256,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     return np.array([losses for _, losses in ends]), [end for end, _ in ends]
 
 
-def mask_edge(points: Cells, pose: Pose, is_valid: NDArray[np.bool_]) -> Cells:
+def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     """Remove the points near the edge of what a photo (H, W) shows."""
     inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
     offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
@@ -387,7 +387,7 @@ def _turn_features(part: Once[Features], before: Mount, after: Mount) -> Feature
     return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
 
 
-def _turn_rays(rays: NDArray[np.float32], before: Mount, after: Mount) -> NDArray[np.float32]:
+def _turn_rays(rays: Array32, before: Mount, after: Mount) -> Array32:
     pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
     found, _ = after.camera.rays(pixels)
     return np.asarray(rotate_points(found, before.rotation.T), np.float32)

@@ -14,13 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..arrays import Array
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
 from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.matching import match

@@ -4,10 +4,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Int32s
 from ..confidence.alternatives import Hypothesis
-from ..geometry.pose import Array, Pose, orthonormal
+from ..geometry.pose import Pose, orthonormal
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
@@ -27,8 +27,6 @@ MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the l
 MAX_UNOCCLUDED = 2  # rounds that mask occluders
 NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
 MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
-
-Array32 = NDArray[np.float32]
 
 
 class Limits(NamedTuple):
@@ -193,7 +191,7 @@ def descend_perturbed(
     points: Array32,
     levels: Array32,
     weights: Array32,
-    blocks: NDArray[np.int32],
+    blocks: Int32s,
     wide: Texels,
     narrow: Texels,
     scale: float,
@@ -223,12 +221,12 @@ def descend_perturbed(
         scores[k] = score(points, levels, weights, blocks, narrow.rgbx, narrow.width, R[k], t[k])
 
 
-def to_levels(channels: NDArray[np.float32]) -> NDArray[np.float32]:
+def to_levels(channels: Array32) -> Array32:
     """Convert channels in standard deviations to 8-bit levels, not rounded."""
     return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
 
 
-def perturbations(size: float) -> NDArray[np.float64]:
+def perturbations(size: float) -> Array:
     """Return steps (9, 6), rotation [rad] and translation [m]: zero, then to the corners of a cube."""
     signs = np.array([(a, b, c) for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / math.sqrt(3.0)
     steps = np.concatenate([signs[:, ::-1] * PERTURBED_ANGLE, signs * PERTURBED_DISTANCE], axis=1) * size
@@ -246,7 +244,7 @@ def descend(cells: Cells, image: Texels, pose: Pose, limits: Limits) -> Pose:
     return Pose(orthonormal(R), t + cells.center_map)
 
 
-def score_on_cells(cells: Cells, blocks: NDArray[np.int32], image: Texels, pose: Pose) -> Hypothesis:
+def score_on_cells(cells: Cells, blocks: Int32s, image: Texels, pose: Pose) -> Hypothesis:
     """Score a pose by `channel_loss.score`, on the cells of a view and its blocks."""
     t = pose.center_world - cells.center_map
     R = pose.R_cam_from_world

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ..geometry.pose import Array, Pose, rotate_points
+from ..arrays import Array, Mask
+from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import Keypoints, find_keypoints
@@ -65,7 +65,7 @@ class Photo:
         found: Texels = getattr(self.images, name)()
         return found
 
-    def find_shown_cells(self, num_rings: int, pose: Pose) -> NDArray[np.bool_]:
+    def find_shown_cells(self, num_rings: int, pose: Pose) -> Mask:
         """Return a mask (N,) of the grid cells around a pose that the photo shows."""
         grid = make_grid(num_rings)
         if self.small.valid_share > ALL_SHOWN:
@@ -73,7 +73,7 @@ class Photo:
         rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
         return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
 
-    def mask(self, is_hidden: NDArray[np.bool_]) -> "Photo":
+    def mask(self, is_hidden: Mask) -> "Photo":
         """Return the photo without pixels (h, 2 h), the rest normalised again."""
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)

@@ -3,8 +3,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
 from ..prior import Prior
 from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
@@ -14,9 +14,9 @@ from ..scan_map.scan_map import ScanMap
 STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
 
 
-def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_]]:
+def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
     """Return the candidates (N,) that each option allows, with a margin of half a grid spacing."""
-    allowed: dict[str, NDArray[np.bool_]] = {}
+    allowed: dict[str, Mask] = {}
     if prior.near is not None and prior.radius is not None:
         allowed["`near`"] = distances_to(scan_map, prior.near) <= prior.radius + COARSE_SPACING / 2
     if prior.height is not None:
@@ -29,7 +29,7 @@ def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, NDArray[np.bool_
     return allowed
 
 
-def distances_to(scan_map: ScanMap, near: tuple[float, float, float | None]) -> NDArray[np.float64]:
+def distances_to(scan_map: ScanMap, near: tuple[float, float, float | None]) -> Array:
     """Return the distance (N,) [m] of each candidate from a place; along the ground if it has no z."""
     x, y, z = near
     centers_world = scan_map.centers @ scan_map.R_map_from_world + scan_map.origin_world
@@ -62,7 +62,7 @@ def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     return scan_map.narrow(np.isin(scan_map.sparse, scan_map.searched_for[is_allowed]))
 
 
-def allow_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDArray[np.float64]:
+def allow_rotations(R_cam_from_world: Array, prior: Prior) -> Array:
     """Return the rotations (N, 3, 3) of which the prior allows the heading, or else the nearest."""
     if prior.heading_deg is None:
         return R_cam_from_world
@@ -70,7 +70,7 @@ def allow_rotations(R_cam_from_world: NDArray[np.float64], prior: Prior) -> NDAr
     return np.asarray(R_cam_from_world[off <= max(np.radians(prior.tolerance_deg), float(off.min()))])
 
 
-def heading_errors(R_cam_from_world: NDArray[np.float64], heading_deg: float) -> NDArray[np.float64]:
+def heading_errors(R_cam_from_world: Array, heading_deg: float) -> Array:
     """Return the angles (N,) [rad] between a heading and the image centres of rotations (N, 3, 3)."""
     forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
     heading = np.arctan2(forward[:, 0], forward[:, 1])

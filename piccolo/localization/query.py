@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import EvidenceKind
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import Keypoints, find_keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches, match
@@ -105,7 +105,7 @@ class Query:
         colors = Once(partial(make_texels, self.given))
         return replace(self, photo=self.photo.forget(), colors=colors, cache=Cache(make_views(self.scan_map)))
 
-    def mask(self, is_hidden: NDArray[np.bool_]) -> "Query":
+    def mask(self, is_hidden: Mask) -> "Query":
         """Return the query of the photo without pixels (h, 2 h)."""
         return replace(self, photo=self.photo.mask(is_hidden), cache=Cache(self.cache.views))
 

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Int32s, Int64s
 from ..geometry.nearness import STARTING, STARTING_NARROW
 from ..geometry.pose import Pose
 from ..geometry.rotations import R_cam_from_angles, uniform_rotations, uniform_yaws
@@ -33,7 +33,7 @@ PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held abo
 NUM_LEVEL_YAWS = 40
 
 
-def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Samples, Samples]:
+def turn_panorama(texels: Texels, rotations: Array) -> tuple[Samples, Samples]:
     """Sample channels (rotations, 3, cells) of the search grid [levels], and validity (rotations, cells)."""
     grid = make_grid(SEARCH_RINGS)
     samples = np.empty((len(rotations), 3, len(grid)), np.float32)
@@ -47,7 +47,7 @@ def turn_panorama(texels: Texels, rotations: NDArray[np.float64]) -> tuple[Sampl
 def widen(
     samples: Samples,
     validity: Samples,
-    cells: NDArray[np.int32],
+    cells: Int32s,
     cell_areas: Samples,
     areas: Samples,
     wide_samples: Samples,
@@ -94,11 +94,11 @@ def widen_samples(samples: Samples, validity: Samples, workers: Workers) -> tupl
 class Starts:
     """Poses in arrays, best first, and the candidate on whose view each descends."""
 
-    R_cam_from_map: NDArray[np.float64]  # (n, 3, 3)
-    center_map: NDArray[np.float64]  # (n, 3) [m]
-    candidate: NDArray[np.int64]  # (n,)
+    R_cam_from_map: Array  # (n, 3, 3)
+    center_map: Array  # (n, 3) [m]
+    candidate: Int64s  # (n,)
 
-    def take(self, indices: NDArray[np.int64]) -> "Starts":
+    def take(self, indices: Int64s) -> "Starts":
         """Select the starts at `indices`, in that order."""
         return Starts(self.R_cam_from_map[indices], self.center_map[indices], self.candidate[indices])
 
@@ -114,7 +114,7 @@ def best_poses_wide(
     pool: int,
     workers: Workers,
     is_centered: bool = False,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
+) -> tuple[Int64s, Int64s, Samples]:
     """Return the best `pool` poses by the masked correlation of wide views with the averaged panorama.
 
     The result is as of `best_poses`. Candidates are scored in parts: the scores of a campus in all rotations
@@ -152,9 +152,7 @@ def views_at_once(num_rotations: int) -> int:
     return max(SCORES_AT_ONCE // num_rotations, BLOCK)
 
 
-def best_poses(
-    scores: Samples, pool: int, least: np.float32 = LOWEST
-) -> tuple[NDArray[np.int64], NDArray[np.int64], Samples]:
+def best_poses(scores: Samples, pool: int, least: np.float32 = LOWEST) -> tuple[Int64s, Int64s, Samples]:
     """Return candidates, rotations and scores of the best `pool` poses above `least`, best first.
 
     Of equal scores, the first is taken. A threshold from a sample of the scores keeps the sorted part small.
@@ -213,7 +211,7 @@ def search_poses(query: Query, tilts: Tilts) -> Starts:
     return Starts(R[kept][order], centers[kept][order], candidate[order])
 
 
-def list_rotations(query: Query, tilts: Tilts) -> NDArray[np.float64]:
+def list_rotations(query: Query, tilts: Tilts) -> Array:
     """Return the rotations (N, 3, 3), camera from map, to search: upright, about level, or all."""
     R_map_from_world = query.scan_map.R_map_from_world
     settings = query.settings

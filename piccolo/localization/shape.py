@@ -5,7 +5,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..geometry.pose import Array, yaw_rotation
+from ..arrays import Array
+from ..geometry.pose import yaw_rotation
 from ..panorama.gpano import attitude_of_gravity
 from .beam import brief_query, score_starts
 from .query import Query, prepare_query

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arrays import Array32, Bytes
 from ..confidence.occlusion import EXPLAINED, occlusion_mask
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
@@ -36,7 +37,7 @@ class Located(NamedTuple):
     """Keypoints of a picture at a pose in the map, and how far away what they show is."""
 
     keypoints: Keypoints
-    ranges: NDArray[np.float32]  # (N,) [m]
+    ranges: Array32  # (N,) [m]
     pose: Pose
 
 
@@ -166,14 +167,14 @@ def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArr
     )
 
 
-def draw(query: Query, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, NDArray[np.uint8]]:
+def draw(query: Query, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
     """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
     shown = cv2.dilate(view.cut_mask(query.photo.panorama.is_valid), np.ones((2 * AROUND + 1,) * 2, np.uint8))
     turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
     return render_gray(query.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
 
 
-def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, NDArray[np.float32]]:
+def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, Array32]:
     """Draw what a view of the photo would show at a pose; return the keypoints, and their ranges (N,) [m]."""
     image, shown = draw(query, pose, view)
     found = find_in_view(image.gray, np.where(image.is_filled, shown, np.uint8(0)), view)

@@ -3,10 +3,4 @@
 from .model import GPano, Panorama
 from .read import check_labels, panorama_size, read_panorama
 
-__all__ = [
-    "GPano",
-    "Panorama",
-    "check_labels",
-    "panorama_size",
-    "read_panorama",
-]
+__all__ = ["GPano", "Panorama", "check_labels", "panorama_size", "read_panorama"]

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Bytes, Mask
 from ..camera import Camera, Mount
 from ..camera.resampling import View, make_sphere
 
@@ -27,7 +27,7 @@ class FocalPrior:
     deviation: float  # standard deviation of its logarithm
     source: str  # the option that gives it, or EXIF
     view: View  # the photo, what is masked in it left out
-    is_hidden: NDArray[np.bool_]  # (H, W) of the sphere, masked beside
+    is_hidden: Mask  # (H, W) of the sphere, masked beside
     is_measured: bool = False  # by other photos of the camera
 
 
@@ -35,8 +35,8 @@ class FocalPrior:
 class Panorama:
     """A full equirectangular picture, W = 2 H."""
 
-    rgb: NDArray[np.uint8]  # (H, W, 3)
-    is_valid: NDArray[np.bool_]  # (H, W), False where the picture shows nothing
+    rgb: Bytes  # (H, W, 3)
+    is_valid: Mask  # (H, W), False where the picture shows nothing
     gpano: GPano | None = None  # None for a file without such metadata
     warnings: tuple[str, ...] = ()  # what the user should know of the reading
     cameras: tuple[Mount, ...] = ()  # that took it; none if it came as a sphere or a part of one

@@ -4,8 +4,8 @@ import math
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array
 from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses
@@ -33,7 +33,7 @@ PAPER_WEIGHTS = (6.37, 2.51)
 class PaperMap(LocalCloud):
     """The paper's map, prepared once per cloud."""
 
-    positions: NDArray[np.float64]  # (M, 3) starts in free space, relative to origin_world [m]
+    positions: Array  # (M, 3) starts in free space, relative to origin_world [m]
     scan_sha256: str = ""  # of the files or arrays that it was made from, in hexadecimal digits
 
 

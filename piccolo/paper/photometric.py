@@ -11,16 +11,14 @@ import functools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Mask
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
 from ..geometry.sphere import pixel_rays, ray_jacobian
 from ..optimize.refine import Equations, Loss
 from ..panorama import Panorama
 from ..views.zbuffer import View, render_view
-
-Image = NDArray[np.float32]
 
 MIN_SHOWN_SHARE = 0.5  # of what is rendered, as of the sampling loss: masked pixels may not hide more
 MIN_FILLED_SHARE = 0.1  # of the pixels that the points could fill: fewer are seen from outside of a scan
@@ -61,9 +59,7 @@ def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) 
     return float(norms.mean(dtype=np.float64)), gradient / count, matrix / count
 
 
-def _compare(
-    points: PackedPoints, panorama: Panorama, pose: Pose
-) -> tuple[View, Image, NDArray[np.bool_]] | None:
+def _compare(points: PackedPoints, panorama: Panorama, pose: Pose) -> tuple[View, Array32, Mask] | None:
     """Render the view at `pose`; return it, its differences (N, 3) in [-1, 1], and their mask (H, W).
 
     None where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan.
@@ -78,7 +74,7 @@ def _compare(
     return view, view.rgb[counts] - panorama.rgb[counts].astype(np.float32) / np.float32(255.0), counts
 
 
-def view_gradient(view: View) -> tuple[Image, Image]:
+def view_gradient(view: View) -> tuple[Array32, Array32]:
     """Return derivatives (H, W, 3) by u and v [1/px]: central, one-sided at a hole, 0 between two."""
     seen = view.is_seen[..., None].astype(np.float32)
     gradients = []
@@ -94,16 +90,14 @@ def view_gradient(view: View) -> tuple[Image, Image]:
 
 
 @functools.lru_cache(maxsize=2)
-def _unit_motion(width: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _unit_motion(width: int) -> tuple[Array, Array]:
     """Return derivatives (H, W, 6) of u and v by a step, for points at 1 m in each pixel's centre."""
     rays = pixel_rays(width)
     rows_u, rows_v = (np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in ray_jacobian(rays))
     return rows_u, rows_v
 
 
-def pixel_motion(
-    depth: NDArray[np.float32], counts: NDArray[np.bool_]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def pixel_motion(depth: Array32, counts: Mask) -> tuple[Array, Array]:
     """Return derivatives (N, 6) of u and v [px] by a step, for pixels of `counts` at `depth` (H, W)."""
     rows_u, rows_v = (rows[counts] for rows in _unit_motion(depth.shape[1]))
     per_depth = 1.0 / np.maximum(depth[counts], LEAST_DEPTH)[:, None]

@@ -3,12 +3,12 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Array32, Mask
 from ..cloud.soa import PackedPoints
 from ..confidence.alternatives import Hypothesis, best_distinct
 from ..geometry.nearness import Nearness
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.sphere import solid_angles
 from ..jobs.threads import Workers
 from ..optimize.refine import Loss
@@ -21,7 +21,7 @@ MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
 
 
-def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
+def box_grid(low: Array, high: Array, num_cells: int) -> Array:
     """Return centres (M, 3) of near-cubic cells that fill a box, M near `num_cells`, one an axis at least."""
     size = np.maximum(high - low, 1e-3)
     edge = (size.prod() / num_cells) ** (1.0 / 3.0)
@@ -34,7 +34,7 @@ def box_grid(low: Array, high: Array, num_cells: int) -> NDArray[np.float64]:
     return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
 
 
-def farthest_point_sampling(positions: NDArray[np.float64], count: int) -> NDArray[np.float64]:
+def farthest_point_sampling(positions: Array, count: int) -> Array:
     """Return at most `count` of the positions (N, 3), in their order.
 
     Each is chosen farthest from those chosen before it.
@@ -49,7 +49,7 @@ def farthest_point_sampling(positions: NDArray[np.float64], count: int) -> NDArr
     return np.asarray(positions[np.sort(chosen)])
 
 
-def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDArray[np.float64]:
+def free_grid(points: PackedPoints, num_translations: int, margin: float) -> Array:
     """Return camera positions (M, 3) in free space on a uniform grid over the box, M <= num_translations.
 
     The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined
@@ -71,7 +71,7 @@ def free_grid(points: PackedPoints, num_translations: int, margin: float) -> NDA
     return farthest_point_sampling(free, num_translations)
 
 
-def color_histogram(rgb: NDArray[np.float32], counts: NDArray[np.bool_], bins: int) -> NDArray[np.float64]:
+def color_histogram(rgb: Array32, counts: Mask, bins: int) -> Array:
     """Return the fraction (bins ** 3,) of the solid angle in each colour, of an image (H, W, 3) in [0, 1].
 
     Only pixels of `counts` (H, W) are counted; all zero if there is none.
@@ -99,8 +99,8 @@ def search(
     points: PackedPoints,
     panorama: Panorama,
     loss: Loss,
-    positions: NDArray[np.float64],
-    rotations: NDArray[np.float64],
+    positions: Array,
+    rotations: Array,
     settings: PaperSettings,
     workers: Workers,
 ) -> list[Hypothesis]:

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arrays import Array
 from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Array, Pose, carry
+from ..geometry.pose import Pose, carry
 from .frames import Frame, State
 from .path import EVEN, Path
 

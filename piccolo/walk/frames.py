@@ -12,10 +12,11 @@ from typing import Literal
 
 import numpy as np
 
+from ..arrays import Array
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Array, Pose
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, std_of
 from ..localization.comparison import Comparison
 from ..scan_map.scan_map import ScanMap

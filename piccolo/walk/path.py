@@ -16,10 +16,10 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..arrays import Array, Mask
 from ..geometry.nearness import ONE_ANSWER
-from ..geometry.pose import Array, Pose, carry
+from ..geometry.pose import Pose, carry
 from ..scan_map.free_space import FreeSpace
 from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
 from .motion import JUMP_LOG, REACH_SLACK, Motion
@@ -58,7 +58,7 @@ class _Steps(NamedTuple):
     """Log odds of the steps from a key frame's states to those of a later one."""
 
     begin: int  # number of the column
-    log: NDArray[np.float64]  # (S before, S)
+    log: Array  # (S before, S)
 
 
 class _Column(NamedTuple):
@@ -121,9 +121,7 @@ def track_back(frames: Sequence[Frame], m: int, k: int) -> Pose | None:
     return None if at_key is None or departed is None else carry(arrived, departed, at_key)
 
 
-def is_moved(
-    moved: tuple[Pose, Pose, float], starts: Sequence[State], ends: Sequence[State]
-) -> NDArray[np.bool_]:
+def is_moved(moved: tuple[Pose, Pose, float], starts: Sequence[State], ends: Sequence[State]) -> Mask:
     """Return True (S, N) for the steps that are as a known motion."""
     begin, end, error = moved
     carried = [carry(end, begin, state.pose) for state in starts]
@@ -194,7 +192,7 @@ class Lattice:
             known = self.known[m, k] = (*states, is_likely.tobytes(), steps)
         return known[3]
 
-    def _step(self, m: int, k: int, is_likely: NDArray[np.bool_], most_expected: float) -> Array:
+    def _step(self, m: int, k: int, is_likely: Mask, most_expected: float) -> Array:
         """Return log odds (S before, S) of the steps from a key frame to another.
 
         Nobody walks from a place that is far less likely (S before,) than the best.

@@ -10,10 +10,10 @@ from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
-from ...geometry.pose import Array, Pose, rotate_points
+from ...geometry.pose import Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import e57_file, reader
 from .e57_file import E57File, child, children, open_file, parse_integer, read_number, refusing, text_of
@@ -85,7 +85,7 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans))
 
 
-def _station_axes(scans: list[E57Scan]) -> tuple[NDArray[np.float64], ...]:
+def _station_axes(scans: list[E57Scan]) -> tuple[Array, ...]:
     """Return the z axes (3,) of the scanners whose poses are known."""
     poses = [scan.pose for scan in scans if scan.pose is not None]
     # programs that know of no scanner write the identity

@@ -16,8 +16,9 @@ from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 
 import numpy as np
 
+from ...arrays import Array
 from ...errors import InputError
-from ...geometry.pose import Array, Pose, rotation_from_quaternion_wxyz
+from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
 from ...optional import import_optional
 from .reader import quote_line
 

@@ -16,6 +16,7 @@ from typing import BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array, Bytes
 from ...errors import InputError
 from ...optional import import_optional
 from ..settings import IN_METRES, Channel, CloudSettings
@@ -71,8 +72,8 @@ class LasHeader(NamedTuple):
     point_format: int
     record_size: int  # [byte]
     num_points: int
-    scales: NDArray[np.float64]  # (3,) x y z
-    offsets: NDArray[np.float64]  # (3,)
+    scales: Array  # (3,) x y z
+    offsets: Array  # (3,)
     is_compressed: bool
 
     @property
@@ -231,9 +232,7 @@ def _check_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) ->
     return tuple(chunks)
 
 
-def decompress(
-    header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]
-) -> NDArray[np.uint8]:
+def decompress(header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]) -> Bytes:
     """Decompress the bytes `data` of `chunks`; return their records, one after the other."""
     lazrs = import_optional(header.path, "lazrs")
     if layout.num_layers:
@@ -344,7 +343,7 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
             data = file.read(size)
             if len(data) < size:
                 raise InputError(f"{header.path}: {reader.CUT}")
-            content: bytes | NDArray[np.uint8] = data
+            content: bytes | Bytes = data
             if layout.laszip:
                 content = decompress(header, layout, data, layout.chunks[first:end])
             records = np.frombuffer(content, dtype=header.dtype)
@@ -365,7 +364,7 @@ def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[re
         yield points_world, (kept[name] & bits).astype(np.float64)
 
 
-def _points(header: LasHeader, records: Records) -> tuple[NDArray[np.float64], Records]:
+def _points(header: LasHeader, records: Records) -> tuple[Array, Records]:
     """Return the positions (N, 3) of the records that are not withheld, and these records."""
     withheld = WITHHELD_OLD if header.point_format < 6 else WITHHELD
     is_withheld = (records["flags"] & withheld) != 0

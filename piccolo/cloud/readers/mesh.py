@@ -15,10 +15,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array, Bytes, Int64s, Mask
 from ...errors import InputError
-from ...geometry.pose import Array
 from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
@@ -36,11 +35,11 @@ class Surface(NamedTuple):
     """Triangles of one material, in their own frame."""
 
     vertices: Array  # (V, 3), NaN: the triangle is left out
-    triangles: NDArray[np.int64]  # (T, 3) rows of vertices
+    triangles: Int64s  # (T, 3) rows of vertices
     uv: Array | None = None  # (V, 2), v upwards from the lower edge
     texture: Texture | None = None
     colors: Array | None = None  # (C, 3) in [0, 1]; with a texture: factors
-    corners: NDArray[np.int64] | None = None  # (T, 3) rows of colors
+    corners: Int64s | None = None  # (T, 3) rows of colors
     is_linear: bool = False  # colors are linear light, not sRGB
 
 
@@ -72,7 +71,7 @@ def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points:
     behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
     behind[-1] = num_points
     last: Texture | None = None
-    texels: NDArray[np.uint8] | None = None
+    texels: Bytes | None = None
     for i, instance in enumerate(instances):
         first = int(behind[i - 1]) if i else 0
         end = int(behind[i])
@@ -94,7 +93,7 @@ def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points:
             yield _points(instance, k, rows, texels)
 
 
-def compute_weights(k: NDArray[np.int64]) -> Array:
+def compute_weights(k: Int64s) -> Array:
     """Return barycentric coordinates (N, 3) of points k: the R2 sequence, its square folded to a triangle."""
     a, b = (np.modf(0.5 + k * step)[0] for step in R2_STEPS)
     is_beyond = a + b > 1.0
@@ -102,9 +101,7 @@ def compute_weights(k: NDArray[np.int64]) -> Array:
     return np.stack([1.0 - a - b, a, b], axis=1)
 
 
-def _points(
-    instance: SurfaceInstance, k: NDArray[np.int64], rows: NDArray[np.int64], texels: NDArray[np.uint8] | None
-) -> RawCloud:
+def _points(instance: SurfaceInstance, k: Int64s, rows: Int64s, texels: Bytes | None) -> RawCloud:
     """Return the points k in the triangles `rows`, without those on texels of alpha 0."""
     surface = instance.surface
     weights = compute_weights(k)
@@ -126,13 +123,13 @@ def _points(
     return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
 
 
-def _blend(values: Array, corners: NDArray[np.int64], weights: Array) -> Array:
+def _blend(values: Array, corners: Int64s, weights: Array) -> Array:
     """Interpolate values (V, D) between corners (N, 3), rows of them, by barycentric weights (N, 3)."""
     a, b, c = (values[corners[:, i]] * weights[:, i : i + 1] for i in range(3))
     return np.asarray(a + b + c)
 
 
-def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
+def look_up(texels: Bytes, uv: Array) -> Bytes:
     """Return texels (N, 4) at uv (N, 2): u to the right, v upwards from the lower edge, both repeating."""
     height, width = texels.shape[:2]
     turned = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
@@ -142,7 +139,7 @@ def look_up(texels: NDArray[np.uint8], uv: Array) -> NDArray[np.uint8]:
     return np.asarray(texels[rows, columns])
 
 
-def srgb_to_linear(colors: NDArray[np.uint8]) -> Array:
+def srgb_to_linear(colors: Bytes) -> Array:
     """Convert sRGB bytes to linear light in [0, 1] (IEC 61966-2-1)."""
     levels = np.arange(256) / 255.0
     return np.asarray(np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)[colors])
@@ -153,7 +150,7 @@ def linear_to_srgb(linear: Array) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
-def _bytes(colors: Array) -> NDArray[np.uint8]:
+def _bytes(colors: Array) -> Bytes:
     return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
@@ -284,13 +281,13 @@ def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
     uv: Array = np.array(raw, dtype=np.float64)
     if uv.shape != (len(vertices), 2):
         raise InputError(f"{path}: {len(uv)} texture coordinates, wanted {len(vertices)}")
-    is_wrong: NDArray[np.bool_] = ~np.all(np.abs(uv) < 1e6, axis=1)
+    is_wrong: Mask = ~np.all(np.abs(uv) < 1e6, axis=1)
     vertices[is_wrong] = np.nan
     uv[is_wrong] = 0.0
     return uv
 
 
-def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray[np.int64]) -> Surface:
+def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: Int64s) -> Surface:
     visual = mesh.visual
     path = loaded.path
     materials = loaded.materials or []
@@ -314,9 +311,7 @@ def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: NDArray
     return Surface(vertices, triangles, uv, texture, colors, corners, is_linear=True)
 
 
-def _colors(
-    path: Path, mesh: Any, triangles: NDArray[np.int64]
-) -> tuple[Array, NDArray[np.int64]] | tuple[None, None]:
+def _colors(path: Path, mesh: Any, triangles: Int64s) -> tuple[Array, Int64s] | tuple[None, None]:
     """Return the colours (C, 3) of vertices, faces or the material, and the rows (T, 3) of the corners."""
     of_vertices = mesh.vertex_attributes.get("color")
     if of_vertices is not None:

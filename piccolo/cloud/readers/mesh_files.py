@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 from urllib.parse import unquote
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from ...arrays import Bytes
 from ...errors import InputError
 
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
@@ -54,7 +54,7 @@ class Texture(NamedTuple):
     path: Path  # of the mesh
     content: bytes
 
-    def texels(self) -> NDArray[np.uint8]:
+    def texels(self) -> Bytes:
         """Decode the texels (H, W, 4) RGBA, the first row at the top."""
         with _image(self.path, "", self.content) as image:
             return np.asarray(image.convert("RGBA"))

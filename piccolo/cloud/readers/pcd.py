@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array, Mask
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
@@ -268,7 +269,7 @@ def _read_packed(header: PcdHeader, type_: str, read_columns: reader.ColumnReade
         yield RawCloud(points_world, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8))
 
 
-def _bits_of_text(values: NDArray[np.float64], type_: str) -> tuple[NDArray[np.uint32], NDArray[np.bool_]]:
+def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
     """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits."""
     if type_ == "f4":
         # alpha 255 and a red above 127 make a NaN, which in text has lost its bits

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array, Mask
 from ...errors import InputError
 from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
@@ -34,7 +35,7 @@ class PtxScan(NamedTuple):
     """A scan's number of points and its transform to the world."""
 
     num_points: int  # lines in the file, with or without a return
-    T_world_from_scanner: NDArray[np.float64]  # (4, 4)
+    T_world_from_scanner: Array  # (4, 4)
 
 
 def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -69,7 +70,7 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     return PointSource(path, readers[channel], num_points, tuple(warnings), tuple(_station_axes(scans)))
 
 
-def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
+def _station_axes(scans: list[PtxScan]) -> Iterator[Array]:
     """Yield the unit z axes (3,), in the world, of the scanners whose pose is not the identity."""
     for scan in scans:
         z = scan.T_world_from_scanner[:3, 2]
@@ -84,7 +85,7 @@ def has_ptx_magic(head: bytes) -> bool:
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
 
-def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
+def _take_header(lines: NumberLines) -> tuple[int, Array] | None:
     """Return the next scan's number of points by its header, and T_world_from_scanner; None at the end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
@@ -123,15 +124,13 @@ def _ends_with_a_line_end(path: Path) -> bool:
         return file.read() in (b"\r", b"\n")
 
 
-def _read(
-    path: Path, layout: LineLayout, scans: list[PtxScan]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+def _read(path: Path, layout: LineLayout, scans: list[PtxScan]) -> Iterator[tuple[Array, NDArray[Any]]]:
     """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,)."""
     lines = NumberLines(path, layout, WANTED)
     for scan in scans:
         lines.skip(len(NUMBERS_A_LINE))
         for points, values in lines.read_points(scan.num_points):
-            is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
+            is_return: Mask = np.any(points != 0.0, axis=1)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
                 yield transform_points(points[is_return], scan.T_world_from_scanner), values[is_return]
 

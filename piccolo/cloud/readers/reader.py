@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array, Bytes, Floats, Int64s, Mask
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
 from ..settings import Channel, CloudSettings, UpAxis
@@ -27,16 +28,12 @@ MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 b
 CUT = "the file was cut while it was read, wanted a whole file"
 
 # points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
-PointsWithScalar = tuple[NDArray[np.floating[Any]], NDArray[np.float64]]
+PointsWithScalar = tuple[Floats, Array]
 ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
 # The value that means full brightness, by the type of a field without its byte order.
 BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
 TYPES_WANTED = "uint8 0-255, uint16 0-65535 or float 0-1, one for all three"
-COLOR_NAMES = (
-    ("red", "green", "blue"),
-    ("r", "g", "b"),
-    ("diffuse_red", "diffuse_green", "diffuse_blue"),
-)
+COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 Columns = list[NDArray[Any]]
 ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
@@ -56,8 +53,8 @@ class MissingChannelError(InputError):
 class RawCloud(NamedTuple):
     """Points in the file's order and unit, not yet checked."""
 
-    points_world: NDArray[np.floating[Any]]  # (N, 3) in the file's unit, maybe NaN; float32 if stored as such
-    colors: NDArray[np.uint8]  # (N, 3) RGB
+    points_world: Floats  # (N, 3) in the file's unit, maybe NaN; float32 if stored as such
+    colors: Bytes  # (N, 3) RGB
 
 
 ChunkReader = Callable[[], Iterator[RawCloud]]  # each call from the start; InputError where the data break
@@ -70,7 +67,7 @@ class PointSource(NamedTuple):
     read_chunks: ChunkReader
     num_points: int | None = None  # for the progress; None if only reading can tell
     warnings: tuple[str, ...] = ()  # one line each, for the user: what was decided about this file
-    station_axes: tuple[NDArray[np.float64], ...] = ()  # (3,) unit, z of scanners with poses, file's axes
+    station_axes: tuple[Array, ...] = ()  # (3,) unit, z of scanners with poses, file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
     channel: Channel = "colors"  # what is read of the points
 
@@ -125,7 +122,7 @@ def color_chunks(
         if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
             colors = np.array(values, dtype=np.uint8)
         else:  # a point without a finite position needs no colour: it becomes black
-            is_finite: NDArray[np.bool_] = np.all(np.isfinite(points_world), axis=1)
+            is_finite: Mask = np.all(np.isfinite(points_world), axis=1)
             numbers = np.where(is_finite[:, None], values, 0).astype(np.float64)
             is_wrong = ~((numbers >= 0.0) & (numbers <= brightest)).all(axis=1)
             if is_wrong.any():
@@ -166,7 +163,7 @@ def float_type(columns: Columns) -> type[np.floating[Any]]:
     return np.float32 if all(column.dtype.str[1:] == "f4" for column in columns) else np.float64
 
 
-def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
+def points_of(columns: Columns) -> Floats:
     """Return the points (N, 3) in the first three columns."""
     with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
         return np.stack(columns[:3], axis=1, dtype=float_type(columns[:3]))
@@ -197,7 +194,7 @@ def _read_colored(path: Path, read_columns: ColumnReader, brightest: float) -> I
     return color_chunks(parts, brightest, partial(point_label, path))
 
 
-def bare_points(chunks: Iterable[NDArray[np.floating[Any]]]) -> Iterator[RawCloud]:
+def bare_points(chunks: Iterable[Floats]) -> Iterator[RawCloud]:
     """Yield points (N, 3) of which only the shape counts, in grey."""
     return (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points in chunks)
 
@@ -223,7 +220,7 @@ def intensity_reader(read_scalar: ScalarReader) -> ChunkReader:
     return read_chunks
 
 
-def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[np.uint8]:
+def as_gray(intensity: Array, low: float, high: float) -> Bytes:
     """Convert intensity (N,) to gray (N, 3): black up to `low` and for NaN, white from `high` on.
 
     If all are alike, they say no more than no intensity does.
@@ -248,7 +245,7 @@ def _limits(chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
     return low, high
 
 
-def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
+def _bins(values: Array) -> Int64s:
     """Return the bin (N,) of each value: the upper half of its bits as a float32, in ascending order."""
     # + 0.0 turns -0.0 into 0.0
     bits = (np.clip(values, -LARGEST, LARGEST) + 0.0).astype(np.float32).view(np.uint32)

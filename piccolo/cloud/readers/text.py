@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
@@ -96,7 +97,7 @@ class NumberLines:
         self.num_taken += num_skipped
         return num_skipped
 
-    def _take_rows(self, count: int) -> NDArray[np.float64]:
+    def _take_rows(self, count: int) -> Array:
         """Return the wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
         columns = list(self.layout.columns)
         num_columns = self.layout.num_columns
@@ -118,7 +119,7 @@ class NumberLines:
         self.num_taken += len(rows)
         return rows
 
-    def read_rows(self, count: int | None = None) -> Iterator[NDArray[np.float64]]:
+    def read_rows(self, count: int | None = None) -> Iterator[Array]:
         """Yield the wanted columns of `count` lines, or of all that are left, CHUNK or fewer at once."""
         num_rows = 0
         while num_rows != count:
@@ -201,7 +202,7 @@ def is_number(field: str) -> bool:
 def line_source(path: Path, layout: LineLayout, channel: Channel, wanted: str) -> PointSource:
     """Return points of lines x y z r g b, colours 0-255, or of x y z intensity, or of x y z."""
 
-    def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+    def read() -> Iterator[tuple[Array, NDArray[Any]]]:
         return NumberLines(path, layout, wanted).read_points()
 
     readers: dict[Channel, ChunkReader] = {
