@@ -5,6 +5,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
+from html import escape
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,6 +21,7 @@ from .confidence.localization import Alternative, Evidence, FocalLength, Localiz
 from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose
+from .geometry.rotations import heading_pitch_roll_deg
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
 from .scan_map.gps import GpsPrior
@@ -190,6 +192,21 @@ class Result:
             shown = (h for h in self.alternatives if h.probability is None or round(h.probability, 2) > 0.0)
             lines += [f"  or {_place(h)}" for h in shown]
         return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        """Return the result as a table, which notebooks show."""
+        rows = {"photo": self.pano, "status": self.status, "confidence": f"{self.confidence:.3f}"}
+        if self.best_pose is not None:
+            x, y, z = self.best_pose.center_world
+            heading, pitch, roll = heading_pitch_roll_deg(self.best_pose)
+            turned = f"heading {heading:.1f}, pitch {pitch:.1f}, roll {roll:.1f} deg"
+            rows["pose" if self.pose else "best guess"] = f"({x:.3f}, {y:.3f}, {z:.3f}) m, {turned}"
+        if self.covariance is not None:
+            rows["one sigma"] = f"{1000.0 * self.covariance.largest_std:.1f} mm"
+        rows |= {"warnings": "; ".join(self.warnings)} if self.warnings else {}
+        rows |= {"error": self.error} if self.error else {}
+        cells = (f"<tr><th>{name}</th><td>{escape(printable(text))}</td></tr>" for name, text in rows.items())
+        return f"<table>{''.join(cells)}</table>"
 
     def to_json(self) -> str:
         """Return the result as JSON on one line (docs/RESULT.md). NaN and infinity raise ValueError."""

@@ -123,6 +123,17 @@ def test_result_without_a_pose_or_with_nan():
         dataclasses.replace(RESULT, loss=float("nan")).to_json()
 
 
+def test_a_notebook_shows_status_pose_and_confidence():
+    shown = dataclasses.replace(RESULT, pano="a<b>.jpg", warnings=("one",))._repr_html_()
+    x, y, z = RESULT.best_pose.center_world
+    place = f"({x:.3f}, {y:.3f}, {z:.3f}) m"
+    for text in ("a&lt;b&gt;.jpg", RESULT.status, f"{RESULT.confidence:.3f}", place, "one"):
+        assert f"<td>{text}" in shown
+    none = dataclasses.replace(RESULT, error="a.jpg: no such file", **WITHOUT_ARRAYS)
+    assert "<th>error</th><td>a.jpg: no such file</td>" in none._repr_html_()
+    assert "heading" not in none._repr_html_()
+
+
 def test_several_files_of_a_cloud_are_a_list():
     several = dataclasses.replace(RESULT, cloud=("b.ply", "a.ply"), **WITHOUT_ARRAYS)
     assert json.loads(several.to_json())["cloud"] == ["b.ply", "a.ply"]
