@@ -17,7 +17,7 @@ from ...geometry.pose import Array, Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import e57_file, reader
 from .e57_file import E57File, child, children, open_file, parse_integer, read_number, refusing, text_of
-from .reader import CHUNK, ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud
+from .reader import CHUNK, CloudFormat, MissingChannelError, PointSource
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -73,16 +73,10 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if not scans:
         error = InputError if channel == "shape" else MissingChannelError
         raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
-    read_chunks: ChunkReader = partial(_read_colored, path, scans)
-    if channel == "shape":
-        read_chunks = lambda: reader.bare_points(points for _, points, _ in _read(path, scans))  # noqa: E731
-    elif channel == "intensity":
-        read_chunks = reader.intensity_reader(
-            lambda: ((p, values[:, 0]) for _, p, values in _read(path, scans))
-        )
-    warnings = tuple(f"{path}: {what}; left out" for what in left_out)
     num_points = sum(scan.num_points for scan in scans)
-    return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans))
+    source = reader.make_source(path, partial(_read, path, scans), channel, num_points=num_points)
+    warnings = tuple(f"{path}: {what}; left out" for what in left_out)
+    return source._replace(warnings=warnings, station_axes=_station_axes(scans))
 
 
 def _station_axes(scans: list[E57Scan]) -> tuple[NDArray[np.float64], ...]:
@@ -162,31 +156,16 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     return first, last
 
 
-def _read_colored(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
-    """Yield the points with colours, scaled from the file's range to 0-255."""
-    for scan, points_world, values in _read(path, scans):
-        low, high = np.array(scan.color_ranges).T
-        with np.errstate(over="ignore", invalid="ignore"):
-            brightness = (values - low) * (255.0 / (high - low))
-        is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
-        if is_wrong.any():
-            i, k = np.argwhere(is_wrong)[0]
-            wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
-            raise InputError(f"{path}: {scan.label} has a colour of {values[i, k]:g}, {wanted}")
-        yield RawCloud(points_world, np.rint(brightness).astype(np.uint8))
-
-
-def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Array]]:
-    """Yield each scan with its valid points (N, 3), in the world, and their channels (N, C)."""
+def _read(path: Path, scans: list[E57Scan]) -> Iterator[reader.Part]:
+    """Yield the valid points (N, 3) of each scan, in the world, and their channels."""
     with open_file(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
                 is_valid = np.ones(len(columns[scan.coordinates[0]]), dtype=np.bool_)
                 for name in scan.invalid:
                     is_valid &= columns[name] == 0
-                a, b, c = (columns[name][is_valid] for name in scan.coordinates)
-                kept = [columns[name][is_valid] for name in scan.channels]
-                channels = np.array(kept).reshape(len(kept), len(a)).T
+                kept = {name: column[is_valid] for name, column in columns.items()}
+                a, b, c = (kept[name] for name in scan.coordinates)
                 with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
                     if scan.coordinates == SPHERICAL:
                         a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
@@ -194,7 +173,22 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
                     if scan.pose is not None:
                         R_world_from_scan = scan.pose.R_cam_from_world.T
                         points = rotate_points(points, R_world_from_scan) + scan.pose.center_world
-                yield scan, points, channels
+                yield points, _colors(path, scan, kept) if scan.color_ranges else kept.get(INTENSITY, points)
+
+
+def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> NDArray[np.uint8]:
+    """Return the colours (N, 3), scaled from the file's range to 0-255."""
+    values = np.stack([columns[name] for name in COLORS], axis=1)
+    low, high = np.array(scan.color_ranges).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        brightness = (values - low) * (255.0 / (high - low))
+    is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
+    if is_wrong.any():
+        i, k = np.argwhere(is_wrong)[0]
+        wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
+        raise InputError(f"{path}: {scan.label} has a colour of {values[i, k]:g}, {wanted}")
+    colors: NDArray[np.uint8] = np.rint(brightness).astype(np.uint8)
+    return colors
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:

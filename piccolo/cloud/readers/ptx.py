@@ -8,18 +8,16 @@ import math
 import os
 from collections.abc import Iterator
 from functools import partial
-from itertools import starmap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...errors import InputError
-from ...geometry.pose import transform_points
+from ...geometry.pose import Array, transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
+from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
@@ -34,7 +32,7 @@ class PtxScan(NamedTuple):
     """A scan's number of points and its transform to the world."""
 
     num_points: int  # lines in the file, with or without a return
-    T_world_from_scanner: NDArray[np.float64]  # (4, 4)
+    T_world_from_scanner: Array  # (4, 4)
 
 
 def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -60,16 +58,11 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
     read = partial(_read, path, COLORED if channel == "colors" else IN_GRAY, scans)
-    readers: dict[Channel, ChunkReader] = {
-        "colors": lambda: starmap(RawCloud, read()),
-        "intensity": reader.intensity_reader(read),
-        "shape": reader.bare_reader(read),
-    }
-    num_points = sum(scan.num_points for scan in scans)
-    return PointSource(path, readers[channel], num_points, tuple(warnings), tuple(_station_axes(scans)))
+    source = reader.make_source(path, read, channel, num_points=sum(scan.num_points for scan in scans))
+    return source._replace(warnings=tuple(warnings), station_axes=tuple(_station_axes(scans)))
 
 
-def _station_axes(scans: list[PtxScan]) -> Iterator[NDArray[np.float64]]:
+def _station_axes(scans: list[PtxScan]) -> Iterator[Array]:
     """Yield the unit z axes (3,), in the world, of the scanners whose pose is not the identity."""
     for scan in scans:
         z = scan.T_world_from_scanner[:3, 2]
@@ -84,7 +77,7 @@ def has_ptx_magic(head: bytes) -> bool:
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
 
-def _take_header(lines: NumberLines) -> tuple[int, NDArray[np.float64]] | None:
+def _take_header(lines: NumberLines) -> tuple[int, Array] | None:
     """Return the next scan's number of points by its header, and T_world_from_scanner; None at the end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
@@ -123,17 +116,16 @@ def _ends_with_a_line_end(path: Path) -> bool:
         return file.read() in (b"\r", b"\n")
 
 
-def _read(
-    path: Path, layout: LineLayout, scans: list[PtxScan]
-) -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
+def _read(path: Path, layout: LineLayout, scans: list[PtxScan]) -> Iterator[reader.Part]:
     """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,)."""
     lines = NumberLines(path, layout, WANTED)
     for scan in scans:
         lines.skip(len(NUMBERS_A_LINE))
         for points, values in lines.read_points(scan.num_points):
-            is_return: NDArray[np.bool_] = np.any(points != 0.0, axis=1)
+            is_return = np.any(points != 0.0, axis=1)
+            returned: Array = points[is_return].astype(np.float64, copy=False)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
-                yield transform_points(points[is_return], scan.T_world_from_scanner), values[is_return]
+                yield transform_points(returned, scan.T_world_from_scanner), values[is_return]
 
 
 PTX = CloudFormat("PTX", frozenset({".ptx"}), has_ptx_magic, open_ptx)

@@ -6,9 +6,9 @@ PTS files have lines x y z intensity r g b after a count of points.
 import os
 from collections.abc import Iterator
 from functools import partial
-from itertools import chain, islice, starmap
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
+from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
@@ -96,15 +96,24 @@ class NumberLines:
         self.num_taken += num_skipped
         return num_skipped
 
-    def _take_rows(self, count: int) -> NDArray[np.float64]:
-        """Return the wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
+    def read_rows(self, count: int | None = None) -> Iterator[NDArray[np.float64]]:
+        """Yield the wanted columns (R, C) of `count` lines, or of all that are left, CHUNK at once."""
+        num_columns = self.layout.num_columns or len(self.layout.columns)
+        most = max(1, min(reader.CHUNK, reader.MAX_BLOCK_SIZE // (8 * num_columns)))
+        num_rows = 0
+        while num_rows != count and self.peek() is not None:
+            rows = self._parse(most if count is None else min(most, count - num_rows))
+            num_rows += len(rows)
+            yield rows
+        if num_rows < (count or 0):
+            raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
+
+    def _parse(self, count: int) -> NDArray[np.float64]:
+        """Return the wanted columns (R, C) of the next lines, `count` or fewer."""
         columns = list(self.layout.columns)
         num_columns = self.layout.num_columns
-        most = max(1, reader.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
-        if self.peek() is None:
-            return np.empty((0, len(columns)))
-        lines = islice(self._lines, min(count, reader.CHUNK, most))
         usecols = columns if num_columns is None else None
+        lines = islice(self._lines, count)
         try:
             rows = np.loadtxt(lines, comments=None, delimiter=self.layout.delimiter, usecols=usecols, ndmin=2)
         except InputError:  # of line_blocks
@@ -118,31 +127,18 @@ class NumberLines:
         self.num_taken += len(rows)
         return rows
 
-    def read_rows(self, count: int | None = None) -> Iterator[NDArray[np.float64]]:
-        """Yield the wanted columns of `count` lines, or of all that are left, CHUNK or fewer at once."""
-        num_rows = 0
-        while num_rows != count:
-            rows = self._take_rows(reader.CHUNK if count is None else count - num_rows)
-            num_rows += len(rows)
-            if len(rows):
-                yield rows
-            elif count is None:
-                return
-            else:
-                raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
-
-    def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    def read_points(self, count: int | None = None) -> Iterator[reader.Part]:
         """Yield the points (N, 3) of the lines that `read_rows` would read, with the other columns.
 
-        These are colours (N, 3), checked to be 0-255, if six columns are read, else the fourth column (N,).
+        These are colours (N, 3), checked to be 0-255, if six columns are read, else the last column (N,).
         """
         first = self.num_taken
+        is_colored = len(self.layout.columns) == NUM_COLUMNS["colors"]
         rows = self.read_rows(count)
-        if len(self.layout.columns) == NUM_WITH_INTENSITY:
-            return ((some[:, :3], some[:, 3]) for some in rows)
-        parts = ((some[:, :3], some[:, 3:]) for some in rows)
-        chunks = reader.color_chunks(parts, reader.BRIGHTEST["u1"], lambda index: self.locate(first + index))
-        return ((chunk.points_world, chunk.colors) for chunk in chunks)
+        parts = ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
+        if not is_colored:
+            return parts
+        return reader.color_chunks(parts, reader.BRIGHTEST["u1"], lambda index: self.locate(first + index))
 
     def locate(self, index: int) -> str:
         """Return the file, and the number in it of the line that follows `index` lines of numbers."""
@@ -200,16 +196,7 @@ def is_number(field: str) -> bool:
 
 def line_source(path: Path, layout: LineLayout, channel: Channel, wanted: str) -> PointSource:
     """Return points of lines x y z r g b, colours 0-255, or of x y z intensity, or of x y z."""
-
-    def read() -> Iterator[tuple[NDArray[np.float64], NDArray[Any]]]:
-        return NumberLines(path, layout, wanted).read_points()
-
-    readers: dict[Channel, ChunkReader] = {
-        "colors": lambda: starmap(RawCloud, read()),
-        "intensity": reader.intensity_reader(read),
-        "shape": lambda: reader.bare_points(NumberLines(path, layout, wanted).read_rows()),
-    }
-    return PointSource(path, readers[channel])
+    return reader.make_source(path, lambda: NumberLines(path, layout, wanted).read_points(), channel)
 
 
 def open_text(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -277,14 +264,7 @@ def _find_columns(header: str, channel: Channel) -> tuple[int, ...]:
     """Return the columns of x, y, z, and r, g, b or an intensity; empty if not all are named."""
     names = _names(header)
     once = [name for name in names if names.count(name) == 1]
-    more: dict[Channel, tuple[str, ...]] = {
-        "colors": reader.color_names(once),
-        "intensity": tuple(name for name in once if name in reader.INTENSITY_NAMES)[:1],
-        "shape": (),
-    }
-    wanted = (*"xyz", *more[channel])
-    is_found = (more[channel] or channel == "shape") and set(wanted) <= set(once)
-    return tuple(names.index(name) for name in wanted) if is_found else ()
+    return tuple(map(names.index, reader.find_fields(once, channel)))
 
 
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
