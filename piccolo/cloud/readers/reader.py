@@ -244,29 +244,19 @@ def as_gray(intensity: NDArray[np.float64], low: float, high: float) -> NDArray[
 
 def _limits(chunks: Iterator[Part]) -> tuple[float, float]:
     """Return percentiles of the intensity of points with a position, within 1 %, or exact up to 255."""
-    histogram = np.zeros(NUM_BINS, np.int64)
+    histogram = np.zeros(NUM_BINS, np.int64)  # by the upper half of a float32's bits
     for points, intensity in chunks:
         is_measured = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
-        histogram += np.bincount(_bins(intensity[is_measured]), minlength=NUM_BINS)
-    total = np.cumsum(histogram)
+        # + 0.0 turns -0.0 into 0.0
+        values = (np.clip(intensity[is_measured], -LARGEST, LARGEST) + 0.0).astype(np.float32)
+        histogram += np.bincount(values.view(np.uint32) >> 16, minlength=NUM_BINS)
+    levels = (np.arange(NUM_BINS, dtype=np.uint32) << 16).view(np.float32)  # in each bin the nearest to 0
+    order = np.argsort(levels)
+    total = np.cumsum(histogram[order])
     if total[-1] == 0:  # no point has a position: others refuse that
         return 0.0, 1.0
-    low, high = (_lower_edge(int(np.searchsorted(total, share * total[-1]))) for share in (BLACK, WHITE))
+    low, high = levels[order[np.searchsorted(total, np.array([BLACK, WHITE]) * total[-1])]].tolist()
     return low, high
-
-
-def _bins(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the bin (N,) of each value: the upper half of its bits as a float32, in ascending order."""
-    # + 0.0 turns -0.0 into 0.0
-    bits = (np.clip(values, -LARGEST, LARGEST) + 0.0).astype(np.float32).view(np.uint32)
-    bits = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))
-    return (bits >> 16).astype(np.int64)
-
-
-def _lower_edge(index: int) -> float:
-    """Return the value nearest to 0 in a bin."""
-    bits = (index << 16) ^ (1 << 31) if index >= NUM_BINS // 2 else ~(index << 16 | 0xFFFF) & 0xFFFFFFFF
-    return float(np.array(bits, np.uint32).view(np.float32))
 
 
 def _read_labels(path: Path, read: PartReader, labels: Labels) -> Iterator[RawCloud]:

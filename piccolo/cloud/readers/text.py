@@ -5,7 +5,6 @@ PTS files have lines x y z intensity r g b after a count of points.
 
 import os
 from collections.abc import Iterator
-from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -74,8 +73,15 @@ class NumberLines:
         self.layout = layout
         self.wanted = wanted
         self.num_taken = 0
-        self._kept = partial(_strip_blanks, has_counts=layout.has_counts)
-        self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
+        self._lines = chain.from_iterable(map(self._strip, line_blocks(path, layout.start)))
+
+    def _strip(self, lines: list[bytes]) -> list[bytes]:
+        """Strip lines of blanks; return the lines of numbers."""
+        return [
+            line
+            for line in filter(None, map(bytes.strip, lines))
+            if not line.startswith(COMMENT_MARKS) and not (self.layout.has_counts and line.isdigit())
+        ]
 
     def peek(self) -> bytes | None:
         """Return the next line without taking it; None at the end."""
@@ -153,8 +159,7 @@ class NumberLines:
         for lines in line_blocks(self.path, self.layout.start):
             for line in lines:
                 number += 1
-                for kept in self._kept([line]):
-                    yield number, kept
+                yield from ((number, kept) for kept in self._strip([line]))
 
     def _complaint(self, otherwise: str) -> str:
         """Describe the first broken line after those taken; with `otherwise` if all seem right."""
@@ -174,15 +179,6 @@ class NumberLines:
         parsed = [fields[column] for column in columns] if exact is None else fields
         broken = next((field for field in parsed if not is_number(field)), None)
         return "" if broken is None else f"{quote_line(broken.encode('latin-1'))} is not a number"
-
-
-def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
-    """Strip lines of blanks; return the lines of numbers."""
-    return [
-        line
-        for line in filter(None, map(bytes.strip, lines))
-        if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
-    ]
 
 
 def is_number(field: str) -> bool:
@@ -218,20 +214,26 @@ def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
     start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
     named: tuple[int, ...] = ()
     header = ""
+    num_names = 0
     num_lines = 0
     for line in head[start:].splitlines(keepends=True):
         text = line.decode("latin-1").strip()
-        fields = text.split(_delimiter(text))
-        if _begins_numbers(line.strip(), fields):
+        delimiter = _delimiter(text)
+        fields = text.split(delimiter)
+        is_count = len(fields) == 1 and line.strip().isdigit()
+        if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
             break
-        named = _find_columns(text, channel) or named
-        if {*"xyz"} <= {*_names(text)}:
+        names = [name.strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter)]
+        once = [name for name in names if names.count(name) == 1]
+        named = tuple(map(names.index, reader.find_fields(once, channel))) or named
+        if {*"xyz"} <= {*names}:
             header = text
+            num_names = len(names)
         start += len(line)
         num_lines += 1
     else:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
-    if not named and len(_names(header)) == len(fields):
+    if not named and num_names == len(fields):
         raise MissingChannelError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
     has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
     if not named and channel == "intensity" and not has_intensity:
@@ -241,30 +243,12 @@ def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
         found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quote_line(line)}"
         error = MissingChannelError if len(fields) >= NUM_COLUMNS["shape"] else InputError
         raise error(f"{path}: {found}, {WANTED}")
-    return LineLayout(columns, start=start, delimiter=_delimiter(text))
+    return LineLayout(columns, start=start, delimiter=delimiter)
 
 
 def _delimiter(line: str) -> str | None:
+    """Return the mark between the columns of a line; None for blanks and tabs."""
     return next((mark for mark in ";," if mark in line), None)
-
-
-def _begins_numbers(line: bytes, fields: list[str]) -> bool:
-    """Return False for blank lines, comments, headers, and the count of points at the start of .pts files."""
-    is_count = len(fields) == 1 and line.isdigit()
-    return not line.startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields))
-
-
-def _names(header: str) -> list[str]:
-    """Return the names of columns in a header line, in lower case."""
-    names = header.lstrip("#/ ")
-    return [name.strip(' "').lower() for name in names.split(_delimiter(names))]
-
-
-def _find_columns(header: str, channel: Channel) -> tuple[int, ...]:
-    """Return the columns of x, y, z, and r, g, b or an intensity; empty if not all are named."""
-    names = _names(header)
-    once = [name for name in names if names.count(name) == 1]
-    return tuple(map(names.index, reader.find_fields(once, channel)))
 
 
 TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
