@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..files.atomic import replacing
 from ..geometry.pose import Array, transform_points
-from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
-from .readers.reader import CHUNK, HEAD_SIZE
+from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
+from .readers.reader import CHUNK
 from .stream import CloudStream
 
 TYPE_NAMES = {
@@ -121,7 +121,7 @@ def write_transformed(
     """
     path = cloud.sources[0].path
     with path.open("rb") as file:
-        is_ply = PLY.has_magic(file.read(HEAD_SIZE))
+        is_ply = file.read(len(MAGIC[0])) in MAGIC
     if is_ply and len(cloud.sources) == 1:
         return _write_copy(cloud, read_header(path), T_target_from_source, out, finish)
     dtype = coordinate_type(cloud.box, T_target_from_source, cloud.scale)

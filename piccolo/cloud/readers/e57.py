@@ -17,7 +17,7 @@ from ...geometry.pose import Array, Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import e57_file, reader
 from .e57_file import E57File, open_file, parse_integer, read_number, refusing
-from .reader import CHUNK, CloudFormat, MissingChannelError, PointSource
+from .reader import CHUNK, MissingChannelError, PointSource
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
@@ -208,9 +208,6 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     if num_read != scan.num_points:
         counts = f"promises {scan.num_points} points, found {num_read}"
         raise InputError(f"{file.path}: {scan.label} {counts}; the file is broken")
-
-
-E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(e57_file.MAGIC), open_e57)
 
 
 class E57Image(NamedTuple):

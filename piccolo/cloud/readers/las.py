@@ -20,7 +20,7 @@ from ...errors import InputError
 from ...optional import import_optional
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CHUNK, CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import CHUNK, MissingChannelError, PointSource, quote_line
 
 MAGIC = b"LASF"
 MIN_HEADER_SIZE = 227  # [byte]
@@ -367,8 +367,3 @@ def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> NDArr
     if (rgb > 255).any():
         raise InputError(f"{header.path}: a colour of {rgb.max()} in a file whose other colours are 8-bit")
     return rgb.astype(np.uint8)
-
-
-LAS = CloudFormat(
-    "LAS, LAZ", frozenset({".las", ".laz"}), lambda head: head.startswith(MAGIC), open_las, has_labels=True
-)

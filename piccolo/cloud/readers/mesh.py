@@ -22,7 +22,7 @@ from ...geometry.pose import Array
 from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import BRIGHTEST, CHUNK, GRAY, CloudFormat, MissingChannelError, PointSource, RawCloud
+from .reader import BRIGHTEST, CHUNK, GRAY, MissingChannelError, PointSource, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -308,11 +308,3 @@ def _fractions(path: Path, raw: Any, count: int) -> Array:
     if not np.all((fractions >= 0.0) & (fractions <= 1.0)):
         raise InputError(f"{path}: a colour of {np.abs(colors).max():g}, wanted 0 to 1 or bytes")
     return np.asarray(fractions, dtype=np.float64)
-
-
-MESH = CloudFormat(
-    "OBJ, GLB and glTF meshes",
-    frozenset({".obj", ".glb", ".gltf"}),
-    lambda head: head.startswith(GLB_MAGIC),
-    open_mesh,
-)

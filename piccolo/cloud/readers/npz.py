@@ -19,7 +19,7 @@ from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -163,7 +163,3 @@ def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     if promised != found:
         raise InputError(f"{path}: an array promises {promised} bytes, found {found}; it is cut off")
     return array
-
-
-NPY = CloudFormat("NumPy .npy", frozenset({".npy"}), lambda head: head.startswith(NPY_MAGIC), open_npy)
-NPZ = CloudFormat("NumPy .npz", frozenset({".npz"}), has_npz_magic, open_npz)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
@@ -267,8 +267,3 @@ def _bits_of_text(values: NDArray[np.float64], type_: str) -> tuple[NDArray[np.u
         return np.where(is_right, values, 0.0).astype(np.float32).view(np.uint32), is_right
     is_right = (values >= -(2.0**31)) & (values < 2.0**32) & (values == np.floor(values))
     return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right
-
-
-PCD = CloudFormat(
-    "PCD", frozenset({".pcd"}), lambda head: bool(FIRST_LINES.match(head)), open_pcd, has_labels=True
-)

@@ -18,7 +18,7 @@ from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .mesh import open_ply_mesh
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
@@ -157,6 +157,3 @@ def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
         promised = f"promises {count} vertices of {dtype.itemsize} bytes, found {room} bytes"
         raise InputError(f"{header.path}: the header {promised}; the file is cut off or broken")
     return offset, count, dtype
-
-
-PLY = CloudFormat("PLY", frozenset({".ply"}), lambda head: head.startswith(MAGIC), open_ply, has_labels=True)

@@ -17,7 +17,7 @@ from ...errors import InputError
 from ...geometry.pose import Array, transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
@@ -126,6 +126,3 @@ def _read(path: Path, layout: LineLayout, scans: list[PtxScan]) -> Iterator[read
             returned: Array = points[is_return].astype(np.float64, copy=False)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
                 yield transform_points(returned, scan.T_world_from_scanner), values[is_return]
-
-
-PTX = CloudFormat("PTX", frozenset({".ptx"}), has_ptx_magic, open_ptx)

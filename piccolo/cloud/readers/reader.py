@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
-from ..settings import Channel, CloudSettings, UpAxis
+from ..settings import Channel, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
@@ -72,17 +72,6 @@ class PointSource(NamedTuple):
     station_axes: tuple[NDArray[np.float64], ...] = ()  # (3,) unit, z of scanners with poses, file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
     channel: Channel = "colors"  # what is read of the points
-
-
-class CloudFormat(NamedTuple):
-    """A format and its reader."""
-
-    name: str
-    suffixes: frozenset[str]  # lower case, with the dot
-    has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    # MissingChannelError if the file has no such channel
-    open_source: Callable[[Path, CloudSettings, Channel], PointSource]
-    has_labels: bool = False  # the reader knows them
 
 
 def quote_line(line: bytes) -> str:

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 NUM_COLUMNS: dict[Channel, int] = {"colors": 6, "intensity": NUM_WITH_INTENSITY, "shape": 3}
-TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
@@ -251,9 +250,6 @@ def _delimiter(line: str) -> str | None:
     return next((mark for mark in ";," if mark in line), None)
 
 
-TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
-
-
 def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of a PTS file.
 
@@ -273,6 +269,3 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         error = MissingChannelError if min(num_columns, 7) in COLUMNS["shape"] else InputError
         raise error(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
     return line_source(path, LineLayout(columns, num_columns, has_counts=True), channel, PTS_WANTED)
-
-
-PTS = CloudFormat("PTS", frozenset({".pts"}), lambda head: False, open_pts)
