@@ -178,6 +178,7 @@ def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list
         materials = [NO_MATERIAL, *(_material(path, given) for given in tree.get("materials", []))]
         _keep_base_colors(tree, materials)
         _keep_triangles(path, tree, materials, num_bytes)
+        _split_meshes(tree)
         list(_read_files(tree["images"], resolver))
         for node in tree.get("nodes", []):
             node.pop("camera", None)  # with which trimesh passes over the node's mesh
@@ -291,6 +292,22 @@ def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes
         num_rows += sum(accessors[row]["count"] for row in rows)
     if num_rows > max(MAX_ROWS, num_bytes):
         raise InputError(f"{path}: over {MAX_ROWS} vertices and indices in {num_bytes} bytes")
+
+
+def _split_meshes(tree: Json) -> None:
+    """Place each primitive by a node of its own: trimesh names those of one mesh by chance, some alike."""
+    parts: list[Json] = []
+    nodes: list[Json] = tree.get("nodes", [])
+    splits: list[list[int]] = []
+    for mesh in tree.get("meshes", []):
+        splits.append([*range(len(parts), len(parts) + len(mesh["primitives"]))])
+        parts += [{"primitives": [primitive]} for primitive in mesh["primitives"]]
+    for node in nodes[:]:
+        if "mesh" in node:
+            added = [{"mesh": part} for part in splits[node.pop("mesh")]]
+            node["children"] = [*node.get("children", []), *range(len(nodes), len(nodes) + len(added))]
+            nodes += added
+    tree["meshes"] = parts
 
 
 def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:
