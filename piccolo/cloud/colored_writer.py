@@ -14,7 +14,7 @@ from ..files.atomic import replacing
 from ..files.temporary import temporary_folder
 from ..jobs.memory import check_memory
 from ..optional import import_optional
-from .ply_writer import needs_double, vertex_rows, writing_ply
+from .ply_writer import coordinate_type, vertex_rows, writing_ply
 from .stream import CloudStream
 
 SUFFIXES = (".ply", ".las", ".laz", ".e57")
@@ -47,14 +47,11 @@ def write_colored(
 @contextmanager
 def writing_ply_rows(out: Path, box: Array, scale: float, _crs: str) -> Iterator[Add]:
     """Yield a function that adds points to a PLY file."""
-    dtype = np.float64 if needs_double(box * scale, np.eye(4), scale) else np.float32
-
-    def rows(points: Array, colors: Bytes, num_photos: Bytes) -> NDArray[np.void]:
-        return vertex_rows(points.astype(dtype), colors, photos=num_photos)
-
-    empty = rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), np.empty(0, np.uint8))
-    with writing_ply(out, empty.dtype) as writer:
-        yield lambda *columns: writer.add(rows(*columns))
+    dtype = coordinate_type(box * scale, np.eye(4), scale)
+    with writing_ply(out) as writer:
+        yield lambda points, colors, num_photos: writer.add(
+            vertex_rows(points.astype(dtype), colors, photos=num_photos)
+        )
 
 
 @contextmanager

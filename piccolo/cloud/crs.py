@@ -9,8 +9,6 @@ from ..optional import import_optional
 from .readers import e57_file, las
 from .settings import check_crs
 
-__all__ = ["check_crs", "from_wgs84", "read_crs"]
-
 PROJECTION_USER = b"LASF_Projection"  # of LAS's records
 WKT_ID = 2112
 GEO_KEYS_ID = 34735
@@ -31,7 +29,7 @@ def read_crs(paths: Sequence[Path]) -> str:
     if head.startswith(las.MAGIC):
         text = _of_las(paths[0])
     elif head.startswith(e57_file.MAGIC):
-        text = e57_file.read_xml(paths[0]).findtext("{*}coordinateMetadata") or ""
+        text = e57_file.read_xml(paths[0]).findtext("coordinateMetadata", "")
     return " ".join(text.split()) if len(text) <= MAX_LENGTH else ""
 
 

@@ -1,24 +1,47 @@
 """Opening files of point clouds: the format follows from a file's first bytes, or else from its name."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 from ..errors import InputError
 from ..jobs.threads import Progress, no_progress
-from .readers.e57 import E57
-from .readers.las import LAS
-from .readers.mesh import MESH
-from .readers.npz import NPY, NPZ
-from .readers.pcd import PCD
-from .readers.ply import PLY
-from .readers.ptx import PTX
-from .readers.reader import HEAD_SIZE, CloudFormat, MissingChannelError, PointSource
-from .readers.text import PTS, TEXT
-from .settings import IN_METRES, CloudSettings
+from .readers import e57, e57_file, las, mesh, mesh_files, npz, pcd, ply, ptx, text
+from .readers.reader import HEAD_SIZE, MissingChannelError, PointSource
+from .settings import IN_METRES, Channel, CloudSettings
 from .stream import Cloud, CloudStream
 
-FORMATS = (PLY, LAS, E57, PCD, PTX, PTS, NPZ, NPY, MESH, TEXT)
+
+class CloudFormat(NamedTuple):
+    """A format and its reader."""
+
+    name: str
+    suffixes: tuple[str, ...]  # lower case, with the dot
+    has_magic: Callable[[bytes], object]  # true of a file's first HEAD_SIZE bytes; content goes before names
+    # MissingChannelError if the file has no such channel
+    open_source: Callable[[Path, CloudSettings, Channel], PointSource]
+    has_labels: bool = False  # the reader knows them
+
+
+def _begins(*magic: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(magic)
+
+
+FORMATS = (
+    CloudFormat("PLY", (".ply",), _begins(*ply.MAGIC), ply.open_ply, has_labels=True),
+    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las.MAGIC), las.open_las, has_labels=True),
+    CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
+    CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd, has_labels=True),
+    CloudFormat("PTX", (".ptx",), ptx.has_ptx_magic, ptx.open_ptx),
+    CloudFormat("PTS", (".pts",), _begins(), text.open_pts),
+    CloudFormat("NumPy .npz", (".npz",), npz.has_npz_magic, npz.open_npz),
+    CloudFormat("NumPy .npy", (".npy",), _begins(npz.NPY_MAGIC), npz.open_npy),
+    CloudFormat(
+        "OBJ, GLB and glTF meshes", (".obj", ".glb", ".gltf"), _begins(mesh_files.GLB_MAGIC), mesh.open_mesh
+    ),
+    CloudFormat("text x y z r g b", (".txt", ".xyz", ".asc", ".csv", ".xyzrgb"), _begins(), text.open_text),
+)
 WANTED = f"wanted a point cloud: {', '.join(f.name for f in FORMATS)}"
 
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Bytes, Floats
 from ..files.atomic import replacing
-from ..geometry.pose import transform_points
-from .readers.ply import PLY, PlyHeader, place_of_vertices, read_columns, read_header
-from .readers.reader import CHUNK, HEAD_SIZE
+from ..geometry.pose import Array, transform_points
+from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
+from .readers.reader import CHUNK
 from .stream import CloudStream
 
 TYPE_NAMES = {
@@ -36,15 +36,17 @@ def vertex_rows(points: Floats, colors: Bytes | None, **more: NDArray[Any] | Non
     columns = dict(zip(AXES, points.T, strict=True))
     columns.update({} if colors is None else dict(zip(COLOR_NAMES, colors.T, strict=True)))
     columns.update((name, column) for name, column in more.items() if column is not None)
-    rows = np.empty(len(points), dtype=[(name, column.dtype) for name, column in columns.items()])
+    return _rows(columns, np.dtype([(name, column.dtype) for name, column in columns.items()]))
+
+
+def _rows(columns: dict[str, NDArray[Any]], dtype: np.dtype[Any]) -> Rows:
+    rows = np.empty(len(columns["x"]), dtype)
     for name, column in columns.items():
         rows[name] = column
     return rows
 
 
-def header(
-    dtype: np.dtype[Any], num_vertices: int, comments: Sequence[str] = (), more: Sequence[str] = ()
-) -> bytes:
+def header(dtype: np.dtype[Any], num_vertices: int, comments: Sequence[str], more: Sequence[str]) -> bytes:
     """Return the header of binary vertices; its size does not depend on their number.
 
     `more` are the lines of the elements that follow the vertices.
@@ -59,45 +61,52 @@ def header(
 
 @dataclass
 class PlyWriter:
-    """A writer of vertices, chunk by chunk."""
+    """A writer of vertices, chunk by chunk; all have the fields of the first."""
 
     file: IO[bytes]  # after the vertices the caller may write more elements, in little-endian order
-    dtype: np.dtype[Any]  # little-endian
+    comments: Sequence[str]
+    more: Sequence[str]  # lines of the header for the elements after the vertices
+    dtype: np.dtype[Any] | None = None  # little-endian
     num_vertices: int = 0
 
     def add(self, rows: Rows) -> None:
-        """Write vertices of the writer's dtype."""
+        """Write vertices."""
+        if self.dtype is None:
+            self.dtype = rows.dtype.newbyteorder("<")
+            self.write_header()
         self.file.write(np.ascontiguousarray(rows.astype(self.dtype, copy=False)).data)
         self.num_vertices += len(rows)
 
+    def write_header(self) -> None:
+        """Write the header for the vertices so far."""
+        self.file.write(header(self.dtype or np.dtype([]), self.num_vertices, self.comments, self.more))
+
 
 @contextmanager
-def writing_ply(
-    path: Path, dtype: np.dtype[Any], comments: Sequence[str] = (), more: Sequence[str] = ()
-) -> Iterator[PlyWriter]:
+def writing_ply(path: Path, comments: Sequence[str] = (), more: Sequence[str] = ()) -> Iterator[PlyWriter]:
     """Yield a writer of `path`, which is replaced when all is written and counted, and not after an error."""
     with replacing(path) as file:
-        writer = PlyWriter(file, dtype.newbyteorder("<"))
-        file.write(header(writer.dtype, 0, comments, more))
+        writer = PlyWriter(file, comments, more)
         yield writer
         file.seek(0)
-        file.write(header(writer.dtype, writer.num_vertices, comments, more))
+        writer.write_header()
 
 
 def write_ply(path: Path, rows: Rows) -> None:
     """Write vertices to a file, whole or not at all."""
-    with writing_ply(path, rows.dtype) as writer:
+    with writing_ply(path) as writer:
         writer.add(rows)
 
 
-def needs_double(box: Array, T_target_from_source: Array, scale: float) -> bool:
-    """Return True if rounding to float32 would move a transformed box (2, 3) [m] by over MAX_LOSS.
+def coordinate_type(box: Array, T_target_from_source: Array, scale: float) -> type[np.floating[Any]]:
+    """Return float64 if rounding to float32 would move a transformed box (2, 3) [m] by over MAX_LOSS.
 
     T is in units of `scale` metres.
     """
     corners = np.stack(np.meshgrid(*box.T), axis=-1).reshape(8, 3)
     farthest = float(np.abs(transform_points(corners / scale, T_target_from_source)).max())
-    return float(np.spacing(np.float32(farthest))) * scale > 2.0 * MAX_LOSS
+    is_coarse = float(np.spacing(np.float32(farthest))) * scale > 2.0 * MAX_LOSS
+    return np.float64 if is_coarse else np.float32
 
 
 def write_transformed(
@@ -111,21 +120,17 @@ def write_transformed(
     """
     path = cloud.sources[0].path
     with path.open("rb") as file:
-        is_ply = PLY.has_magic(file.read(HEAD_SIZE))
+        is_ply = file.read(len(MAGIC[0])) in MAGIC
     if is_ply and len(cloud.sources) == 1:
         return _write_copy(cloud, read_header(path), T_target_from_source, out, finish)
-    dtype = np.float64 if needs_double(cloud.box, T_target_from_source, cloud.scale) else np.float32
-    channel = cloud.sources[0].channel
-
-    def rows_of(points: Floats, colors: Bytes) -> Rows:
-        intensity = colors[:, 0] if channel == "intensity" else None
-        return vertex_rows(points, colors if cloud.has_colors else None, intensity=intensity)
-
-    fields = rows_of(np.empty((0, 3), dtype), np.empty((0, 3), np.uint8)).dtype
-    with writing_ply(out, fields) as writer:
+    dtype = coordinate_type(cloud.box, T_target_from_source, cloud.scale)
+    has_intensity = cloud.sources[0].channel == "intensity"
+    with writing_ply(out) as writer:
         for points, colors in cloud.chunks([]):
             target = transform_points(points / cloud.scale, T_target_from_source)
-            writer.add(rows_of(target.astype(dtype), colors))
+            gray = colors[:, 0] if has_intensity else None
+            rows = vertex_rows(target.astype(dtype), colors if cloud.has_colors else None, intensity=gray)
+            writer.add(rows)
         finish()
     return ()
 
@@ -145,17 +150,19 @@ def _write_copy(
         element = header.elements[k]
         more += [f"element {element.name} {header.counts[k]}", *map(str, element.properties)]
     found = header.vertices.dtype("<")
-    is_double = needs_double(cloud.box, T_target_from_source, cloud.scale)
+    is_double = coordinate_type(cloud.box, T_target_from_source, cloud.scale) is np.float64
     wide = [name for name in AXES if is_double or found[name].kind != "f"]  # integers are not enough either
-    dtype = np.dtype([(name, "<f8" if name in wide else found[name]) for name in found.names or ()])
-    columns = read_columns(header, found.names or ())
+    names = found.names or ()
+    dtype = np.dtype([(name, "<f8" if name in wide else found[name]) for name in names])
+    columns = read_columns(header, names)
     with header.path.open("rb") as file:
         lines = file.read(header.size).decode("ascii", "replace").splitlines()
     comments = [line.removeprefix("comment ") for line in lines if line.startswith("comment ")]
     num_chunks = math.ceil(header.counts[header.index] / CHUNK)
-    with writing_ply(out, dtype, comments, more) as writer:
+    with writing_ply(out, comments, more) as writer:
         for some in cloud.show(columns, num_chunks, "write"):
-            writer.add(_transform_rows(_rows(some, found), dtype, T_target_from_source))
+            as_found = {name: _of_type(column, found[name]) for name, column in zip(names, some, strict=True)}
+            writer.add(_rows(_transform(as_found, T_target_from_source), dtype))
         if copied:
             offset, count, row = place_of_vertices(header)
             with header.path.open("rb") as file:
@@ -166,25 +173,23 @@ def _write_copy(
     return tuple(f"{header.path}: the element '{name}' is left out" for name in left_out)
 
 
-def _rows(columns: list[NDArray[np.generic]], dtype: np.dtype[Any]) -> Rows:
-    rows = np.empty(len(columns[0]), dtype)
-    for name, column in zip(dtype.names or (), columns, strict=True):
-        if dtype[name].kind in "iu" and column.dtype.kind == "f":  # of an ASCII file
-            limits = np.iinfo(dtype[name])
-            rows[name] = np.clip(np.nan_to_num(np.rint(column)), limits.min, limits.max)
-        else:
-            rows[name] = column
-    return rows
+def _of_type(column: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+    """Return a column in the type that the file declares; that of an ASCII file was read as float64."""
+    if dtype.kind in "iu" and column.dtype.kind == "f":
+        limits = np.iinfo(dtype)
+        column = np.clip(np.nan_to_num(np.rint(column)), limits.min, limits.max)
+    return column.astype(dtype, copy=False)
 
 
-def _transform_rows(rows: Rows, dtype: np.dtype[Any], T_target_from_source: Array) -> Rows:
-    """Return the vertices with x y z transformed, nx ny nz rotated, and all else unchanged."""
-    target = rows.astype(dtype)
+def _transform(columns: dict[str, NDArray[Any]], T_target_from_source: Array) -> dict[str, NDArray[Any]]:
+    """Return the columns of vertices with x y z transformed, nx ny nz rotated, and all else unchanged."""
     turn = T_target_from_source.copy()
     turn[:3, 3] = 0.0
+    target = columns.copy()
     for names, T in ((AXES, T_target_from_source), (NORMALS, turn)):
-        if set(names) <= set(dtype.names or ()):
-            points = transform_points(np.stack([rows[name] for name in names], axis=1, dtype=np.float64), T)
-            for name, column in zip(names, points.T, strict=True):
-                target[name] = column
+        if set(names) <= columns.keys():
+            points = transform_points(
+                np.stack([columns[name] for name in names], axis=1, dtype=np.float64), T
+            )
+            target.update(zip(names, points.T, strict=True))
     return target

@@ -15,7 +15,7 @@ from ..files.cache import sha256_of_arrays
 from ..geometry.pose import MAX_COORDINATE, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness
+from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness, points_of
 from .settings import Channel, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
@@ -224,7 +224,8 @@ def stream_of_arrays(points: Floats, colors: NDArray[Any] | None) -> CloudStream
         raise InputError(f"points: found {points.dtype}, wanted numbers")
     given = np.full(points.shape, GRAY, np.uint8) if colors is None else colors
     brightest = find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
-    chunk = next(iter(color_chunks([(points, given)], brightest, lambda row: f"{ARRAYS}, row {row}")))
+    parts = [(points_of([*points.T]), given)]
+    chunk = next(color_chunks(parts, brightest, lambda row: f"{ARRAYS}, row {row}"))
     channel: Channel = "shape" if colors is None else "colors"
     source = PointSource(ARRAYS, lambda: iter([chunk]), len(given), channel=channel)
     return CloudStream([source], sha256=sha256_of_arrays(points, given))

@@ -64,10 +64,7 @@ def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list
     T = spec.T_written_from_dataset
     validator = PointValidator(spec.cloud[0].path, 1.0)  # one for all files, as an object may be small
     warnings: list[str] = []
-    has_labels = spec.cloud[0].label is not None
-    no_labels = np.empty(0, np.int32) if has_labels else None
-    dtype = vertex_rows(np.empty((0, 3)), np.empty((0, 3), np.uint8), label=no_labels).dtype
-    with writing_ply(path, dtype) as writer:
+    with writing_ply(path) as writer:
         for part in spec.cloud:
             source = open_source(part.path, IN_COLORS)
             warnings += source.warnings

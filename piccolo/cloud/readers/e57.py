@@ -16,16 +16,19 @@ from ...errors import InputError
 from ...geometry.pose import Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import e57_file, reader
-from .e57_file import E57File, child, children, open_file, parse_integer, read_number, refusing, text_of
-from .reader import CHUNK, ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud
+from .e57_file import E57File, open_file, parse_integer, read_number, refusing
+from .reader import CHUNK, MissingChannelError, PointSource
 
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 COLORS = ("colorRed", "colorGreen", "colorBlue")
-INVALID = {CARTESIAN: "cartesianInvalidState", SPHERICAL: "sphericalInvalidState"}
 INTENSITY = "intensity"
-INVALID_COLOR = "isColorInvalid"
-INVALID_INTENSITY = "isIntensityInvalid"
+INVALID = {  # fields that are 0 in valid points
+    CARTESIAN: "cartesianInvalidState",
+    SPHERICAL: "sphericalInvalidState",
+    COLORS: "isColorInvalid",
+    (INTENSITY,): "isIntensityInvalid",
+}
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 CHANNELS: dict[Channel, tuple[str, ...]] = {"colors": COLORS, "intensity": (INTENSITY,), "shape": ()}
 WANTED: dict[Channel, str] = {
@@ -52,7 +55,7 @@ class E57Scan:
     num_points: int
     coordinates: tuple[str, ...]  # CARTESIAN or SPHERICAL
     channels: tuple[str, ...]  # COLORS, or INTENSITY alone, or none
-    invalid: tuple[str, ...]  # fields that are 0 in valid points
+    invalid: tuple[str, ...]  # of INVALID
     color_ranges: tuple[tuple[float, float], ...]  # of each channel; none: the intensity is read
     pose: Pose | None  # the scanner is the camera
 
@@ -73,33 +76,24 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if not scans:
         error = InputError if channel == "shape" else MissingChannelError
         raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
-    read_chunks: ChunkReader = partial(_read_colored, path, scans)
-    if channel == "shape":
-        read_chunks = lambda: reader.bare_points(points for _, points, _ in _read(path, scans))  # noqa: E731
-    elif channel == "intensity":
-        read_chunks = reader.intensity_reader(
-            lambda: ((p, values[:, 0]) for _, p, values in _read(path, scans))
-        )
-    warnings = tuple(f"{path}: {what}; left out" for what in left_out)
     num_points = sum(scan.num_points for scan in scans)
-    return PointSource(path, read_chunks, num_points, warnings, _station_axes(scans))
-
-
-def _station_axes(scans: list[E57Scan]) -> tuple[Array, ...]:
-    """Return the z axes (3,) of the scanners whose poses are known."""
+    source = reader.make_source(path, partial(_read, path, scans), channel, num_points=num_points)
     poses = [scan.pose for scan in scans if scan.pose is not None]
     # programs that know of no scanner write the identity
     placed = [p for p in poses if not np.array_equal(p.R_cam_from_world, np.eye(3)) or p.center_world.any()]
-    return tuple(pose.R_cam_from_world[2] for pose in placed)
+    return source._replace(
+        warnings=tuple(f"{path}: {what}; left out" for what in left_out),
+        station_axes=tuple(pose.R_cam_from_world[2] for pose in placed),
+    )
 
 
 def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], list[str]]:
     """Return the scans that have the channels, and the reasons for leaving out others."""
-    elements = children(file.root, "data3D")
+    elements = file.root.findall("data3D/*")
     scans: list[E57Scan] = []
     left_out: list[str] = []
     for index, element in enumerate(elements):
-        label = f"scan {index + 1} of {len(elements)} ({text_of(element, 'name')[:40]!r})"
+        label = f"scan {index + 1} of {len(elements)} ({_text(element, 'name')[:40]!r})"
         try:
             scans.append(_scan(file, element, channels, index, label))
         except _UnusableError as reason:
@@ -109,29 +103,27 @@ def _scans(file: E57File, channels: tuple[str, ...]) -> tuple[list[E57Scan], lis
 
 def _scan(file: E57File, element: Element, channels: tuple[str, ...], index: int, label: str) -> E57Scan:
     """Return the description of a scan; _UnusableError if it can't be used."""
-    points = child(element, "points")
-    prototype = child(points, "prototype")
+    points = element.find("points")
+    prototype = element.find("points/prototype")
     if points is None or prototype is None or points.get("type") != "CompressedVector":
         raise _UnusableError("has no points")
     num_points = parse_integer(file.path, points.get("recordCount", "0"))
     if num_points <= 0:
         raise _UnusableError(f"has {num_points} points")
-    fields = {field.tag.removeprefix(e57_file.NAMESPACE): field for field in prototype}
+    fields = {field.tag: field for field in prototype}
     coordinates = next((names for names in (CARTESIAN, SPHERICAL) if fields.keys() >= set(names)), None)
     if coordinates is None:
         raise _UnusableError("has neither cartesian nor spherical coordinates")
     if not fields.keys() >= set(channels):
         raise _UnusableError("has no colours" if channels == COLORS else "has no intensity")
-    of_channels = {COLORS: (INVALID_COLOR,), (INTENSITY,): (INVALID_INTENSITY,)}
-    invalid = (INVALID[coordinates], *of_channels.get(channels, ()))
     num_bits = sum(_num_bits(file.path, field) for field in prototype.iter())
     if num_bits == 0 or num_points * num_bits > 8 * file.size:
         found = f"promises {num_points} points of {num_bits} bits, found a file of {file.size} bytes"
         raise InputError(f"{file.path}: {label} {found}; it is broken")
-    names = tuple(name for name in invalid if name in fields)
-    ranges = (_color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY)
+    invalid = tuple(INVALID[some] for some in (coordinates, channels) if INVALID.get(some) in fields)
+    ranges = tuple(_color_range(file.path, element, fields[name]) for name in channels if name != INTENSITY)
     pose = e57_file.pose_of(file.path, element)
-    return E57Scan(index, label, num_points, coordinates, channels, names, tuple(ranges), pose)
+    return E57Scan(index, label, num_points, coordinates, channels, invalid, ranges, pose)
 
 
 def _num_bits(path: Path, field: Element) -> int:
@@ -148,9 +140,9 @@ def _num_bits(path: Path, field: Element) -> int:
 
 def _color_range(path: Path, element: Element, field: Element) -> tuple[float, float]:
     """Return the values of black and of full brightness of a channel."""
-    name = field.tag.removeprefix(e57_file.NAMESPACE)
-    limits = child(element, "colorLimits")
-    low, high = (read_number(path, child(limits, name + end)) for end in ("Minimum", "Maximum"))
+    name = field.tag
+    low = read_number(path, element, f"colorLimits/{name}Minimum")
+    high = read_number(path, element, f"colorLimits/{name}Maximum")
     if low is not None and high is not None and low < high:
         return low, high
     declared = [field.get(end) for end in ("minimum", "maximum")]
@@ -162,31 +154,16 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
     return first, last
 
 
-def _read_colored(path: Path, scans: list[E57Scan]) -> Iterator[RawCloud]:
-    """Yield the points with colours, scaled from the file's range to 0-255."""
-    for scan, points_world, values in _read(path, scans):
-        low, high = np.array(scan.color_ranges).T
-        with np.errstate(over="ignore", invalid="ignore"):
-            brightness = (values - low) * (255.0 / (high - low))
-        is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
-        if is_wrong.any():
-            i, k = np.argwhere(is_wrong)[0]
-            wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
-            raise InputError(f"{path}: {scan.label} has a colour of {values[i, k]:g}, {wanted}")
-        yield RawCloud(points_world, np.rint(brightness).astype(np.uint8))
-
-
-def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Array]]:
-    """Yield each scan with its valid points (N, 3), in the world, and their channels (N, C)."""
+def _read(path: Path, scans: list[E57Scan]) -> Iterator[reader.Part]:
+    """Yield the valid points (N, 3) of each scan, in the world, and their channels."""
     with open_file(path) as file:
         for scan in scans:
             for columns in _read_scan(file, scan):
                 is_valid = np.ones(len(columns[scan.coordinates[0]]), dtype=np.bool_)
                 for name in scan.invalid:
                     is_valid &= columns[name] == 0
-                a, b, c = (columns[name][is_valid] for name in scan.coordinates)
-                kept = [columns[name][is_valid] for name in scan.channels]
-                channels = np.array(kept).reshape(len(kept), len(a)).T
+                kept = {name: column[is_valid] for name, column in columns.items()}
+                a, b, c = (kept[name] for name in scan.coordinates)
                 with np.errstate(over="ignore", invalid="ignore"):  # broken points may be infinite
                     if scan.coordinates == SPHERICAL:
                         a, b, c = a * np.cos(c) * np.cos(b), a * np.cos(c) * np.sin(b), a * np.sin(c)
@@ -194,7 +171,22 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[tuple[E57Scan, Array, Ar
                     if scan.pose is not None:
                         R_world_from_scan = scan.pose.R_cam_from_world.T
                         points = rotate_points(points, R_world_from_scan) + scan.pose.center_world
-                yield scan, points, channels
+                yield points, _colors(path, scan, kept) if scan.color_ranges else kept.get(INTENSITY, points)
+
+
+def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> NDArray[np.uint8]:
+    """Return the colours (N, 3), scaled from the file's range to 0-255."""
+    values = np.stack([columns[name] for name in COLORS], axis=1)
+    low, high = np.array(scan.color_ranges).T
+    with np.errstate(over="ignore", invalid="ignore"):
+        brightness = (values - low) * (255.0 / (high - low))
+    is_wrong = ~((brightness >= -TOLERANCE) & (brightness <= 255.0 + TOLERANCE))
+    if is_wrong.any():
+        i, k = np.argwhere(is_wrong)[0]
+        wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
+        raise InputError(f"{path}: {scan.label} has a colour of {values[i, k]:g}, {wanted}")
+    colors: NDArray[np.uint8] = np.rint(brightness).astype(np.uint8)
+    return colors
 
 
 def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
@@ -216,9 +208,6 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
     if num_read != scan.num_points:
         counts = f"promises {scan.num_points} points, found {num_read}"
         raise InputError(f"{file.path}: {scan.label} {counts}; the file is broken")
-
-
-E57 = CloudFormat("E57", frozenset({".e57"}), lambda head: head.startswith(e57_file.MAGIC), open_e57)
 
 
 class E57Image(NamedTuple):
@@ -256,43 +245,43 @@ def read_image(path: Path, index: int) -> bytes:
 
 def _images(file: E57File) -> Iterator[E57Image]:
     """Yield the representations, of the elements of images2D, that contain an image."""
-    elements = enumerate(children(file.root, "images2D"))
-    for (number, element), (kind, representation_name) in product(elements, KINDS.items()):
-        representation = child(element, representation_name)
-        for encoding in ENCODINGS:
-            blob = child(representation, f"{encoding}Image")
-            if representation is None or blob is None or blob.get("type") != "Blob":
-                continue
-            size = parse_integer(file.path, blob.get("length", ""))
-            if not 0 < size <= file.size:  # libE57 reserves it
-                found = f"promises {size} bytes, found a file of {file.size} bytes"
-                raise InputError(f"{file.path}: image {number} {found}; it is broken")
-            yield E57Image(
-                name=text_of(element, "name"),
-                kind=kind,
-                encoding=encoding,
-                size=size,
-                width=_side(file.path, representation, "imageWidth"),
-                height=_side(file.path, representation, "imageHeight"),
-                fov_deg=_fov_deg(file.path, representation) if kind == "spherical" else None,
-                pose=e57_file.pose_of(file.path, element),
-                scan_guid=text_of(element, "associatedData3DGuid"),
-                node=(number, representation_name, f"{encoding}Image"),
-            )
+    elements = enumerate(file.root.findall("images2D/*"))
+    for (number, element), (kind, place), encoding in product(elements, KINDS.items(), ENCODINGS):
+        representation = element.find(place)
+        blob = element.find(f"{place}/{encoding}Image")
+        if representation is None or blob is None or blob.get("type") != "Blob":
+            continue
+        size = parse_integer(file.path, blob.get("length", ""))
+        if not 0 < size <= file.size:  # libE57 reserves it
+            found = f"promises {size} bytes, found a file of {file.size} bytes"
+            raise InputError(f"{file.path}: image {number} {found}; it is broken")
+        width = _side(file.path, representation, "imageWidth")
+        height = _side(file.path, representation, "imageHeight")
+        across = read_number(file.path, representation, "pixelWidth")
+        down = read_number(file.path, representation, "pixelHeight")
+        fov_deg = None
+        if kind == "spherical" and across is not None and down is not None:
+            fov_deg = math.degrees(across * width), math.degrees(down * height)
+        yield E57Image(
+            name=_text(element, "name"),
+            kind=kind,
+            encoding=encoding,
+            size=size,
+            width=width,
+            height=height,
+            fov_deg=fov_deg,
+            pose=e57_file.pose_of(file.path, element),
+            scan_guid=_text(element, "associatedData3DGuid"),
+            node=(number, place, f"{encoding}Image"),
+        )
+
+
+def _text(element: Element, place: str) -> str:
+    return element.findtext(place, "").strip()
 
 
 def _side(path: Path, representation: Element, name: str) -> int:
-    value = read_number(path, child(representation, name)) or 0.0
+    value = read_number(path, representation, name) or 0.0
     if not 0 < value <= MAX_SIDE:
         raise InputError(f"{path}: an image's {name} is {value:g}, wanted 1 to {MAX_SIDE}")
     return int(value)
-
-
-def _fov_deg(path: Path, representation: Element) -> tuple[float, float] | None:
-    """Return the angles [deg] of a spherical image across and down, from its pixel size; None without one."""
-    width, height = (read_number(path, child(representation, name)) for name in ("pixelWidth", "pixelHeight"))
-    if width is None or height is None:
-        return None
-    across = width * _side(path, representation, "imageWidth")
-    down = height * _side(path, representation, "imageHeight")
-    return math.degrees(across), math.degrees(down)

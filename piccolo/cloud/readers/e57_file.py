@@ -111,12 +111,12 @@ class _Limited(TreeBuilder):
         self.room.append(MAX_IN_VECTOR if attrs.get("type") == "Vector" else MAX_PARTS)
         if any(name.lower().endswith("schemalocation") for name in attrs):
             raise ValueError("a schema in another file")
-        return super().start(tag, attrs)
+        return super().start(tag.removeprefix(NAMESPACE), attrs)
 
     def end(self, tag: str) -> Element:
         """Close an element."""
         self.room.pop()
-        return super().end(tag)
+        return super().end(tag.removeprefix(NAMESPACE))
 
     def doctype(self, *_: str | None) -> None:
         """Refuse a document type, where entities are declared."""
@@ -130,34 +130,15 @@ def _parse_xml(path: Path, xml: bytes) -> Element:
         root = parser.close()
     except (ParseError, ValueError, LookupError) as error:
         raise InputError(f"{path}: the XML section is broken ({quote_line(str(error).encode())})") from error
-    if not isinstance(root, Element) or root.tag != f"{NAMESPACE}e57Root":
+    if not isinstance(root, Element) or root.tag != "e57Root":
         raise InputError(f"{path}: the XML section has no element e57Root of E57 1.0")
     return root
 
 
-def child(element: Element | None, name: str) -> Element | None:
-    """Return the child of a name in E57's namespace; None if there is none."""
-    return None if element is None else element.find(NAMESPACE + name)
-
-
-def children(element: Element, name: str) -> list[Element]:
-    """Return the children of the child of a name; empty if there is none."""
-    found = child(element, name)
-    return [] if found is None else list(found)
-
-
-def text_of(element: Element | None, name: str) -> str:
-    """Return the text of a child; empty if there is none."""
-    found = child(element, name)
-    return "" if found is None else (found.text or "").strip()
-
-
-def read_number(path: Path, element: Element | None) -> float | None:
-    """Return the value of a number's element, 0 if it is empty, scaled if it is a scaled integer.
-
-    None without an element.
-    """
-    return None if element is None else read_scaled(path, element, (element.text or "").strip() or "0")
+def read_number(path: Path, element: Element, place: str) -> float | None:
+    """Return the number in the element at a place below another, 0 if it is empty; None without one."""
+    found = element.find(place)
+    return None if found is None else read_scaled(path, found, (found.text or "").strip() or "0")
 
 
 def read_scaled(path: Path, element: Element, text: str) -> float:
@@ -165,8 +146,8 @@ def read_scaled(path: Path, element: Element, text: str) -> float:
     value = parse_number(path, text)
     if element.get("type") != "ScaledInteger":
         return value
-    scale, offset = (parse_number(path, element.get(*part)) for part in (("scale", "1"), ("offset", "0")))
-    return value * scale + offset
+    scale = parse_number(path, element.get("scale", "1"))
+    return value * scale + parse_number(path, element.get("offset", "0"))
 
 
 def parse_number(path: Path, text: str) -> float:
@@ -190,16 +171,15 @@ def parse_integer(path: Path, text: str) -> int:
 
 def pose_of(path: Path, element: Element) -> Pose | None:
     """Return the pose of a scan or an image; None if it has none. Missing parts are the identity's."""
-    pose = child(element, "pose")
-    if pose is None:
+    if element.find("pose") is None:
         return None
-    rotation = child(pose, "rotation")
-    q = _numbers(path, rotation, "wxyz") if rotation is not None else np.eye(4)[0]
+    q = np.eye(4)[0]
+    if element.find("pose/rotation") is not None:
+        q = _numbers(path, element, "pose/rotation", "wxyz")
     if not 0.0 < np.linalg.norm(q) < math.inf:
         raise InputError(f"{path}: a pose's rotation is {q.tolist()}, wanted a quaternion w x y z")
-    center_world = _numbers(path, child(pose, "translation"), "xyz")
-    return Pose(rotation_from_quaternion_wxyz(q).T, center_world)
+    return Pose(rotation_from_quaternion_wxyz(q).T, _numbers(path, element, "pose/translation", "xyz"))
 
 
-def _numbers(path: Path, element: Element | None, names: str) -> Array:
-    return np.array([read_number(path, child(element, name)) or 0.0 for name in names])
+def _numbers(path: Path, element: Element, place: str, names: str) -> Array:
+    return np.array([read_number(path, element, f"{place}/{name}") or 0.0 for name in names])

@@ -21,7 +21,7 @@ from ...errors import InputError
 from ...optional import import_optional
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CHUNK, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
+from .reader import CHUNK, MissingChannelError, PointSource, quote_line
 
 MAGIC = b"LASF"
 MIN_HEADER_SIZE = 227  # [byte]
@@ -48,10 +48,9 @@ NUM_LAYERS = {6: 9, 7: 10, 8: 11, 9: 10, 10: 12}  # of a chunk, by point format;
 MAX_CHUNK_SIZE = 1 << 29  # [byte] of a chunk's records, for it is decompressed at once; 2 MB are usual
 # What is wanted of formats 6 to 10, where fields can be passed over.
 SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "RGB")
-WITHHELD_OLD = 0x80  # bit of the flags' byte, in the formats 0-5
-WITHHELD = 0x04  # in 6-10
-CLASS_OLD = 0x1F  # bits of the class, in the formats 0-5
-CLASS = 0xFF
+# Of the flags' byte the bit of withheld points, and the bits of the class.
+OLD_BITS = 0x80, 0x1F  # in the formats 0-5
+BITS = 0x04, 0xFF  # in 6-10
 MAX_SAMPLES = 1 << 20
 NUM_SAMPLE_RUNS = 64
 TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
@@ -285,35 +284,24 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     header = read_header(path)
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
     if options.labels or channel == "shape":
-        read = partial(_read_scalar, header, layout, "class")
-        labels = options.labels
-        read_chunks = reader.label_reader(path, read, labels) if labels else reader.bare_reader(read)
-        return PointSource(path, read_chunks, header.num_points)
-    if channel == "intensity":
-        return _gray_source(header, layout)
-    brightest, num_samples = _largest(header, layout, "rgb") if header.has_colors else (0, 0)
-    if brightest == 0:
-        why = f"red green blue are 0 in all {num_samples} points checked"
-        if not header.has_colors:
-            why = f"point format {header.point_format} has none"
-        raise MissingChannelError(f"{path}: has no colours: {why}, {WANTED}")
-    is_8_bit = brightest <= 255
-    note = f"{path}: the colours are read as 8-bit values in 16-bit fields"
-    return PointSource(
-        path,
-        lambda: (_read_colors(header, records, is_8_bit) for records in _chunks(header, layout)),
-        header.num_points,
-        (f"{note} (largest value {brightest} in {num_samples} points checked)",) if is_8_bit else (),
-    )
-
-
-def _gray_source(header: LasHeader, layout: LasLayout) -> PointSource:
-    """Return the points in grey, by their intensity."""
-    largest, num_samples = _largest(header, layout, "intensity")
+        read = partial(_read, header, layout, "class")
+        return reader.make_source(path, read, channel, options.labels, header.num_points)
+    if channel == "colors" and not header.has_colors:
+        raise MissingChannelError(
+            f"{path}: has no colours: point format {header.point_format} has none, {WANTED}"
+        )
+    field = "rgb" if channel == "colors" else "intensity"
+    largest, num_samples = _largest(header, layout, field)
     if largest == 0:
-        raise MissingChannelError(f"{header.path}: the intensity is 0 in all {num_samples} points checked")
-    read_chunks = reader.intensity_reader(partial(_read_scalar, header, layout, "intensity"))
-    return PointSource(header.path, read_chunks, header.num_points)
+        is_zero = f"0 in all {num_samples} points checked"
+        what = f"has no colours: red green blue are {is_zero}, {WANTED}"
+        raise MissingChannelError(f"{path}: {what if field == 'rgb' else f'the intensity is {is_zero}'}")
+    is_8_bit = field == "rgb" and largest <= 255
+    read = partial(_read, header, layout, field, is_8_bit)
+    source = reader.make_source(path, read, channel, num_points=header.num_points)
+    found = f"(largest value {largest} in {num_samples} points checked)"
+    note = f"{path}: the colours are read as 8-bit values in 16-bit fields {found}"
+    return source._replace(warnings=(note,) if is_8_bit else ())
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:
@@ -357,33 +345,24 @@ def _largest(header: LasHeader, layout: LasLayout, name: str) -> tuple[int, int]
     return max(largest for largest, _ in found), sum(count for _, count in found)
 
 
-def _read_scalar(header: LasHeader, layout: LasLayout, name: str) -> Iterator[reader.PointsWithScalar]:
-    bits = 0xFFFF if name == "intensity" else CLASS_OLD if header.point_format < 6 else CLASS
-    for records in _chunks(header, layout):
-        points_world, kept = _points(header, records)
-        yield points_world, (kept[name] & bits).astype(np.float64)
+def _read(header: LasHeader, layout: LasLayout, field: str, is_8_bit: bool = False) -> Iterator[reader.Part]:
+    """Yield the points that are not withheld, and their colours, intensity or class."""
+    withheld, class_bits = OLD_BITS if header.point_format < 6 else BITS
+    for chunk in _chunks(header, layout):
+        records = chunk[chunk["flags"] & withheld == 0]
+        with np.errstate(over="ignore"):  # to infinity, and such points are dropped
+            points_world = records["xyz"] * header.scales + header.offsets
+        values = records[field]
+        if field == "rgb":
+            yield points_world, _colors(header, values, is_8_bit)
+        else:
+            yield points_world, (values & class_bits if field == "class" else values).astype(np.float64)
 
 
-def _points(header: LasHeader, records: Records) -> tuple[Array, Records]:
-    """Return the positions (N, 3) of the records that are not withheld, and these records."""
-    withheld = WITHHELD_OLD if header.point_format < 6 else WITHHELD
-    is_withheld = (records["flags"] & withheld) != 0
-    if is_withheld.any():
-        records = records[~is_withheld]
-    with np.errstate(over="ignore"):  # to infinity, and such points are dropped
-        return records["xyz"] * header.scales + header.offsets, records
-
-
-def _read_colors(header: LasHeader, records: Records, is_8_bit: bool) -> RawCloud:
-    points_world, records = _points(header, records)
-    rgb = records["rgb"]
+def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> NDArray[np.uint8]:
+    """Return colours (N, 3) of 16 bits, or of 8 in 16, as 8 bits."""
     if not is_8_bit:
-        return RawCloud(points_world, TO_8_BIT[rgb])
+        return TO_8_BIT[rgb]
     if (rgb > 255).any():
         raise InputError(f"{header.path}: a colour of {rgb.max()} in a file whose other colours are 8-bit")
-    return RawCloud(points_world, rgb.astype(np.uint8))
-
-
-LAS = CloudFormat(
-    "LAS, LAZ", frozenset({".las", ".laz"}), lambda head: head.startswith(MAGIC), open_las, has_labels=True
-)
+    return rgb.astype(np.uint8)

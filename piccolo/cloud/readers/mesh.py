@@ -19,9 +19,9 @@ import numpy as np
 from ...arrays import Array, Bytes, Int64s, Mask
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
-from .mesh_files import GLB_MAGIC, NO_MATERIAL, Texture
+from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import BRIGHTEST, CHUNK, CloudFormat, MissingChannelError, PointSource, RawCloud
+from .reader import BRIGHTEST, CHUNK, GRAY, MissingChannelError, PointSource, RawCloud
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -112,14 +112,13 @@ def _points(instance: SurfaceInstance, k: Int64s, rows: Int64s, texels: Bytes | 
     if surface.colors is not None and surface.corners is not None:
         factors = _blend(surface.colors, surface.corners[rows], weights)
     if texels is None or surface.uv is None:
-        if factors is None:
-            raise ValueError("a surface without colours")
-        return RawCloud(points_world, _bytes(linear_to_srgb(factors) if surface.is_linear else factors))
+        gray = np.full(points_world.shape, GRAY, np.uint8)
+        return RawCloud(points_world, gray if factors is None else _bytes(factors, surface.is_linear))
     found = look_up(texels, _blend(surface.uv, triangles, weights))
     colors = found[:, :3]
     is_visible = found[:, 3] > 0
     if factors is not None:
-        colors = _bytes(linear_to_srgb(srgb_to_linear(colors) * factors))
+        colors = _bytes(srgb_to_linear(colors) * factors, is_linear=True)
     return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
 
 
@@ -150,8 +149,9 @@ def linear_to_srgb(linear: Array) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
-def _bytes(colors: Array) -> Bytes:
-    return np.rint(np.clip(colors, 0.0, 1.0) * 255.0).astype(np.uint8)
+def _bytes(colors: Array, is_linear: bool) -> NDArray[np.uint8]:
+    levels = linear_to_srgb(colors) if is_linear else colors
+    return np.rint(np.clip(levels, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def open_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -202,7 +202,7 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
         density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
         notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
     read_chunks = partial(sample_points, instances, ends, num_points)
-    up: UpAxis = "z" if loaded.materials is None else "y"  # by the specification of glTF
+    up: UpAxis = "y" if loaded.is_gltf else "z"  # by the specification of glTF
     return PointSource(path, read_chunks, num_points, tuple(notes), up=up)
 
 
@@ -221,8 +221,8 @@ def _instances(loaded: Loaded, is_bare: bool) -> tuple[list[SurfaceInstance], li
         if surface is None:
             continue
         if is_bare:
-            surface = make_gray(surface)
-        if surface.colors is None and surface.texture is None:
+            surface = Surface(surface.vertices, surface.triangles)
+        elif surface.colors is None and surface.texture is None:
             num_bare += 1
             continue
         instances.append(SurfaceInstance(surface, np.array(matrix, dtype=np.float64)))
@@ -236,44 +236,53 @@ def _instances(loaded: Loaded, is_bare: bool) -> tuple[list[SurfaceInstance], li
     return instances, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
 
 
-def make_gray(surface: Surface) -> Surface:
-    """Return the triangles of a surface in grey."""
-    corners = np.broadcast_to(np.int64(0), surface.triangles.shape)
-    return Surface(surface.vertices, surface.triangles, colors=np.full((1, 3), 0.5), corners=corners)
-
-
 def _is_one_color(surfaces: list[Surface]) -> bool:
-    if any(surface.texture for surface in surfaces):
-        return False
-    extremes = [(s.colors.min(axis=0), s.colors.max(axis=0)) for s in surfaces if s.colors is not None]
-    low = np.min([low for low, _ in extremes], axis=0)
-    return bool(np.all(low == np.max([high for _, high in extremes], axis=0)))
+    first = surfaces[0].colors
+    return first is not None and all(s.texture is None and np.all(s.colors == first[0]) for s in surfaces)
 
 
 def _surface(loaded: Loaded, mesh: Any) -> Surface | None:
     """Return the triangles of a mesh with its colours; None if it has no triangles."""
+    path = loaded.path
     vertices = np.array(mesh.vertices, dtype=np.float64)
     triangles = np.array(mesh.faces, dtype=np.int64)
     if not len(triangles):
         return None
     if (vertices.shape[1:], triangles.shape[1:]) != ((3,), (3,)):
         found = f"vertices of shape {vertices.shape} and triangles of shape {triangles.shape}"
-        raise InputError(f"{loaded.path}: {found}, wanted three numbers each")
+        raise InputError(f"{path}: {found}, wanted three numbers each")
     if triangles.min() < 0 or triangles.max() >= len(vertices):
         named = f"a face names vertex {triangles.max()} (from {triangles.min()})"
-        raise InputError(f"{loaded.path}: {named}, found {len(vertices)} vertices")
-    if loaded.materials is not None:
-        return _gltf_surface(loaded, mesh, vertices, triangles)
-    material = getattr(mesh.visual, "material", None)
+        raise InputError(f"{path}: {named}, found {len(vertices)} vertices")
+    texture, factor = loaded.look_of(mesh.visual)
     uv = getattr(mesh.visual, "uv", None)
-    texture = loaded.texture(getattr(material, "image", None))
+    surface = Surface(vertices, triangles, is_linear=loaded.is_gltf)
     if texture is not None:
         if uv is None:
-            return Surface(vertices, triangles)  # the material's colour would only be multiplied
-        uv = _check_uv(loaded.path, uv, vertices)
-        return Surface(vertices, triangles, uv, texture)
-    colors, corners = _colors(loaded.path, mesh, triangles)
-    return Surface(vertices, triangles, colors=colors, corners=corners)
+            return surface  # the material's colour would only be multiplied
+        surface = surface._replace(uv=_check_uv(path, uv, vertices), texture=texture)
+        if not loaded.is_gltf:
+            return surface
+    return _with_colors(surface, loaded, mesh, factor)
+
+
+def _with_colors(surface: Surface, loaded: Loaded, mesh: Any, factor: Array | None) -> Surface:
+    """Return a surface in the colours of its vertices or faces, or else in the material's (1, 3), if any."""
+    triangles = surface.triangles
+    of_vertices = (mesh.visual if loaded.is_gltf else mesh).vertex_attributes.get("color")
+    of_faces = mesh.face_attributes.get("color")
+    if of_vertices is not None:
+        colors = _fractions(loaded.path, of_vertices, len(surface.vertices))
+        if loaded.is_gltf and factor is not None:
+            colors = colors * factor
+        return surface._replace(colors=colors, corners=triangles)
+    rows = np.zeros(1, np.int64)
+    if of_faces is not None:
+        factor = _fractions(loaded.path, of_faces, len(triangles))
+        rows = np.arange(len(triangles))
+    if factor is None or (surface.texture is not None and np.all(factor == 1.0)):
+        return surface
+    return surface._replace(colors=factor, corners=np.broadcast_to(rows[:, None], triangles.shape))
 
 
 def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
@@ -287,46 +296,6 @@ def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
     return uv
 
 
-def _gltf_surface(loaded: Loaded, mesh: Any, vertices: Array, triangles: Int64s) -> Surface:
-    visual = mesh.visual
-    path = loaded.path
-    materials = loaded.materials or []
-    material = materials[int(visual.material.name)]
-    texture = loaded.texture(visual.material.baseColorTexture)
-    if material.texture is not None and (texture is None or visual.uv is None):
-        raise InputError(f"{path}: a texture can't be read or its coordinates are missing, {WANTED}")
-    raw = visual.vertex_attributes.get("color")
-    if raw is None and material is NO_MATERIAL:
-        return Surface(vertices, triangles)
-    uv = None if texture is None else _check_uv(path, visual.uv, vertices)
-    factor = np.array([material.factor])
-    if raw is not None:
-        colors = _fractions(path, raw, len(vertices)) * factor
-        corners = triangles
-    elif texture is not None and np.all(factor == 1.0):
-        return Surface(vertices, triangles, uv, texture)
-    else:
-        colors = factor
-        corners = np.broadcast_to(np.int64(0), triangles.shape)
-    return Surface(vertices, triangles, uv, texture, colors, corners, is_linear=True)
-
-
-def _colors(path: Path, mesh: Any, triangles: Int64s) -> tuple[Array, Int64s] | tuple[None, None]:
-    """Return the colours (C, 3) of vertices, faces or the material, and the rows (T, 3) of the corners."""
-    of_vertices = mesh.vertex_attributes.get("color")
-    if of_vertices is not None:
-        return _fractions(path, of_vertices, len(mesh.vertices)), triangles
-    of_faces = mesh.face_attributes.get("color")
-    if of_faces is not None:
-        rows = np.broadcast_to(np.arange(len(triangles))[:, None], triangles.shape)
-        return _fractions(path, of_faces, len(triangles)), rows
-    material: Any = getattr(mesh.visual, "material", None)
-    if "kd" in getattr(material, "kwargs", {}):
-        color = np.array(material.diffuse[:3], dtype=np.float64)[None] / 255.0
-        return color, np.broadcast_to(np.int64(0), triangles.shape)
-    return None, None
-
-
 def _fractions(path: Path, raw: Any, count: int) -> Array:
     """Return colours (N, 3) in [0, 1]; their range in the file follows from their type."""
     colors = np.array(raw)
@@ -336,11 +305,3 @@ def _fractions(path: Path, raw: Any, count: int) -> Array:
     if not np.all((fractions >= 0.0) & (fractions <= 1.0)):
         raise InputError(f"{path}: a colour of {np.abs(colors).max():g}, wanted 0 to 1 or bytes")
     return np.asarray(fractions, dtype=np.float64)
-
-
-MESH = CloudFormat(
-    "OBJ, GLB and glTF meshes",
-    frozenset({".obj", ".glb", ".gltf"}),
-    lambda head: head.startswith(GLB_MAGIC),
-    open_mesh,
-)

@@ -56,7 +56,7 @@ class Texture(NamedTuple):
 
     def texels(self) -> Bytes:
         """Decode the texels (H, W, 4) RGBA, the first row at the top."""
-        with _image(self.path, "", self.content) as image:
+        with open_image(self.path, self.content) as image:
             return np.asarray(image.convert("RGBA"))
 
 
@@ -81,14 +81,8 @@ def own_limit() -> Iterator[None]:
         Image.MAX_IMAGE_PIXELS = limit
 
 
-def check_image(path: Path, name: str, content: bytes) -> None:
-    """Refuse what is no image, which trimesh would ignore."""
-    with _image(path, f" {name}", content):
-        pass
-
-
 @contextmanager
-def _image(path: Path, name: str, content: bytes) -> Iterator[Image.Image]:
+def open_image(path: Path, content: bytes, name: str = "") -> Iterator[Image.Image]:
     """Yield an image of an allowed size; InputError if it can't be opened, or decoded by the caller."""
     with own_limit():
         try:
@@ -119,7 +113,7 @@ def first_line(error: BaseException) -> str:
 class FolderResolver:
     """The files in a mesh's own folder and below, and nothing else; a resolver for trimesh.
 
-    trimesh continues without a file that it can't get, so the first refusal is kept for later.
+    trimesh continues without a file that it can't get, so the last refusal is kept for later.
     """
 
     path: Path  # the mesh
@@ -146,9 +140,8 @@ class FolderResolver:
         except (OSError, ValueError, RuntimeError) as error:
             problem = f" ({error})"
         if problem:
-            refusal = InputError(f"{self.path}: names the file {name[:100]!a}{problem}")
-            self.refusal = self.refusal or refusal
-            raise refusal
+            self.refusal = InputError(f"{self.path}: names the file {name[:100]!a}{problem}")
+            raise self.refusal
         return self._contents[file]
 
     __getitem__ = get
@@ -175,12 +168,18 @@ def sanitize_gltf(content: bytes, resolver: FolderResolver) -> tuple[bytes, list
     try:
         tree = json.loads(text)
         _check_version(path, tree)
-        num_bytes = len(content) + _num_bytes_of_files(tree, resolver)
+        for buffer, found in _read_files(tree.get("buffers", []), resolver):
+            if len(found) < _count(buffer["byteLength"]):
+                counts = f"has {len(found)} of {buffer['byteLength']} bytes"
+                raise InputError(f"{path}: the buffer {buffer['uri'][:100]!a} {counts}, {WANTED}")
+        num_bytes = len(content) + resolver.num_bytes
         _check_data(path, tree, num_bytes)
         _check_nodes(path, tree)
         materials = [NO_MATERIAL, *(_material(path, given) for given in tree.get("materials", []))]
         _keep_base_colors(tree, materials)
         _keep_triangles(path, tree, materials, num_bytes)
+        _split_meshes(tree)
+        list(_read_files(tree["images"], resolver))
         for node in tree.get("nodes", []):
             node.pop("camera", None)  # with which trimesh passes over the node's mesh
             node.pop("name", None)  # trimesh before 5 mixes up nodes named "world"
@@ -211,17 +210,12 @@ def _check_version(path: Path, tree: Json) -> None:
         raise InputError(f"{path}: requires the extensions {names[:100]!a}, wanted a plain glTF mesh")
 
 
-def _num_bytes_of_files(tree: Json, resolver: FolderResolver) -> int:
-    """Return the size of the buffers in their own files; decode the files' names, which trimesh does not."""
-    for kind in ("buffers", "images"):
-        for entry in tree.get(kind, []):
-            if entry.get("uri", "data:").startswith("data:"):
-                continue
-            name = entry["uri"] = unquote(entry["uri"])
-            if kind == "buffers" and len(resolver[name]) < _count(entry["byteLength"]):
-                counts = f"has {len(resolver[name])} of {entry['byteLength']} bytes"
-                raise InputError(f"{resolver.path}: the buffer {name[:100]!a} {counts}, {WANTED}")
-    return resolver.num_bytes
+def _read_files(entries: list[Json], resolver: FolderResolver) -> Iterator[tuple[Json, bytes]]:
+    """Yield the entries that name files, with these; decode the names, which trimesh does not."""
+    for entry in entries:
+        if not entry.get("uri", "data:").startswith("data:"):
+            entry["uri"] = unquote(entry["uri"])
+            yield entry, resolver[entry["uri"]]
 
 
 def _check_data(path: Path, tree: Json, num_bytes: int) -> None:
@@ -298,6 +292,22 @@ def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes
         num_rows += sum(accessors[row]["count"] for row in rows)
     if num_rows > max(MAX_ROWS, num_bytes):
         raise InputError(f"{path}: over {MAX_ROWS} vertices and indices in {num_bytes} bytes")
+
+
+def _split_meshes(tree: Json) -> None:
+    """Place each primitive by a node of its own: trimesh names those of one mesh by chance, some alike."""
+    parts: list[Json] = []
+    nodes: list[Json] = tree.get("nodes", [])
+    splits: list[list[int]] = []
+    for mesh in tree.get("meshes", []):
+        splits.append([*range(len(parts), len(parts) + len(mesh["primitives"]))])
+        parts += [{"primitives": [primitive]} for primitive in mesh["primitives"]]
+    for node in nodes[:]:
+        if "mesh" in node:
+            added = [{"mesh": part} for part in splits[node.pop("mesh")]]
+            node["children"] = [*node.get("children", []), *range(len(nodes), len(nodes) + len(added))]
+            nodes += added
+    tree["meshes"] = parts
 
 
 def _primitive(path: Path, accessors: list[Json], materials: list[Material], primitive: Json) -> Json:

@@ -9,10 +9,13 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...errors import InputError
+from ...geometry.pose import Array
 from ...optional import import_optional
 from . import mesh_files
-from .mesh_files import GLB_MAGIC, FolderResolver, Material, Texture
+from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture
 
 WANTED = "wanted a mesh with textures, vertex colours or materials"
 # faces whose indices count back from the last vertex, or are 0; trimesh would take wrong vertices
@@ -44,7 +47,26 @@ class Loaded:
     materials: list[Material] | None = None  # of glTF, named by their rows
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
 
-    def texture(self, image: Any) -> Texture | None:
+    @property
+    def is_gltf(self) -> bool:
+        """True for glTF, whose colours are linear light and whose y is up."""
+        return self.materials is not None
+
+    def look_of(self, visual: Any) -> tuple[Texture | None, Array | None]:
+        """Return the texture and the colour (1, 3) of a surface's material, by trimesh's description."""
+        given: Any = getattr(visual, "material", None)
+        if self.materials is None:
+            has_color = "kd" in getattr(given, "kwargs", {})
+            color: Array | None = np.array([given.diffuse[:3]], np.float64) / 255.0 if has_color else None
+            return self._texture(getattr(given, "image", None)), color
+        material = self.materials[int(given.name)]
+        texture = self._texture(given.baseColorTexture)
+        if material.texture is not None and (texture is None or visual.uv is None):
+            wrong = "a texture can't be read or its coordinates are missing"
+            raise InputError(f"{self.path}: {wrong}, {WANTED}")
+        return texture, None if material is NO_MATERIAL else np.array([material.factor])
+
+    def _texture(self, image: Any) -> Texture | None:
         """Return the texture in an image, one object for all surfaces that share it."""
         if id(image) not in self.textures:
             self.textures[id(image)] = mesh_files.read_texture(self.path, image)
@@ -75,15 +97,17 @@ def load_obj(path: Path, content: bytes) -> Loaded:
     names = set(LIBRARY_LINE.findall(content))
     if len(names) > 1:
         raise InputError(f"{path}: names {len(names)} files of materials, wanted one")
-    for name in names:  # trimesh would do without
+    for name in names:
         text = resolver.get(name.decode()).decode("utf-8", "replace")
         _check_textures(resolver, TEXTURE_LINE.findall(text))
     return Loaded(path, _scene(resolver, content, "obj"))
 
 
 def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
+    """Refuse what is no image, which trimesh would ignore."""
     for name in sorted(set(names)):
-        mesh_files.check_image(resolver.path, ascii(name[:100]), resolver.get(name))
+        with mesh_files.open_image(resolver.path, resolver.get(name), f" {name[:100]!a}"):
+            pass
 
 
 def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
@@ -111,9 +135,8 @@ def _scene(resolver: FolderResolver, content: bytes, kind: str, has_texture: boo
         raise
     except Exception as error:  # whatever trimesh stumbles over
         if resolver.refusal is None:
-            why = mesh_files.first_line(error)
-            text = f"trimesh can't read it ({why}); the file may be damaged or cut off"
-            raise InputError(f"{resolver.path}: {text}") from error
+            why = f"({mesh_files.first_line(error)}); the file may be damaged or cut off"
+            raise InputError(f"{resolver.path}: trimesh can't read it {why}") from error
     if resolver.refusal is not None:
         raise resolver.refusal
     return scene

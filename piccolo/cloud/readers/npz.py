@@ -7,9 +7,8 @@ column), is read whole, after the size in its header has been compared with the 
 import errno
 import math
 import zipfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal, NamedTuple
 
@@ -20,7 +19,7 @@ from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -29,7 +28,6 @@ MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could r
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
 POINTS_NAMES = ("points", "xyz")
 COLORS_NAMES = ("colors", "rgb")
-Parts = Iterable[tuple[NDArray[Any], NDArray[Any]]]
 WANTED = "wanted .npy of x y z r g b (N, 6) with colours 0-255, or .npz with points (N, 3) and colors (N, 3)"
 
 
@@ -66,12 +64,9 @@ def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     array = _open_array(path, None, path.stat().st_size)
     if len(array.shape) != 2 or array.shape[1] not in (3, 6) or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
-    if channel == "shape":
-        return _bare_source(path, array)
-    if channel == "intensity" or array.shape[1] == 3:
+    if channel == "intensity" or (channel == "colors" and array.shape[1] == 3):
         raise MissingChannelError(f"{path}: {array}, {WANTED}")
-    brightest = reader.BRIGHTEST["u1"]
-    return _source(path, lambda: ((rows[:, :3], rows[:, 3:]) for rows in array.read_rows()), brightest, array)
+    return _source(path, channel, array, array, "u1")
 
 
 def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -82,29 +77,29 @@ def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     """
     if channel == "intensity":
         raise MissingChannelError(f"{path}: has no intensity")
-    is_bare = channel == "shape"
-    arrays = [_open_array(path, m.filename, m.file_size) for m in _members(path, is_bare)]
+    arrays = [_open_array(path, m.filename, m.file_size) for m in _members(path, channel == "shape")]
     points = arrays[0]
-    if is_bare and points.shape[1:] == (3,) and points.dtype.kind in "fiu":
-        return _bare_source(path, points)
     colors = arrays[-1]
     if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
         raise InputError(f"{path}: {points} and {colors}, {WANTED}")
-    brightest = reader.find_full_brightness(path, [colors.dtype.str[1:]])
-    return _source(path, lambda: zip(points.read_rows(), colors.read_rows(), strict=True), brightest, points)
+    return _source(path, channel, points, colors, colors.dtype.str[1:])
 
 
-def _bare_source(path: Path, rows: ArrayInFile) -> PointSource:
-    """Return the source of points alone, in the first three columns."""
-    return PointSource(
-        path, lambda: reader.bare_points(reader.points_of(list(r.T)) for r in rows.read_rows()), rows.shape[0]
-    )
+def _source(
+    path: Path, channel: Channel, points: ArrayInFile, colors: ArrayInFile, type_: str
+) -> PointSource:
+    """Return points with colours of a type, of an array (N, 3) of each or of one (N, 6); or points alone."""
 
+    def read() -> Iterator[reader.Part]:
+        if colors is points:
+            return ((reader.points_of([*rows.T]), rows[:, 3:]) for rows in points.read_rows())
+        pairs = zip(points.read_rows(), colors.read_rows(), strict=True)
+        return ((reader.points_of([*xyz.T]), rgb) for xyz, rgb in pairs)
 
-def _source(path: Path, read_parts: Callable[[], Parts], brightest: float, rows: ArrayInFile) -> PointSource:
-    """Return the source of the points in chunks of positions and colours; their number is that of `rows`."""
-    locate = partial(reader.point_label, path)
-    return PointSource(path, lambda: reader.color_chunks(read_parts(), brightest, locate), rows.shape[0])
+    num_points = points.shape[0]
+    if channel == "shape":
+        return reader.make_source(path, read, channel, num_points=num_points)
+    return reader.colored_source(path, read, [type_], num_points)
 
 
 def has_npz_magic(head: bytes) -> bool:
@@ -168,7 +163,3 @@ def _open_array(path: Path, member: str | None, size: int) -> ArrayInFile:
     if promised != found:
         raise InputError(f"{path}: an array promises {promised} bytes, found {found}; it is cut off")
     return array
-
-
-NPY = CloudFormat("NumPy .npy", frozenset({".npy"}), lambda head: head.startswith(NPY_MAGIC), open_npy)
-NPZ = CloudFormat("NumPy .npz", frozenset({".npz"}), has_npz_magic, open_npz)

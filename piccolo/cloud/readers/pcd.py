@@ -5,7 +5,7 @@ compression is LZF: literal runs of bytes, and copies of earlier ones.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from ...arrays import Array, Mask
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
 MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
@@ -32,13 +32,11 @@ FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
 PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
-INTENSITY = "intensity"
-LABEL = "label"
-SCALAR_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4")
-TYPES = {  # of fields that are not colours on their own
+COLOR_NAMES = (*((name,) for name in PACKED_NAMES), *reader.COLOR_NAMES)
+SCALAR_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4"), "numbers of 32 bits or float64"
+TYPES = {
     **dict.fromkeys("xyz", (("f4", "f8"), "float32 or float64")),
     **dict.fromkeys(PACKED_NAMES, (("f4", "u4", "i4"), "uint32, int32 or float32")),
-    **dict.fromkeys((INTENSITY, LABEL), (SCALAR_TYPES, "numbers of 32 bits or float64")),
 }
 
 
@@ -184,37 +182,28 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
-    if len(fields) > 3 and fields[3].name in PACKED_NAMES:
-        read_chunks = partial(_read_packed, header, fields[3].type, read_columns)
-        return PointSource(path, read_chunks, header.num_points)
+    if fields[-1].name in PACKED_NAMES:
+        read_parts = partial(_read_packed, header, fields[-1].type, read_columns)
+        return reader.make_source(path, read_parts, channel, num_points=header.num_points)
     types = [field.type for field in fields[3:]]
-    return reader.column_source(path, read_columns, types, header.num_points, options.labels)
+    return reader.column_source(path, read_columns, types, channel, options.labels, header.num_points)
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:
     """Return the fields x y z and one or three of colours, or the intensity or label, or no others."""
-    found = {field.name: field for field in header.fields if field.count == 1}
     names = [field.name for field in header.fields]
-    more: tuple[str, ...] = ()
-    wanted = WANTED
-    if options.labels:
-        more = (LABEL,) * (LABEL in found)
-        wanted = "wanted x y z and label"
-    elif channel == "intensity":
-        more = (INTENSITY,) * (INTENSITY in found)
-    elif channel == "colors":
-        more = next(((name,) for name in PACKED_NAMES if name in found), reader.color_names(found))
-    has_points = all(names.count(axis) == 1 and axis in found for axis in "xyz")
-    if not has_points or not (more or channel == "shape"):
+    found = {field.name: field for field in header.fields if field.count == names.count(field.name) == 1}
+    chosen = reader.find_fields(found, channel, options.labels, COLOR_NAMES)
+    if not chosen:
         listed = " ".join(names[:12]) or "none"
-        error = MissingChannelError if has_points else InputError
+        error = MissingChannelError if {*"xyz"} <= found.keys() else InputError
+        wanted = "wanted x y z and label" if options.labels else WANTED
         raise error(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
-    fields = tuple(found[name] for name in (*"xyz", *more))
-    for field in fields:
-        types, kinds = TYPES.get(field.name, ((field.type,), ""))
-        if field.type not in types:
-            raise InputError(f"{header.path}: '{field.name}' is of type {field.type}, wanted {kinds}")
-    return fields
+    for name in chosen if len(chosen) <= 4 else "xyz":
+        types, kinds = TYPES.get(name, SCALAR_TYPES)
+        if found[name].type not in types:
+            raise InputError(f"{header.path}: '{name}' is of type {found[name].type}, wanted {kinds}")
+    return tuple(found[name] for name in chosen)
 
 
 def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[reader.Columns]:
@@ -250,7 +239,9 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
     yield from reader.in_chunks([parts[field].view("<" + field.type) for field in fields])
 
 
-def _read_packed(header: PcdHeader, type_: str, read_columns: reader.ColumnReader) -> Iterator[RawCloud]:
+def _read_packed(
+    header: PcdHeader, type_: str, read_columns: Callable[[], Iterator[reader.Columns]]
+) -> Iterator[reader.Part]:
     """Yield the points with colours 0xAARRGGBB, in numbers of a declared type, which ASCII has as text."""
     num_before = 0
     for columns in read_columns():
@@ -266,7 +257,7 @@ def _read_packed(header: PcdHeader, type_: str, read_columns: reader.ColumnReade
         else:
             bits = np.ascontiguousarray(values).view(np.uint32)
         num_before += len(bits)
-        yield RawCloud(points_world, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8))
+        yield points_world, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
 
 
 def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
@@ -277,8 +268,3 @@ def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
         return np.where(is_right, values, 0.0).astype(np.float32).view(np.uint32), is_right
     is_right = (values >= -(2.0**31)) & (values < 2.0**32) & (values == np.floor(values))
     return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right
-
-
-PCD = CloudFormat(
-    "PCD", frozenset({".pcd"}), lambda head: bool(FIRST_LINES.match(head)), open_pcd, has_labels=True
-)

@@ -18,7 +18,7 @@ from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .mesh import open_ply_mesh
-from .reader import CloudFormat, MissingChannelError, PointSource, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
 
 MAGIC = (b"ply\n", b"ply\r")
@@ -63,8 +63,8 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if not header.is_ascii:
         place_of_vertices(header)
     types = [header.vertices.ply_property(name).val_dtype for name in names[3:]]
-    num_points = header.counts[header.index]
-    return reader.column_source(path, partial(read_columns, header, names), types, num_points, options.labels)
+    read = partial(read_columns, header, names)
+    return reader.column_source(path, read, types, channel, options.labels, header.counts[header.index])
 
 
 def _has_faces(header: PlyHeader) -> bool:
@@ -136,21 +136,14 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
 def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel) -> tuple[str, ...]:
     """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label, or none."""
     found = [prop.name for prop in header.vertices.properties]
-    by_lower = {name.lower(): name for name in found}
-    more: tuple[str, ...] = ()
-    if options.labels:
-        more = tuple(by_lower[name] for name in reader.LABEL_NAMES if name in by_lower)[:1]
-    elif channel == "intensity":
-        more = tuple(name for name in found if name.lower() in reader.INTENSITY_NAMES)[:1]
-    elif channel == "colors":
-        more = reader.color_names(found)
-    if not {*"xyz"} <= {*found} or not (more or channel == "shape"):
+    names = reader.find_fields(found, channel, options.labels)
+    if not names:
         kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
         listed = " ".join(found[:9]) or "no properties"
         wanted = LABELS_WANTED if options.labels else WANTED
         error = MissingChannelError if {*"xyz"} <= {*found} else InputError
         raise error(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
-    return (*"xyz", *more)
+    return names
 
 
 def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
@@ -164,6 +157,3 @@ def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
         promised = f"promises {count} vertices of {dtype.itemsize} bytes, found {room} bytes"
         raise InputError(f"{header.path}: the header {promised}; the file is cut off or broken")
     return offset, count, dtype
-
-
-PLY = CloudFormat("PLY", frozenset({".ply"}), lambda head: head.startswith(MAGIC), open_ply, has_labels=True)

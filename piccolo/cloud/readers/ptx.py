@@ -8,19 +8,17 @@ import math
 import os
 from collections.abc import Iterator
 from functools import partial
-from itertools import starmap
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...arrays import Array, Mask
 from ...errors import InputError
-from ...geometry.pose import transform_points
+from ...geometry.pose import Array, transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 from .text import NUM_WITH_INTENSITY, LineLayout, NumberLines
 
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
@@ -61,13 +59,8 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
     read = partial(_read, path, COLORED if channel == "colors" else IN_GRAY, scans)
-    readers: dict[Channel, ChunkReader] = {
-        "colors": lambda: starmap(RawCloud, read()),
-        "intensity": reader.intensity_reader(read),
-        "shape": reader.bare_reader(read),
-    }
-    num_points = sum(scan.num_points for scan in scans)
-    return PointSource(path, readers[channel], num_points, tuple(warnings), tuple(_station_axes(scans)))
+    source = reader.make_source(path, read, channel, num_points=sum(scan.num_points for scan in scans))
+    return source._replace(warnings=tuple(warnings), station_axes=tuple(_station_axes(scans)))
 
 
 def _station_axes(scans: list[PtxScan]) -> Iterator[Array]:
@@ -124,15 +117,13 @@ def _ends_with_a_line_end(path: Path) -> bool:
         return file.read() in (b"\r", b"\n")
 
 
-def _read(path: Path, layout: LineLayout, scans: list[PtxScan]) -> Iterator[tuple[Array, NDArray[Any]]]:
+def _read(path: Path, layout: LineLayout, scans: list[PtxScan]) -> Iterator[reader.Part]:
     """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,)."""
     lines = NumberLines(path, layout, WANTED)
     for scan in scans:
         lines.skip(len(NUMBERS_A_LINE))
         for points, values in lines.read_points(scan.num_points):
-            is_return: Mask = np.any(points != 0.0, axis=1)
+            is_return = np.any(points != 0.0, axis=1)
+            returned: Array = points[is_return].astype(np.float64, copy=False)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
-                yield transform_points(points[is_return], scan.T_world_from_scanner), values[is_return]
-
-
-PTX = CloudFormat("PTX", frozenset({".ptx"}), has_ptx_magic, open_ptx)
+                yield transform_points(returned, scan.T_world_from_scanner), values[is_return]

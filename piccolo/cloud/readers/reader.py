@@ -20,22 +20,25 @@ from numpy.typing import NDArray
 from ...arrays import Array, Bytes, Floats, Int64s, Mask
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
-from ..settings import Channel, CloudSettings, UpAxis
+from ..settings import Channel, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
 MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 bytes have room
 CUT = "the file was cut while it was read, wanted a whole file"
 
-# points (N, 3) in the file's unit, and a number (N,) of each: intensity or label
-PointsWithScalar = tuple[Floats, Array]
-ScalarReader = Callable[[], Iterator[PointsWithScalar]]  # each call from the start
+# Points (N, 3) in the file's unit, float32 if stored as such; and colours (N, 3), or a number (N,) of each.
+Part = tuple[NDArray[np.floating[Any]], NDArray[Any]]
+PartReader = Callable[[], Iterator[Part]]  # each call from the start
 # The value that means full brightness, by the type of a field without its byte order.
 BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
 TYPES_WANTED = "uint8 0-255, uint16 0-65535 or float 0-1, one for all three"
-COLOR_NAMES = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
-Columns = list[NDArray[Any]]
-ColumnReader = Callable[[], Iterator[Columns]]  # each call from the start
+COLOR_NAMES = (
+    ("red", "green", "blue"),
+    ("r", "g", "b"),
+    ("diffuse_red", "diffuse_green", "diffuse_blue"),
+)
+Columns = Sequence[NDArray[Any]]
 INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
 BLACK, WHITE = 0.01, 0.99  # fraction of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
@@ -72,17 +75,6 @@ class PointSource(NamedTuple):
     channel: Channel = "colors"  # what is read of the points
 
 
-class CloudFormat(NamedTuple):
-    """A format and its reader."""
-
-    name: str
-    suffixes: frozenset[str]  # lower case, with the dot
-    has_magic: Callable[[bytes], bool]  # of a file's first HEAD_SIZE bytes; content goes before names
-    # MissingChannelError if the file has no such channel
-    open_source: Callable[[Path, CloudSettings, Channel], PointSource]
-    has_labels: bool = False  # the reader knows them
-
-
 def quote_line(line: bytes) -> str:
     """Return the first line of `line`, shortened and printable, with control characters escaped."""
     text = line.splitlines()[0] if line else b""
@@ -94,9 +86,23 @@ def point_label(path: Path, index: int) -> str:
     return f"{path}: point {index + 1}"
 
 
-def color_names(names: Collection[str]) -> tuple[str, ...]:
-    """Return the names of the three colours among a file's names; empty if there are none."""
-    return next((three for three in COLOR_NAMES if all(name in names for name in three)), ())
+def find_fields(
+    names: Collection[str],
+    channel: Channel,
+    labels: Labels | None = None,
+    color_names: Sequence[tuple[str, ...]] = COLOR_NAMES,
+) -> tuple[str, ...]:
+    """Return x y z and the colours, intensity or label among a file's names; empty if any is missing."""
+    by_lower = {name.lower(): name for name in names}
+    more: tuple[str, ...] = ()
+    if labels:
+        more = tuple(by_lower[name] for name in LABEL_NAMES if name in by_lower)[:1]
+    elif channel == "intensity":
+        more = tuple(name for name in names if name.lower() in INTENSITY_NAMES)[:1]
+    elif channel == "colors":
+        more = next((some for some in color_names if all(name in names for name in some)), ())
+    is_found = {*"xyz"} <= {*names} and (more or channel == "shape")
+    return (*"xyz", *more) if is_found else ()
 
 
 def find_full_brightness(path: Path, types: Sequence[str]) -> float:
@@ -106,19 +112,13 @@ def find_full_brightness(path: Path, types: Sequence[str]) -> float:
     return BRIGHTEST[types[0]]
 
 
-def color_chunks(
-    chunks: Iterable[tuple[NDArray[np.generic], NDArray[np.generic]]],
-    brightest: float,
-    locate: Callable[[int], str],
-) -> Iterator[RawCloud]:
-    """Yield chunks of positions and colours (N, 3), each of any type, colours from 0 to `brightest`.
+def color_chunks(parts: Iterable[Part], brightest: float, locate: Callable[[int], str]) -> Iterator[RawCloud]:
+    """Yield points with their colours (N, 3), of any type from 0 to `brightest`, as 8 bits.
 
     Raises InputError if a colour is out of range: `locate` turns a point's index into the file and a place.
     """
     num_before = 0
-    for points, values in chunks:
-        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
-            points_world = points.astype(float_type([points]))
+    for points_world, values in parts:
         if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
             colors = np.array(values, dtype=np.uint8)
         else:  # a point without a finite position needs no colour: it becomes black
@@ -152,72 +152,72 @@ def take_records(file: BufferedReader, path: Path, count: int, dtype: np.dtype[A
     return records
 
 
-def in_chunks(columns: list[NDArray[Any]]) -> Iterator[list[NDArray[Any]]]:
+def in_chunks(columns: Columns) -> Iterator[Columns]:
     """Yield arrays of the same length, CHUNK or fewer rows at once."""
     for begin in range(0, len(columns[0]), CHUNK):
         yield [column[begin : begin + CHUNK] for column in columns]
 
 
-def float_type(columns: Columns) -> type[np.floating[Any]]:
-    """Return float32 for columns that are all stored so, in any order of bytes, else float64."""
-    return np.float32 if all(column.dtype.str[1:] == "f4" for column in columns) else np.float64
-
-
-def points_of(columns: Columns) -> Floats:
-    """Return the points (N, 3) in the first three columns."""
+def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
+    """Return the points (N, 3) in the first three columns: float32 if stored as such, else float64."""
     with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
-        return np.stack(columns[:3], axis=1, dtype=float_type(columns[:3]))
+        points = np.stack(columns[:3], axis=1)
+        return points.astype(np.float32 if points.dtype == np.float32 else np.float64, copy=False)
+
+
+def make_source(
+    path: Path,
+    read: PartReader,
+    channel: Channel,
+    labels: Labels | None = None,
+    num_points: int | None = None,
+) -> PointSource:
+    """Return the points that `read` yields with colours of 8 bits, or with a label, else an intensity.
+
+    If only the shape counts, the points are grey.
+    """
+    readers: dict[Channel, ChunkReader] = {
+        "colors": lambda: (RawCloud(*part) for part in read()),
+        "intensity": intensity_reader(read),
+        "shape": lambda: (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points, _ in read()),
+    }
+    return PointSource(
+        path, partial(_read_labels, path, read, labels) if labels else readers[channel], num_points
+    )
+
+
+def colored_source(path: Path, read: PartReader, types: Sequence[str], num_points: int) -> PointSource:
+    """Return the points that `read` yields with three colours of these types, such as "u1"."""
+    brightest = find_full_brightness(path, types)
+    locate = partial(point_label, path)
+    return make_source(path, lambda: color_chunks(read(), brightest, locate), "colors", None, num_points)
 
 
 def column_source(
-    path: Path, read_columns: ColumnReader, types: Sequence[str], num_points: int, labels: Labels | None
+    path: Path,
+    read_columns: Callable[[], Iterator[Columns]],
+    types: Sequence[str],
+    channel: Channel,
+    labels: Labels | None,
+    num_points: int,
 ) -> PointSource:
-    """Return points with colours of three types, such as "u1", or with one scalar: label, else intensity.
+    """Return points in columns x y z, with three colours of these types, or with a scalar, or alone."""
+    is_colored = len(types) == len(COLOR_NAMES[0])
 
-    Without types only the shape counts: the points are grey.
-    """
-    if not types:
-        return PointSource(path, lambda: bare_points(map(points_of, read_columns())), num_points)
-    if len(types) == 3:
-        read_chunks: ChunkReader = partial(
-            _read_colored, path, read_columns, find_full_brightness(path, types)
-        )
-    elif labels:
-        read_chunks = label_reader(path, partial(_with_scalar, read_columns), labels)
-    else:
-        read_chunks = intensity_reader(partial(_with_scalar, read_columns))
-    return PointSource(path, read_chunks, num_points)
+    def read() -> Iterator[Part]:
+        for columns in read_columns():
+            values = np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64)
+            yield points_of(columns), values
+
+    if is_colored:
+        return colored_source(path, read, types, num_points)
+    return make_source(path, read, channel, labels, num_points)
 
 
-def _read_colored(path: Path, read_columns: ColumnReader, brightest: float) -> Iterator[RawCloud]:
-    parts = ((np.stack(c[:3], axis=1), np.stack(c[3:], axis=1)) for c in read_columns())
-    return color_chunks(parts, brightest, partial(point_label, path))
-
-
-def bare_points(chunks: Iterable[Floats]) -> Iterator[RawCloud]:
-    """Yield points (N, 3) of which only the shape counts, in grey."""
-    return (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points in chunks)
-
-
-def bare_reader(read_scalar: ScalarReader) -> ChunkReader:
-    """Return `read_chunks` of a PointSource for points of which only the shape counts."""
-    return lambda: bare_points(points for points, _ in read_scalar())
-
-
-def _with_scalar(read_columns: ColumnReader) -> Iterator[PointsWithScalar]:
-    return ((points_of(columns), columns[3].astype(np.float64)) for columns in read_columns())
-
-
-def intensity_reader(read_scalar: ScalarReader) -> ChunkReader:
+def intensity_reader(read: PartReader) -> ChunkReader:
     """Return `read_chunks` of a PointSource for a reader of points and their intensity."""
-    limits = functools.cache(lambda: _limits(read_scalar()))
-
-    def read_chunks() -> Iterator[RawCloud]:
-        low, high = limits()
-        for points, intensity in read_scalar():
-            yield RawCloud(points, as_gray(intensity, low, high))
-
-    return read_chunks
+    limits = functools.cache(lambda: _limits(read()))
+    return lambda: (RawCloud(points, as_gray(intensity, *limits())) for points, intensity in read())
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:
@@ -232,45 +232,31 @@ def as_gray(intensity: Array, low: float, high: float) -> Bytes:
     return np.repeat(gray[:, None], 3, axis=1)
 
 
-def _limits(chunks: Iterator[PointsWithScalar]) -> tuple[float, float]:
+def _limits(chunks: Iterator[Part]) -> tuple[float, float]:
     """Return percentiles of the intensity of points with a position, within 1 %, or exact up to 255."""
-    histogram = np.zeros(NUM_BINS, np.int64)
+    histogram = np.zeros(NUM_BINS, np.int64)  # by the upper half of a float32's bits
     for points, intensity in chunks:
         is_measured = np.isfinite(points).all(axis=1) & np.isfinite(intensity)
-        histogram += np.bincount(_bins(intensity[is_measured]), minlength=NUM_BINS)
-    total = np.cumsum(histogram)
+        # + 0.0 turns -0.0 into 0.0
+        values = (np.clip(intensity[is_measured], -LARGEST, LARGEST) + 0.0).astype(np.float32)
+        histogram += np.bincount(values.view(np.uint32) >> 16, minlength=NUM_BINS)
+    levels = (np.arange(NUM_BINS, dtype=np.uint32) << 16).view(np.float32)  # in each bin the nearest to 0
+    order = np.argsort(levels)
+    total = np.cumsum(histogram[order])
     if total[-1] == 0:  # no point has a position: others refuse that
         return 0.0, 1.0
-    low, high = (_lower_edge(int(np.searchsorted(total, share * total[-1]))) for share in (BLACK, WHITE))
+    low, high = levels[order[np.searchsorted(total, np.array([BLACK, WHITE]) * total[-1])]].tolist()
     return low, high
 
 
-def _bins(values: Array) -> Int64s:
-    """Return the bin (N,) of each value: the upper half of its bits as a float32, in ascending order."""
-    # + 0.0 turns -0.0 into 0.0
-    bits = (np.clip(values, -LARGEST, LARGEST) + 0.0).astype(np.float32).view(np.uint32)
-    bits = np.where(bits >> 31, ~bits, bits | np.uint32(1 << 31))
-    return (bits >> 16).astype(np.int64)
-
-
-def _lower_edge(index: int) -> float:
-    """Return the value nearest to 0 in a bin."""
-    bits = (index << 16) ^ (1 << 31) if index >= NUM_BINS // 2 else ~(index << 16 | 0xFFFF) & 0xFFFFFFFF
-    return float(np.array(bits, np.uint32).view(np.float32))
-
-
-def label_reader(path: Path, read_scalar: ScalarReader, labels: Labels) -> ChunkReader:
-    """Return `read_chunks` of a PointSource for a reader of points and their labels."""
-
-    def read_chunks() -> Iterator[RawCloud]:
-        for points, found in read_scalar():
-            values = np.where(np.isfinite(points).all(axis=1), found, 0.0)  # the others are left out later
-            is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
-            if not is_whole.all():
-                wrong = f"found the label {values[np.argmin(is_whole)]:g}"
-                raise InputError(f"{path}: {wrong}, wanted whole numbers")
-            numbers = values.astype(np.int64)
-            is_kept = labels.are_kept(numbers)
-            yield RawCloud(points[is_kept], label_colors(numbers[is_kept]))
-
-    return read_chunks
+def _read_labels(path: Path, read: PartReader, labels: Labels) -> Iterator[RawCloud]:
+    """Yield the points whose label counts, in the label's colour."""
+    for points, found in read():
+        values = np.where(np.isfinite(points).all(axis=1), found, 0.0)  # the others are left out later
+        is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
+        if not is_whole.all():
+            wrong = f"found the label {values[np.argmin(is_whole)]:g}"
+            raise InputError(f"{path}: {wrong}, wanted whole numbers")
+        numbers = values.astype(np.int64)
+        is_kept = labels.are_kept(numbers)
+        yield RawCloud(points[is_kept], label_colors(numbers[is_kept]))

@@ -5,10 +5,9 @@ PTS files have lines x y z intensity r g b after a count of points.
 
 import os
 from collections.abc import Iterator
-from functools import partial
-from itertools import chain, islice, starmap
+from itertools import chain, islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +16,12 @@ from ...arrays import Array
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
-from .reader import ChunkReader, CloudFormat, MissingChannelError, PointSource, RawCloud, quote_line
+from .reader import MissingChannelError, PointSource, quote_line
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
 NUM_COLUMNS: dict[Channel, int] = {"colors": 6, "intensity": NUM_WITH_INTENSITY, "shape": 3}
-TEXT_SUFFIXES = frozenset({".txt", ".xyz", ".asc", ".csv", ".xyzrgb"})
 HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
@@ -75,8 +73,15 @@ class NumberLines:
         self.layout = layout
         self.wanted = wanted
         self.num_taken = 0
-        self._kept = partial(_strip_blanks, has_counts=layout.has_counts)
-        self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
+        self._lines = chain.from_iterable(map(self._strip, line_blocks(path, layout.start)))
+
+    def _strip(self, lines: list[bytes]) -> list[bytes]:
+        """Strip lines of blanks; return the lines of numbers."""
+        return [
+            line
+            for line in filter(None, map(bytes.strip, lines))
+            if not line.startswith(COMMENT_MARKS) and not (self.layout.has_counts and line.isdigit())
+        ]
 
     def peek(self) -> bytes | None:
         """Return the next line without taking it; None at the end."""
@@ -97,15 +102,24 @@ class NumberLines:
         self.num_taken += num_skipped
         return num_skipped
 
-    def _take_rows(self, count: int) -> Array:
-        """Return the wanted columns (R, C) of the next lines, R <= `count`; R = 0 at the end."""
+    def read_rows(self, count: int | None = None) -> Iterator[NDArray[np.float64]]:
+        """Yield the wanted columns (R, C) of `count` lines, or of all that are left, CHUNK at once."""
+        num_columns = self.layout.num_columns or len(self.layout.columns)
+        most = max(1, min(reader.CHUNK, reader.MAX_BLOCK_SIZE // (8 * num_columns)))
+        num_rows = 0
+        while num_rows != count and self.peek() is not None:
+            rows = self._parse(most if count is None else min(most, count - num_rows))
+            num_rows += len(rows)
+            yield rows
+        if num_rows < (count or 0):
+            raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
+
+    def _parse(self, count: int) -> NDArray[np.float64]:
+        """Return the wanted columns (R, C) of the next lines, `count` or fewer."""
         columns = list(self.layout.columns)
         num_columns = self.layout.num_columns
-        most = max(1, reader.MAX_BLOCK_SIZE // (8 * (num_columns or len(columns))))
-        if self.peek() is None:
-            return np.empty((0, len(columns)))
-        lines = islice(self._lines, min(count, reader.CHUNK, most))
         usecols = columns if num_columns is None else None
+        lines = islice(self._lines, count)
         try:
             rows = np.loadtxt(lines, comments=None, delimiter=self.layout.delimiter, usecols=usecols, ndmin=2)
         except InputError:  # of line_blocks
@@ -119,31 +133,18 @@ class NumberLines:
         self.num_taken += len(rows)
         return rows
 
-    def read_rows(self, count: int | None = None) -> Iterator[Array]:
-        """Yield the wanted columns of `count` lines, or of all that are left, CHUNK or fewer at once."""
-        num_rows = 0
-        while num_rows != count:
-            rows = self._take_rows(reader.CHUNK if count is None else count - num_rows)
-            num_rows += len(rows)
-            if len(rows):
-                yield rows
-            elif count is None:
-                return
-            else:
-                raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
-
-    def read_points(self, count: int | None = None) -> Iterator[tuple[NDArray[Any], NDArray[Any]]]:
+    def read_points(self, count: int | None = None) -> Iterator[reader.Part]:
         """Yield the points (N, 3) of the lines that `read_rows` would read, with the other columns.
 
-        These are colours (N, 3), checked to be 0-255, if six columns are read, else the fourth column (N,).
+        These are colours (N, 3), checked to be 0-255, if six columns are read, else the last column (N,).
         """
         first = self.num_taken
+        is_colored = len(self.layout.columns) == NUM_COLUMNS["colors"]
         rows = self.read_rows(count)
-        if len(self.layout.columns) == NUM_WITH_INTENSITY:
-            return ((some[:, :3], some[:, 3]) for some in rows)
-        parts = ((some[:, :3], some[:, 3:]) for some in rows)
-        chunks = reader.color_chunks(parts, reader.BRIGHTEST["u1"], lambda index: self.locate(first + index))
-        return ((chunk.points_world, chunk.colors) for chunk in chunks)
+        parts = ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
+        if not is_colored:
+            return parts
+        return reader.color_chunks(parts, reader.BRIGHTEST["u1"], lambda index: self.locate(first + index))
 
     def locate(self, index: int) -> str:
         """Return the file, and the number in it of the line that follows `index` lines of numbers."""
@@ -158,8 +159,7 @@ class NumberLines:
         for lines in line_blocks(self.path, self.layout.start):
             for line in lines:
                 number += 1
-                for kept in self._kept([line]):
-                    yield number, kept
+                yield from ((number, kept) for kept in self._strip([line]))
 
     def _complaint(self, otherwise: str) -> str:
         """Describe the first broken line after those taken; with `otherwise` if all seem right."""
@@ -181,15 +181,6 @@ class NumberLines:
         return "" if broken is None else f"{quote_line(broken.encode('latin-1'))} is not a number"
 
 
-def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
-    """Strip lines of blanks; return the lines of numbers."""
-    return [
-        line
-        for line in filter(None, map(bytes.strip, lines))
-        if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
-    ]
-
-
 def is_number(field: str) -> bool:
     """Return True if np.loadtxt reads a field as a number."""
     try:
@@ -201,16 +192,7 @@ def is_number(field: str) -> bool:
 
 def line_source(path: Path, layout: LineLayout, channel: Channel, wanted: str) -> PointSource:
     """Return points of lines x y z r g b, colours 0-255, or of x y z intensity, or of x y z."""
-
-    def read() -> Iterator[tuple[Array, NDArray[Any]]]:
-        return NumberLines(path, layout, wanted).read_points()
-
-    readers: dict[Channel, ChunkReader] = {
-        "colors": lambda: starmap(RawCloud, read()),
-        "intensity": reader.intensity_reader(read),
-        "shape": lambda: reader.bare_points(NumberLines(path, layout, wanted).read_rows()),
-    }
-    return PointSource(path, readers[channel])
+    return reader.make_source(path, lambda: NumberLines(path, layout, wanted).read_points(), channel)
 
 
 def open_text(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -232,20 +214,26 @@ def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
     start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
     named: tuple[int, ...] = ()
     header = ""
+    num_names = 0
     num_lines = 0
     for line in head[start:].splitlines(keepends=True):
         text = line.decode("latin-1").strip()
-        fields = text.split(_delimiter(text))
-        if _begins_numbers(line.strip(), fields):
+        delimiter = _delimiter(text)
+        fields = text.split(delimiter)
+        is_count = len(fields) == 1 and line.strip().isdigit()
+        if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
             break
-        named = _find_columns(text, channel) or named
-        if {*"xyz"} <= {*_names(text)}:
+        names = [name.strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter)]
+        once = [name for name in names if names.count(name) == 1]
+        named = tuple(map(names.index, reader.find_fields(once, channel))) or named
+        if {*"xyz"} <= {*names}:
             header = text
+            num_names = len(names)
         start += len(line)
         num_lines += 1
     else:
         raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
-    if not named and len(_names(header)) == len(fields):
+    if not named and num_names == len(fields):
         raise MissingChannelError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
     has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
     if not named and channel == "intensity" and not has_intensity:
@@ -255,40 +243,12 @@ def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
         found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quote_line(line)}"
         error = MissingChannelError if len(fields) >= NUM_COLUMNS["shape"] else InputError
         raise error(f"{path}: {found}, {WANTED}")
-    return LineLayout(columns, start=start, delimiter=_delimiter(text))
+    return LineLayout(columns, start=start, delimiter=delimiter)
 
 
 def _delimiter(line: str) -> str | None:
+    """Return the mark between the columns of a line; None for blanks and tabs."""
     return next((mark for mark in ";," if mark in line), None)
-
-
-def _begins_numbers(line: bytes, fields: list[str]) -> bool:
-    """Return False for blank lines, comments, headers, and the count of points at the start of .pts files."""
-    is_count = len(fields) == 1 and line.isdigit()
-    return not line.startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields))
-
-
-def _names(header: str) -> list[str]:
-    """Return the names of columns in a header line, in lower case."""
-    names = header.lstrip("#/ ")
-    return [name.strip(' "').lower() for name in names.split(_delimiter(names))]
-
-
-def _find_columns(header: str, channel: Channel) -> tuple[int, ...]:
-    """Return the columns of x, y, z, and r, g, b or an intensity; empty if not all are named."""
-    names = _names(header)
-    once = [name for name in names if names.count(name) == 1]
-    more: dict[Channel, tuple[str, ...]] = {
-        "colors": reader.color_names(once),
-        "intensity": tuple(name for name in once if name in reader.INTENSITY_NAMES)[:1],
-        "shape": (),
-    }
-    wanted = (*"xyz", *more[channel])
-    is_found = (more[channel] or channel == "shape") and set(wanted) <= set(once)
-    return tuple(names.index(name) for name in wanted) if is_found else ()
-
-
-TEXT = CloudFormat("text x y z r g b", TEXT_SUFFIXES, lambda head: False, open_text)
 
 
 def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -310,6 +270,3 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         error = MissingChannelError if min(num_columns, 7) in COLUMNS["shape"] else InputError
         raise error(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
     return line_source(path, LineLayout(columns, num_columns, has_counts=True), channel, PTS_WANTED)
-
-
-PTS = CloudFormat("PTS", frozenset({".pts"}), lambda head: False, open_pts)
