@@ -8,7 +8,6 @@ from typing import Any, get_args, get_type_hints
 from .. import __version__
 from ..batch.frame_times import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
-from ..camera.files import open_calibration, read_rig
 from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis, check_crs
 from ..errors import InputError
 from ..geometry.colors import Labels

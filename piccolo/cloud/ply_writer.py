@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Bytes, Floats
 from ..files.atomic import replacing
-from ..geometry.pose import Array, transform_points
+from ..geometry.pose import transform_points
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK
 from .stream import CloudStream

@@ -11,7 +11,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...arrays import Array
+from ...arrays import Array, Bytes
 from ...errors import InputError
 from ...geometry.pose import Pose, rotate_points
 from ..settings import IN_METRES, Channel, CloudSettings
@@ -174,7 +174,7 @@ def _read(path: Path, scans: list[E57Scan]) -> Iterator[reader.Part]:
                 yield points, _colors(path, scan, kept) if scan.color_ranges else kept.get(INTENSITY, points)
 
 
-def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> NDArray[np.uint8]:
+def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> Bytes:
     """Return the colours (N, 3), scaled from the file's range to 0-255."""
     values = np.stack([columns[name] for name in COLORS], axis=1)
     low, high = np.array(scan.color_ranges).T
@@ -185,7 +185,7 @@ def _colors(path: Path, scan: E57Scan, columns: dict[str, Array]) -> NDArray[np.
         i, k = np.argwhere(is_wrong)[0]
         wanted = f"wanted {low[k]:g} to {high[k]:g} as the file declares"
         raise InputError(f"{path}: {scan.label} has a colour of {values[i, k]:g}, {wanted}")
-    colors: NDArray[np.uint8] = np.rint(brightness).astype(np.uint8)
+    colors: Bytes = np.rint(brightness).astype(np.uint8)
     return colors
 
 

@@ -149,7 +149,7 @@ def linear_to_srgb(linear: Array) -> Array:
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
 
 
-def _bytes(colors: Array, is_linear: bool) -> NDArray[np.uint8]:
+def _bytes(colors: Array, is_linear: bool) -> Bytes:
     levels = linear_to_srgb(colors) if is_linear else colors
     return np.rint(np.clip(levels, 0.0, 1.0) * 255.0).astype(np.uint8)
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from ...arrays import Array
 from ...errors import InputError
-from ...geometry.pose import Array
 from ...optional import import_optional
 from . import mesh_files
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture

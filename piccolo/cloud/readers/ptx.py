@@ -13,9 +13,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Array, Mask
+from ...arrays import Array
 from ...errors import InputError
-from ...geometry.pose import Array, transform_points
+from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array, Bytes, Floats, Int64s, Mask
+from ...arrays import Array, Bytes, Floats, Mask
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
 from ..settings import Channel, UpAxis

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ...arrays import Array
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
