@@ -197,7 +197,7 @@ def run_scenes(
         open_keys = keys - {row.key for row in rows}
         found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
         left = [(scene, queries) for scene, queries in found if queries]
-        evaluation = Evaluation(arguments, config, file, rows)
+        evaluation = Evaluation(arguments, config, settings, file, rows)
         if left:
             file.cut(size)
             num_jobs = count_jobs(arguments, max(len(queries) for _, queries in left))
@@ -217,6 +217,7 @@ class Evaluation:
 
     arguments: argparse.Namespace
     config: Localizer  # of any scan
+    settings: dict[str, object]  # of all rows, without the cameras of queries.json
     file: LineFile
     rows: list[QueryResult]
     num_failed: int = 0
@@ -265,6 +266,7 @@ class Evaluation:
         if result.error is not None and (result.status != UNREADABLE or query.is_answerable):
             self.report(result.error)
             return
+        result = replace(result, settings=self.settings)
         row = query_result.make_query_result(scene, query, result, None if result.error else is_inside)
         line = row.to_json()
         self.file.append(line)

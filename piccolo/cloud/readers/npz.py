@@ -99,7 +99,7 @@ def _source(
     num_points = points.shape[0]
     if channel == "shape":
         return reader.make_source(path, read, channel, num_points=num_points)
-    return reader.colored_source(path, read, [type_], num_points)
+    return reader.color_source(path, read, [type_], num_points)
 
 
 def has_npz_magic(head: bytes) -> bool:

@@ -186,7 +186,7 @@ def make_source(
     )
 
 
-def colored_source(path: Path, read: PartReader, types: Sequence[str], num_points: int) -> PointSource:
+def color_source(path: Path, read: PartReader, types: Sequence[str], num_points: int) -> PointSource:
     """Return the points that `read` yields with three colours of these types, such as "u1"."""
     brightest = find_full_brightness(path, types)
     locate = partial(point_label, path)
@@ -210,7 +210,7 @@ def column_source(
             yield points_of(columns), values
 
     if is_colored:
-        return colored_source(path, read, types, num_points)
+        return color_source(path, read, types, num_points)
     return make_source(path, read, channel, labels, num_points)
 
 
