@@ -20,8 +20,7 @@ from .geometry.colors import Labels
 from .geometry.nearness import CONFIRMED
 from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
-from .jobs.stopwatch import Stopwatch
-from .jobs.threads import Workers
+from .jobs.threads import Stopwatch, Workers
 from .localization.beside import SurePhoto, localize_beside, locate
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale

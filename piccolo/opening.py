@@ -17,8 +17,7 @@ from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
 from .geometry.colors import Labels
-from .jobs.stopwatch import Stopwatch
-from .jobs.threads import ProgressCallback, Workers, no_progress, num_cores, report_progress
+from .jobs.threads import ProgressCallback, Stopwatch, Workers, no_progress, num_cores, report_progress
 from .localization.settings import CoarseToFineSettings
 from .opened_scan import OpenedScan, Settings
 from .paper.localize import PaperMap

@@ -13,8 +13,7 @@ from .confidence.localization import Localization
 from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose, check_pose
-from .jobs.stopwatch import Stopwatch
-from .jobs.threads import Progress, Workers, no_progress
+from .jobs.threads import Progress, Stopwatch, Workers, no_progress
 from .localization.query import Query
 from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama

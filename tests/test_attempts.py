@@ -9,8 +9,7 @@ from made_up import PARTIAL, QUERY, TILTED_PARTIAL, TILTED_WHOLE, WHOLE, at, com
 
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.geometry.pose import exp_so3, is_correct
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, query
 from piccolo.localization import localize as method

@@ -11,8 +11,7 @@ from test_verification import NUM_POINTS, SETTINGS, _beside, _narrow, _query, _t
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification

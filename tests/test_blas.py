@@ -8,8 +8,7 @@ import rooms
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from piccolo.jobs.blas import one_blas_thread
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization import localize as method
 from piccolo.localization.settings import CoarseToFineSettings
 

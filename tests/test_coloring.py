@@ -28,8 +28,7 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
 from piccolo.files.journal import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama

@@ -9,8 +9,7 @@ import pytest
 import rooms
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Once, Workers
+from piccolo.jobs.threads import Once, Stopwatch, Workers
 from piccolo.opening import Cloud, open_scan
 from piccolo.scan_map import open_map, scan_map
 from piccolo.scan_map.map_file import load_map, save_map

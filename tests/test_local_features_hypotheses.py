@@ -9,8 +9,7 @@ import pytest
 import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import Matches

@@ -11,8 +11,7 @@ from piccolo.cloud.stream import Cloud
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.rotations import uniform_yaws
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.prior import allow_rotations, apply_prior
 from piccolo.localization.settings import CoarseToFineSettings

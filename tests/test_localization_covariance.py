@@ -14,8 +14,7 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.confidence.covariance import describe_errors
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization import covariance
 from piccolo.localization.comparison import compare
 from piccolo.localization.localize import localize

@@ -10,8 +10,7 @@ import pytest
 from rooms import scan_map
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.scan_map import open_map
 from piccolo.scan_map.map_file import save_map
 from piccolo.scan_map.open_map import CachePolicy

@@ -13,8 +13,7 @@ from piccolo.confidence.localization import Evidence
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import localize, paper_confidence, prepare
 from piccolo.paper.search import MIN_CLEARANCE, PROBE_WIDTH, color_histogram, free_grid, histogram_similarity

@@ -13,8 +13,7 @@ from piccolo.cloud.soa import pack_points
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, step
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import localize, make_loss, prepare

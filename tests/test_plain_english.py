@@ -19,7 +19,7 @@ IRREGULAR = re.compile(
     "begun|bent|broken|brought|built|caught|chosen|done|drawn|found|given|gone|grown|held|hidden|kept|known|laid|"
     "led|lost|made|meant|met|paid|said|seen|sent|shown|sought|spent|taken|thrown|told|worn|written"
 )
-MAX_PARTICIPLES = 3  # of nouns: masked_correlation, squared_gap; and searched_for
+MAX_PARTICIPLES = 3  # of nouns: masked_correlation, square_gap; and searched_for
 # A message below piccolo/cli names a parameter in backticks by its Python name, such as `max_memory`, and a
 # script as tools/NAME.py; for_terminal of cli/start.py makes them --max-memory and piccolo-NAME.
 FLAG = re.compile(r"(?<![\w-])--[a-z{]")

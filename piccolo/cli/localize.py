@@ -24,8 +24,7 @@ from ..errors import InputError, printable
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
 from ..files.line_file import LineFile, open_locked, write_line
 from ..jobs.memory import limit_memory
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers, num_cores
+from ..jobs.threads import Stopwatch, Workers, num_cores
 from ..localization.focal_length import WIDE
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan

@@ -3,8 +3,7 @@
 import argparse
 import json
 
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers, num_cores
+from ..jobs.threads import Stopwatch, Workers, num_cores
 from ..scan_map.named_scans import check_name, name_scan
 from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
 from .command import command, option

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from ..errors import InputError
 from ..files.atomic import check_output
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers, num_cores
+from ..jobs.threads import Stopwatch, Workers, num_cores
 from ..optional import import_optional
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import collect_entries

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from ..batch.results_file import WAYS, Records, write_results
 from ..files.atomic import is_stream
 from ..files.journal import Journal, keeping_steps
-from ..jobs.stopwatch import Stopwatch
+from ..jobs.threads import Stopwatch
 from ..panorama.photo import sha256_of
 from ..photo import Photo
 from ..result import FAILED, Result, read_results

@@ -119,7 +119,7 @@ def project(descriptors: Bytes, mean: NDArray[np.int16], components: Int8s) -> I
 
 
 @inline_kernel
-def squared_gap(first: Int8s, second: Int8s) -> np.int32:
+def square_gap(first: Int8s, second: Int8s) -> np.int32:
     """Return the squared distance of two descriptors (NUM_COMPONENTS,) of 8 bits.
 
     Numba makes 64 bits of products of 32 bits; cut to 32 again, 16 are computed at a time.
@@ -137,7 +137,7 @@ def nearest_middle(descriptors: Int8s, middles: Int8s, nearest: Int32s) -> None:
     for i in range(len(descriptors)):
         best = np.int32(2147483647)
         for k in range(len(middles)):
-            total = squared_gap(descriptors[i], middles[k])
+            total = square_gap(descriptors[i], middles[k])
             if total < best:
                 best = total
                 nearest[i] = k

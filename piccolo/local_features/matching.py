@@ -10,7 +10,7 @@ from ..arrays import Array32, Int8s, Int32s, Mask
 from ..geometry.vectors import dot, minus, row
 from ..jobs.threads import Workers
 from ..kernels.jit import inline_kernel, kernel
-from .feature_map import FeatureMap, project, squared_gap
+from .feature_map import FeatureMap, project, square_gap
 from .keypoints import Keypoints
 
 NUM_NEIGHBORS = 4  # features of the map that a feature of the photo is matched to, at most
@@ -93,7 +93,7 @@ def search_lists(
     for i in range(len(descriptors)):
         for p in range(probes.shape[1]):
             for f in range(list_start[probes[i, p]], list_start[probes[i, p] + 1]):
-                total = squared_gap(descriptors[i], map_descriptors[f])
+                total = square_gap(descriptors[i], map_descriptors[f])
                 if total >= distances[i, -1]:
                     continue
                 at = place_taken(points, f, total, found[i], distances[i])
@@ -108,7 +108,7 @@ def nearest_lists(descriptors: Int8s, middles: Int8s, probes: Int32s) -> None:
     for i in range(len(descriptors)):
         best[:] = FAR
         for m in range(len(middles)):
-            total = squared_gap(descriptors[i], middles[m])
+            total = square_gap(descriptors[i], middles[m])
             if total < best[-1]:
                 put_in_order(len(best) - 1, m, total, probes[i], best)
 

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Once
+from ..jobs.threads import Once, Stopwatch
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..prior import NOTHING_KNOWN
 from ..scan_map.camera_positions import COARSE_SPACING

@@ -17,8 +17,7 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, skew
 from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
 from ..jobs.blas import one_blas_thread
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Stopwatch, Workers
 from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama

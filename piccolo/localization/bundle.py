@@ -20,8 +20,7 @@ from ..confidence.localization import Localization
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.blas import one_blas_thread
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Stopwatch, Workers
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (

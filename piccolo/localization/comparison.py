@@ -17,7 +17,7 @@ from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
-from ..panorama.texels import CHUNK, Texels, make_projected, project, sample
+from ..panorama.texels import CHUNK, Texels, make_chunk, project, sample
 from ..views.points_around import round_position
 from ..views.view import ViewArrays, average_colors, cell_statistics, empty_cells, locate
 from .query import Query
@@ -75,7 +75,7 @@ def sample_photo(
 
     The camera's `center` (3,) [m] is relative to the point from which the offsets of the cells are measured.
     """
-    p = make_projected()
+    p = make_chunk()
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))
         x = offsets[0][lo:hi]

@@ -11,8 +11,7 @@ from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.blas import one_blas_thread
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Stopwatch, Workers
 from ..panorama import Panorama
 from ..panorama.manhattan import find_axes
 from ..scan_map.scan_map import ScanMap

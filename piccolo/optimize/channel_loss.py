@@ -13,7 +13,7 @@ from ..arrays import Array, Array32, Int32s, Int64s
 from ..geometry.sphere import BLOCK_RINGS, make_grid
 from ..kernels.jit import F1, HALF, Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
-from ..panorama.texels import CHUNK, make_projected, project, sample
+from ..panorama.texels import CHUNK, make_chunk, project, sample
 from .levenberg_marquardt import levenberg_marquardt
 from .normal_equations import COUNT, LOSS, block_adder
 
@@ -115,7 +115,7 @@ def correlate(
     They are the products a b, a^2 and b^2 over all channels, the weight, and a and b of each channel.
     """
     sums[:] = 0.0
-    p = make_projected()
+    p = make_chunk()
     found = np.empty((NUM_MOMENTS, CHUNK), np.float32)
     for lo in range(0, len(weights), CHUNK):
         hi = min(lo + CHUNK, len(weights))

@@ -14,15 +14,7 @@ import numpy as np
 from ..arrays import Array, Array32, Int32s
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
-from ..panorama.texels import (
-    CHUNK,
-    Projected,
-    blend_with_gradient,
-    is_valid,
-    make_projected,
-    project,
-    texels_around,
-)
+from ..panorama.texels import CHUNK, Projected, blend_with_gradient, is_valid, make_chunk, project
 
 NUM_SUMS = 29  # loss, count, gradient (6), upper triangle of the normal matrix (21)
 LOSS = 0  # where they begin
@@ -59,7 +51,7 @@ def block_adder(
             z = points.z[n]
             fu = points.fu[n]
             fv = points.fv[n]
-            t00, t10, t01, t11 = texels_around(points, n)
+            t00, t10, t01, t11 = points.t00[n], points.t10[n], points.t01[n], points.t11[n]
             rho2 = x * x + y * y
             c0, c1, c2, weight = read_point(colors, np.uintp(first + n))
             weight *= is_valid(t00, t10, t01, t11)
@@ -147,7 +139,7 @@ def block_adder(
         scale: Scalar,
         sums: Array,
     ) -> None:
-        points = make_projected()
+        points = make_chunk()
         X, Y, Z = xyz
         for lo in range(0, len(X), CHUNK):
             hi = min(lo + CHUNK, len(X))

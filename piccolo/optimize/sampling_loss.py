@@ -19,17 +19,7 @@ from ..cloud.soa import FARTHEST, PackedPoints
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
-from ..panorama.texels import (
-    CHUNK,
-    Texels,
-    bilinear_weights,
-    blend,
-    channel,
-    is_valid,
-    make_projected,
-    project,
-    texels_around,
-)
+from ..panorama.texels import CHUNK, Texels, bilinear_weights, blend, channel, is_valid, make_chunk, project
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
 
 BLOCK = 4096
@@ -47,7 +37,7 @@ def loss_blocks(
 ) -> None:
     """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
     x, y, z, rgbx = points
-    p = make_projected()
+    p = make_chunk()
     for block in range(len(sums)):
         begin = (first_block + block) * BLOCK
         end = min(len(x), begin + BLOCK)
@@ -60,7 +50,7 @@ def loss_blocks(
             total = count = F0
             for n in range(hi - lo):
                 weights = bilinear_weights(p.fu[n], p.fv[n])
-                t00, t10, t01, t11 = texels_around(p, n)
+                t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
                 c = colors[n]
                 dr = blend(t00, t10, t01, t11, weights, 0) - channel(c, 0)
                 dg = blend(t00, t10, t01, t11, weights, 8) - channel(c, 8)

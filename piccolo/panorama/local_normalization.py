@@ -12,7 +12,7 @@ from ..geometry.sphere import pixel_rays, solid_angles
 from ..geometry.vectors import row
 from ..kernels.jit import F0, F1, HALF, Scalar, copy_to, inline_kernel, kernel
 from . import Panorama
-from .texels import CHUNK, Texels, make_projected, project, sample
+from .texels import CHUNK, Texels, make_chunk, project, sample
 
 CLIP = 2.0  # deviations; what differs more from its surroundings counts no more
 MIN_DEVIATION = 0.03  # of a channel in [0, 1]: flatter surroundings are not amplified further
@@ -211,7 +211,7 @@ def sample_channels(
     texels: Int32s, width: int, directions: Array32, rotations: Array32, samples: Array32, validity: Array32
 ) -> None:
     """Write channels (rotations, 3, cells), minus the zero level, and validity in turned directions."""
-    p = make_projected()
+    p = make_chunk()
     center = np.zeros(3)
     zero = np.float32(ZERO_LEVEL)
     axes = directions.T.copy()

@@ -17,7 +17,6 @@ from ..kernels.jit import F1, HALF, Scalar, inline_kernel, whole
 
 BYTE = np.int32(255)
 CHUNK = 512  # points
-Four = tuple[np.int32, np.int32, np.int32, np.int32]  # texels (0, 0), (1, 0), (0, 1), (1, 1)
 Weights = tuple[Scalar, Scalar, Scalar, Scalar]  # of four texels
 Pose32 = tuple[
     np.float32, np.float32, np.float32, np.float32, np.float32, np.float32,
@@ -128,7 +127,7 @@ class Projected(NamedTuple):
 
 
 @inline_kernel
-def make_projected() -> Projected:
+def make_chunk() -> Projected:
     """Make the arrays of a chunk, not filled."""
     f = np.empty((5, CHUNK), np.float32)
     i = np.empty((5, CHUNK), np.int32)
@@ -188,16 +187,11 @@ def project(
 
 
 @inline_kernel
-def texels_around(projected: Projected, n: int) -> Four:
-    """Return the four texels around a projected point."""
-    return projected.t00[n], projected.t10[n], projected.t01[n], projected.t11[n]
-
-
-@inline_kernel
 def sample(projected: Projected, n: int) -> tuple[Scalar, Scalar, Scalar, np.float32]:
     """Interpolate the three channels [levels] at a projected point; return also 1 if all texels count."""
-    weights = bilinear_weights(projected.fu[n], projected.fv[n])
-    t00, t10, t01, t11 = texels_around(projected, n)
+    p = projected
+    weights = bilinear_weights(p.fu[n], p.fv[n])
+    t00, t10, t01, t11 = p.t00[n], p.t10[n], p.t01[n], p.t11[n]
     a = blend(t00, t10, t01, t11, weights, 0)
     b = blend(t00, t10, t01, t11, weights, 8)
     c = blend(t00, t10, t01, t11, weights, 16)

@@ -13,8 +13,7 @@ from ..confidence.confidence import AMBIGUOUS, LEAST_SCORE, LOCALIZED, NOT_LOCAL
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.rotations import uniform_rotations, uniform_yaws
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Stopwatch, Workers
 from ..optimize.refine import Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink

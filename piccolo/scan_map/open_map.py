@@ -15,8 +15,7 @@ from ..cloud.soa import LocalCloud, pack_points
 from ..errors import InputError
 from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Once, Workers
+from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap
 from ..prior import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map

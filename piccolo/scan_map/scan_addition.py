@@ -16,8 +16,7 @@ from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
 from ..geometry.sphere import whole_areas
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Stopwatch, Workers
 from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_map, view_positions
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import BLOCK, ranges_around

@@ -16,8 +16,7 @@ from ..cloud.surface_noise import surface_variance
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Once, Workers
+from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
 from ..prior import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide

@@ -13,8 +13,7 @@ from ..confidence.confidence import posterior
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE
 from ..geometry.pose import Pose, carry, exp_so3, log_so3
 from ..jobs.blas import one_blas_thread
-from ..jobs.stopwatch import Stopwatch
-from ..jobs.threads import Workers
+from ..jobs.threads import Stopwatch, Workers
 from ..localization.attempts import is_whole
 from ..localization.beam import brief_query, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.comparison import compare

@@ -13,8 +13,7 @@ from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import is_correct
-from piccolo.jobs.stopwatch import Stopwatch
-from piccolo.jobs.threads import Workers, num_cores
+from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama

@@ -359,7 +359,7 @@ def _read(header: LasHeader, layout: LasLayout, field: str, is_8_bit: bool = Fal
             yield points_world, (values & class_bits if field == "class" else values).astype(np.float64)
 
 
-def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> NDArray[np.uint8]:
+def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> Bytes:
     """Return colours (N, 3) of 16 bits, or of 8 in 16, as 8 bits."""
     if not is_8_bit:
         return TO_8_BIT[rgb]

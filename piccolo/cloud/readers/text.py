@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ...arrays import Array
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
@@ -101,7 +101,7 @@ class NumberLines:
         self.num_taken += num_skipped
         return num_skipped
 
-    def read_rows(self, count: int | None = None) -> Iterator[NDArray[np.float64]]:
+    def read_rows(self, count: int | None = None) -> Iterator[Array]:
         """Yield the wanted columns (R, C) of `count` lines, or of all that are left, CHUNK at once."""
         num_columns = self.layout.num_columns or len(self.layout.columns)
         most = max(1, min(reader.CHUNK, reader.MAX_BLOCK_SIZE // (8 * num_columns)))
@@ -113,7 +113,7 @@ class NumberLines:
         if num_rows < (count or 0):
             raise InputError(f"{self.path}: found {num_rows} of {count} points; the file is cut off")
 
-    def _parse(self, count: int) -> NDArray[np.float64]:
+    def _parse(self, count: int) -> Array:
         """Return the wanted columns (R, C) of the next lines, `count` or fewer."""
         columns = list(self.layout.columns)
         num_columns = self.layout.num_columns
