@@ -86,6 +86,11 @@ class LasHeader(NamedTuple):
         return np.dtype({"names": [*fields], "formats": kinds, "offsets": at, "itemsize": self.record_size})
 
     @property
+    def num_extra(self) -> int:
+        """Extra bytes of a record."""
+        return self.record_size - RECORD_SIZES[self.point_format]
+
+    @property
     def has_colors(self) -> bool:
         """True if the records have fields for colours, even if these are empty."""
         return self.point_format in COLORS_BYTE
@@ -135,7 +140,6 @@ class LasLayout(NamedTuple):
     offset: int  # [byte] of the first chunk
     chunks: tuple[LazChunk, ...]
     laszip: bytes = b""  # the record that describes the compression, as lazrs takes it; empty without
-    num_layers: int = 0  # 0 if the points are not in layers
 
 
 def read_laz_layout(header: LasHeader) -> LasLayout:
@@ -146,7 +150,7 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
         if laszip is None:
             text = "the points are compressed, but no record says how (LASzip's VLR)"
             raise InputError(f"{header.path}: {text}")
-        num_layers = _check_items(header, laszip, lazrs)
+        _check_items(header, laszip, lazrs)
         table_offset, table = _table(header, file)
     with _refusing(header.path, lazrs):
         vlr = lazrs.LazVlr(laszip)
@@ -154,7 +158,7 @@ def read_laz_layout(header: LasHeader) -> LasLayout:
         if not vlr.uses_variable_size_chunks():
             entries = [(vlr.chunk_size(), size) for _, size in entries]
     offset = header.points_offset + OFFSET_SIZE
-    return LasLayout(offset, _check_chunks(header, entries, table_offset - offset), laszip, num_layers)
+    return LasLayout(offset, _check_chunks(header, entries, table_offset - offset), laszip)
 
 
 def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted_id: int) -> bytes | None:
@@ -171,14 +175,12 @@ def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted
     return None
 
 
-def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> int:
-    """Return the number of layers of a chunk; InputError if the record is not one that lazrs would write."""
-    num_extra = header.record_size - RECORD_SIZES[header.point_format]
-    expected = lazrs.LazVlr.new_for_compression(header.point_format, num_extra, False).record_data()
+def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> None:
+    """Refuse a record that is not one that lazrs would write."""
+    expected = lazrs.LazVlr.new_for_compression(header.point_format, header.num_extra, False).record_data()
     if _without_versions(laszip[: len(expected)]) != _without_versions(expected):
         what = f"point format {header.point_format} in {header.record_size} bytes"
         raise InputError(f"{header.path}: LASzip's record is not that of {what}: it is broken or too old")
-    return NUM_LAYERS[header.point_format] + num_extra if header.point_format >= 6 else 0
 
 
 def _without_versions(laszip: bytes) -> list[bytes]:
@@ -234,8 +236,8 @@ def _check_chunks(header: LasHeader, entries: list[LazChunk], num_bytes: int) ->
 def decompress(header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequence[LazChunk]) -> Bytes:
     """Decompress the bytes `data` of `chunks`; return their records, one after the other."""
     lazrs = import_optional(header.path, "lazrs")
-    if layout.num_layers:
-        _check_layers(header, layout.num_layers, data, chunks)
+    if header.point_format >= 6:
+        _check_layers(header, data, chunks)
     records = np.empty(sum(count for count, _ in chunks) * header.record_size, dtype=np.uint8)
     fields = sum(getattr(lazrs, f"SELECTIVE_DECOMPRESS_{name}") for name in SELECTED)
     selected = lazrs.DecompressionSelection(fields)
@@ -244,12 +246,13 @@ def decompress(header: LasHeader, layout: LasLayout, data: bytes, chunks: Sequen
     return records
 
 
-def _check_layers(header: LasHeader, num_layers: int, data: bytes, chunks: Sequence[LazChunk]) -> None:
+def _check_layers(header: LasHeader, data: bytes, chunks: Sequence[LazChunk]) -> None:
     """Refuse layers larger than their chunk, and another number of points than was promised.
 
     A chunk consists of a whole point, the number of points, the bytes of each layer, the layers.
     """
     begin = 0
+    num_layers = NUM_LAYERS[header.point_format] + header.num_extra
     head_size = header.record_size + 4 * (1 + num_layers)
     for num_points, size in chunks:
         if size < head_size:
@@ -291,7 +294,9 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
             f"{path}: has no colours: point format {header.point_format} has none, {WANTED}"
         )
     field = "rgb" if channel == "colors" else "intensity"
-    largest, num_samples = _largest(header, layout, field)
+    found = [(int(chunk[field].max()), len(chunk)) for chunk in _chunks(header, layout, is_sample=True)]
+    largest = max(value for value, _ in found)
+    num_samples = sum(count for _, count in found)
     if largest == 0:
         is_zero = f"0 in all {num_samples} points checked"
         what = f"has no colours: red green blue are {is_zero}, {WANTED}"
@@ -299,8 +304,8 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     is_8_bit = field == "rgb" and largest <= 255
     read = partial(_read, header, layout, field, is_8_bit)
     source = reader.make_source(path, read, channel, num_points=header.num_points)
-    found = f"(largest value {largest} in {num_samples} points checked)"
-    note = f"{path}: the colours are read as 8-bit values in 16-bit fields {found}"
+    checked = f"(largest value {largest} in {num_samples} points checked)"
+    note = f"{path}: the colours are read as 8-bit values in 16-bit fields {checked}"
     return source._replace(warnings=(note,) if is_8_bit else ())
 
 
@@ -337,12 +342,6 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
             records = np.frombuffer(content, dtype=header.dtype)
             for begin in range(0, len(records), CHUNK):
                 yield records[begin : begin + CHUNK]
-
-
-def _largest(header: LasHeader, layout: LasLayout, name: str) -> tuple[int, int]:
-    """Return the largest `rgb` or `intensity` in a sample of the points, and the size of the sample."""
-    found = [(int(records[name].max()), len(records)) for records in _chunks(header, layout, is_sample=True)]
-    return max(largest for largest, _ in found), sum(count for _, count in found)
 
 
 def _read(header: LasHeader, layout: LasLayout, field: str, is_8_bit: bool = False) -> Iterator[reader.Part]:

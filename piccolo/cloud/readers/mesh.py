@@ -41,48 +41,39 @@ class Surface(NamedTuple):
     colors: Array | None = None  # (C, 3) in [0, 1]; with a texture: factors
     corners: Int64s | None = None  # (T, 3) rows of colors
     is_linear: bool = False  # colors are linear light, not sRGB
-
-
-class SurfaceInstance(NamedTuple):
-    """A surface and the transform with which a node places it in the world."""
-
-    surface: Surface
-    T_world_from_surface: Array  # (4, 4)
+    T_world_from_surface: Array = np.eye(4)  # (4, 4), with which a node places it
 
     def areas(self) -> Array:
-        """Return the areas (T,) of the triangles; 0 for those that aren't finite."""
-        surface = self.surface
-        areas = np.empty(len(surface.triangles))
+        """Return the areas (T,) of the triangles in the world; 0 for those that aren't finite."""
+        areas = np.empty(len(self.triangles))
         with np.errstate(all="ignore"):
-            matrix = self.T_world_from_surface[:3, :3]
             for begin in range(0, len(areas), BLOCK):
-                corners = surface.vertices[surface.triangles[begin : begin + BLOCK]]
-                edges = (corners[:, 1:] - corners[:, :1]) @ matrix.T
+                corners = self.vertices[self.triangles[begin : begin + BLOCK]]
+                edges = (corners[:, 1:] - corners[:, :1]) @ self.T_world_from_surface[:3, :3].T
                 normals = np.cross(edges[:, 0], edges[:, 1])
                 areas[begin : begin + BLOCK] = 0.5 * np.sqrt(np.einsum("ij,ij->i", normals, normals))
         areas[~np.isfinite(areas)] = 0.0
         return areas
 
 
-def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points: int) -> Iterator[RawCloud]:
+def sample_points(surfaces: Sequence[Surface], ends: Array, num_points: int) -> Iterator[RawCloud]:
     """Yield the points of each surface, at most CHUNK at once; `ends` (P,) are cumulative areas."""
     area_per_point = float(ends[-1]) / num_points
-    # the first point at or behind each instance's end
+    # the first point at or behind each surface's end
     behind = np.ceil(ends / area_per_point - 0.5).astype(np.int64)
     behind[-1] = num_points
     last: Texture | None = None
     texels: Bytes | None = None
-    for i, instance in enumerate(instances):
+    for i, surface in enumerate(surfaces):
         first = int(behind[i - 1]) if i else 0
         end = int(behind[i])
         if first == end:
             continue
-        texture = instance.surface.texture
-        if texture is not last:
+        if surface.texture is not last:
             texels = None  # before the next is decoded
-            texels = texture.texels() if texture else None
-            last = texture
-        area_up_to = np.add.accumulate(instance.areas())
+            texels = surface.texture.texels() if surface.texture else None
+            last = surface.texture
+        area_up_to = np.add.accumulate(surface.areas())
         # rounding may put an area behind all ends; never a triangle of area 0
         last_row = int(np.searchsorted(area_up_to, area_up_to[-1]))
         area_before = float(ends[i - 1]) if i else 0.0
@@ -90,7 +81,7 @@ def sample_points(instances: Sequence[SurfaceInstance], ends: Array, num_points:
             k = np.arange(begin, min(begin + CHUNK, end))
             areas = (k + 0.5) * area_per_point - area_before
             rows = np.minimum(np.searchsorted(area_up_to, areas, side="right"), last_row)
-            yield _points(instance, k, rows, texels)
+            yield _points(surface, k, rows, texels)
 
 
 def compute_weights(k: Int64s) -> Array:
@@ -101,11 +92,10 @@ def compute_weights(k: Int64s) -> Array:
     return np.stack([1.0 - a - b, a, b], axis=1)
 
 
-def _points(instance: SurfaceInstance, k: Int64s, rows: Int64s, texels: Bytes | None) -> RawCloud:
+def _points(surface: Surface, k: Int64s, rows: Int64s, texels: Bytes | None) -> RawCloud:
     """Return the points k in the triangles `rows`, without those on texels of alpha 0."""
-    surface = instance.surface
     weights = compute_weights(k)
-    matrix = instance.T_world_from_surface
+    matrix = surface.T_world_from_surface
     triangles = surface.triangles[rows]
     points_world = _blend(surface.vertices, triangles, weights) @ matrix[:3, :3].T + matrix[:3, 3]
     factors = None
@@ -178,14 +168,14 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
     if channel == "intensity":
         raise MissingChannelError(f"{path}: has no intensity")
     scale = options.scale
-    instances, notes = _instances(loaded, channel == "shape")
-    num_triangles = sum(len(instance.surface.triangles) for instance in instances)
+    surfaces, notes = _surfaces(loaded, channel == "shape")
+    num_triangles = sum(len(surface.triangles) for surface in surfaces)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
     sums = []
     num_flat = 0
-    for instance in instances:
-        areas = instance.areas()
+    for surface in surfaces:
+        areas = surface.areas()
         sums.append(areas.sum())
         num_flat += int(np.count_nonzero(areas == 0.0))
     ends = np.cumsum(sums, dtype=np.float64)
@@ -201,23 +191,23 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
     if area * DENSITY > MAX_POINTS:
         density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
         notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
-    read_chunks = partial(sample_points, instances, ends, num_points)
+    read_chunks = partial(sample_points, surfaces, ends, num_points)
     up: UpAxis = "y" if loaded.is_gltf else "z"  # by the specification of glTF
     return PointSource(path, read_chunks, num_points, tuple(notes), up=up)
 
 
-def _instances(loaded: Loaded, is_bare: bool) -> tuple[list[SurfaceInstance], list[str]]:
-    """Return the coloured surfaces with the scene's transforms, and warnings; bare, all in grey."""
+def _surfaces(loaded: Loaded, is_bare: bool) -> tuple[list[Surface], list[str]]:
+    """Return the coloured surfaces where the scene places them, and warnings; bare, all without colours."""
     scene = loaded.scene
     path = loaded.path
     meshes = {name: mesh for name, mesh in scene.geometry.items() if hasattr(mesh, "faces")}
-    surfaces = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
-    instances = []
+    by_name = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
+    surfaces = []
     num_bare = 0
     nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
     # not by the nodes' names: trimesh makes some up by chance
     for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
-        surface = surfaces.get(name)
+        surface = by_name.get(name)
         if surface is None:
             continue
         if is_bare:
@@ -225,15 +215,15 @@ def _instances(loaded: Loaded, is_bare: bool) -> tuple[list[SurfaceInstance], li
         elif surface.colors is None and surface.texture is None:
             num_bare += 1
             continue
-        instances.append(SurfaceInstance(surface, np.array(matrix, dtype=np.float64)))
-    if not instances and not num_bare:
+        surfaces.append(surface._replace(T_world_from_surface=np.array(matrix, dtype=np.float64)))
+    if not surfaces and not num_bare:
         raise InputError(f"{path}: no triangles, {WANTED}")
-    if not instances or (not is_bare and _is_one_color([instance.surface for instance in instances])):
+    if not surfaces or (not is_bare and _is_one_color(surfaces)):
         raise MissingChannelError(f"{path}: no colours, {WANTED}")
     # surfaces of one texture next to each other: it is decoded once
-    first = {id(instance.surface.texture): i for i, instance in reversed(list(enumerate(instances)))}
-    instances.sort(key=lambda instance: first[id(instance.surface.texture)])
-    return instances, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
+    first = {id(surface.texture): i for i, surface in reversed(list(enumerate(surfaces)))}
+    surfaces.sort(key=lambda surface: first[id(surface.texture)])
+    return surfaces, [f"{path}: {num_bare} surfaces without colours left out"] if num_bare else []
 
 
 def _is_one_color(surfaces: list[Surface]) -> bool:

@@ -70,11 +70,6 @@ class PcdHeader(NamedTuple):
         """Bytes of a point in binary."""
         return sum(field.size for field in self.fields)
 
-    @property
-    def num_columns(self) -> int:
-        """Numbers of a point."""
-        return sum(field.count for field in self.fields)
-
 
 def read_header(path: Path) -> PcdHeader:
     """Return the header of a PCD file; SIZE, TYPE and COUNT, if missing as in old files, are 4, F and 1."""
@@ -207,7 +202,9 @@ def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) 
 
 
 def _read_ascii(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterator[reader.Columns]:
-    layout = LineLayout(tuple(field.column for field in fields), header.num_columns, header.size)
+    last = header.fields[-1]
+    columns = tuple(field.column for field in fields)
+    layout = LineLayout(columns, last.column + last.count, header.size)
     rows = NumberLines(header.path, layout, WANTED).read_rows(header.num_points)
     return (list(some.T) for some in rows)
 

@@ -45,31 +45,24 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     lines = NumberLines(path, COLORED, WANTED)
     scans: list[PtxScan] = []
     warnings: list[str] = []
-    while (header := _take_header(lines)) is not None:
-        count, T_world_from_scanner = header
+    while (scan := _take_header(lines)) is not None:
         last_of_header = lines.num_taken - 1
         if not scans and len((lines.peek() or b"").split()) == NUM_WITH_INTENSITY and channel == "colors":
             raise MissingChannelError(f"{path}: has intensity and no colours, {WANTED}")
-        found = lines.skip(count)
-        if found < count:
+        found = lines.skip(scan.num_points)
+        if found < scan.num_points:
             found -= bool(found) and not _ends_with_a_line_end(path)
-            promised = f"ends a header that promises {count} points, found {found}"
+            promised = f"ends a header that promises {scan.num_points} points, found {found}"
             warnings.append(f"{lines.locate(last_of_header)} {promised}; the file may be cut off")
-        scans.append(PtxScan(found, T_world_from_scanner))
+        scans.append(scan._replace(num_points=found))
     if not scans:
         raise InputError(f"{path}: no line of numbers, {WANTED}")
     read = partial(_read, path, COLORED if channel == "colors" else IN_GRAY, scans)
     source = reader.make_source(path, read, channel, num_points=sum(scan.num_points for scan in scans))
-    return source._replace(warnings=tuple(warnings), station_axes=tuple(_station_axes(scans)))
-
-
-def _station_axes(scans: list[PtxScan]) -> Iterator[Array]:
-    """Yield the unit z axes (3,), in the world, of the scanners whose pose is not the identity."""
-    for scan in scans:
-        z = scan.T_world_from_scanner[:3, 2]
-        length = float(np.linalg.norm(z))
-        if length > 0.0 and not np.array_equal(scan.T_world_from_scanner, np.eye(4)):
-            yield z / length
+    poses = [scan.T_world_from_scanner for scan in scans]
+    axes = [T[:3, 2] for T in poses if not np.array_equal(T, np.eye(4)) and np.linalg.norm(T[:3, 2]) > 0.0]
+    station_axes = tuple(z / float(np.linalg.norm(z)) for z in axes)
+    return source._replace(warnings=tuple(warnings), station_axes=station_axes)
 
 
 def has_ptx_magic(head: bytes) -> bool:
@@ -78,8 +71,8 @@ def has_ptx_magic(head: bytes) -> bool:
     return len(lines) == 3 and None not in map(_numbers, lines, NUMBERS_A_LINE)
 
 
-def _take_header(lines: NumberLines) -> tuple[int, Array] | None:
-    """Return the next scan's number of points by its header, and T_world_from_scanner; None at the end."""
+def _take_header(lines: NumberLines) -> PtxScan | None:
+    """Return the next scan by its header; None at the end."""
     numbers: list[list[float]] = []
     for num_wanted in NUMBERS_A_LINE:
         line = lines.take_line()
@@ -96,7 +89,7 @@ def _take_header(lines: NumberLines) -> tuple[int, Array] | None:
         column = " ".join(f"{value:g}" for value in matrix[:, 3])
         place = f"{lines.locate(lines.num_taken - 1)} ends a matrix with the last column"
         raise InputError(f"{place} {column}, wanted 0 0 0 1")
-    return int(numbers[0][0]) * int(numbers[1][0]), matrix.T
+    return PtxScan(int(numbers[0][0]) * int(numbers[1][0]), matrix.T)
 
 
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:

@@ -5,6 +5,7 @@ PTS files have lines x y z intensity r g b after a count of points.
 
 import os
 from collections.abc import Iterator
+from functools import partial
 from itertools import chain, islice
 from pathlib import Path
 from typing import NamedTuple
@@ -72,15 +73,9 @@ class NumberLines:
         self.layout = layout
         self.wanted = wanted
         self.num_taken = 0
-        self._lines = chain.from_iterable(map(self._strip, line_blocks(path, layout.start)))
-
-    def _strip(self, lines: list[bytes]) -> list[bytes]:
-        """Strip lines of blanks; return the lines of numbers."""
-        return [
-            line
-            for line in filter(None, map(bytes.strip, lines))
-            if not line.startswith(COMMENT_MARKS) and not (self.layout.has_counts and line.isdigit())
-        ]
+        # not a method, by which lines would hold each other, and the file open
+        self._kept = partial(_strip_blanks, has_counts=layout.has_counts)
+        self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
 
     def peek(self) -> bytes | None:
         """Return the next line without taking it; None at the end."""
@@ -158,7 +153,7 @@ class NumberLines:
         for lines in line_blocks(self.path, self.layout.start):
             for line in lines:
                 number += 1
-                yield from ((number, kept) for kept in self._strip([line]))
+                yield from ((number, kept) for kept in self._kept([line]))
 
     def _complaint(self, otherwise: str) -> str:
         """Describe the first broken line after those taken; with `otherwise` if all seem right."""
@@ -178,6 +173,15 @@ class NumberLines:
         parsed = [fields[column] for column in columns] if exact is None else fields
         broken = next((field for field in parsed if not is_number(field)), None)
         return "" if broken is None else f"{quote_line(broken.encode('latin-1'))} is not a number"
+
+
+def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
+    """Strip lines of blanks; return the lines of numbers."""
+    return [
+        line
+        for line in filter(None, map(bytes.strip, lines))
+        if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
+    ]
 
 
 def is_number(field: str) -> bool:
