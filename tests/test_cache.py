@@ -13,7 +13,7 @@ import numba
 import numpy as np
 import pytest
 
-from piccolo.cli import progress
+from piccolo.cli import terminal
 from piccolo.files import cache, temporary
 from piccolo.files.atomic import replacing
 from piccolo.files.temporary import PREFIX, temporary_folder
@@ -265,7 +265,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     monkeypatch.setattr(jit.time, "monotonic", lambda: next(seconds))
     for is_quiet in (False, True):
         compiling = jit.Compiling()
-        with progress.showing_log(is_quiet):
+        with terminal.showing_log(is_quiet):
             compiling.start()
             compiling.finish()
             compiling.finish()

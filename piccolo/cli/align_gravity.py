@@ -1,7 +1,6 @@
 """Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
 import argparse
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,11 +23,10 @@ from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
 from ..scene import QUERIES_NAME, read_scene, write_queries
-from .command import command, option, print_warnings
-from .errors import checking_options, print_error
+from .checks import check_outputs, check_suffix, checking_options
+from .command import command, option
 from .options import add_cloud_options, cloud_settings_from
-from .outputs import check_outputs, check_suffix, print_report
-from .progress import progress_bar
+from .terminal import print_error, print_report, print_warnings, progress_bar
 
 EXIT_UNKNOWN = 1
 EPILOG = """\
@@ -161,5 +159,5 @@ def main(arguments: argparse.Namespace) -> int:
         print_warnings(arguments, write_transformed(cloud, T, out, write_others))
     report |= {"cloud": list(map(str, arguments.cloud)), "out": str(out) if out and not doubt else None}
     report |= {"T_aligned_from_scan": T.tolist(), "metres_per_unit": cloud.scale}
-    print_report(arguments, outputs, json.dumps(report, allow_nan=False))
+    print_report(arguments, outputs, report)
     return print_error(arguments, doubt, EXIT_UNKNOWN) if doubt else 0

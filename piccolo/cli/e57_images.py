@@ -9,9 +9,9 @@ from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
+from .checks import check_distinct, check_folder_name
 from .command import command, option
-from .errors import EXIT_BAD_INPUT, print_error
-from .outputs import check_distinct, check_folder_name
+from .terminal import EXIT_BAD_INPUT, print_error
 
 EPILOG = """\
 example:

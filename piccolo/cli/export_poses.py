@@ -1,7 +1,6 @@
 """Write the poses of localize.py for other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
 
 import argparse
-import json
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,9 @@ from ..geometry.rotations import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from ..scene import find_scenes, input_files
+from .checks import check_distinct, checking_options
 from .command import command, option
-from .errors import checking_options, print_note
-from .outputs import check_distinct, print_report
+from .terminal import print_note, print_report
 
 _FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
 EPILOG = f"""\
@@ -117,5 +116,5 @@ def main(arguments: argparse.Namespace) -> int:
         print_note(arguments, f"left out {len(names)}, the first {names[0]}: {reason}")
     num_poses = len(selection.results) - sum(counts.values())
     report = {"out": str(arguments.out), "format": arguments.format, "poses": num_poses}
-    print_report(arguments, outputs, json.dumps({**report, "left_out": {**selection.left_out, **counts}}))
+    print_report(arguments, outputs, {**report, "left_out": {**selection.left_out, **counts}})
     return EXIT_LEFT_OUT if left_out else 0

@@ -19,7 +19,8 @@ from ..photo import Photo, Projection
 from ..prior import Prior
 from ..scan_map.open_map import CachePolicy
 from ..walk.motion import MAX_SPEED, MAX_STEP
-from .command import check_least, option
+from .checks import check_least
+from .command import option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
 EPILOG = """\

@@ -1,7 +1,6 @@
 """Render the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
 
 import argparse
-import json
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
@@ -19,7 +18,7 @@ from ..files.atomic import check_output, check_output_folder, is_stream, replaci
 from ..files.json_file import read_text
 from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
 from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
-from ..jobs.threads import Workers, num_cores
+from ..jobs.threads import Workers
 from ..optimize import descent_animation
 from ..optimize.refine import DescentSettings
 from ..optional import import_optional
@@ -31,11 +30,10 @@ from ..scan_map.open_map import open_points
 from ..scene import read_scene
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
-from .command import command, option, print_warnings
-from .errors import checking_options
+from .checks import check_distinct, check_suffix, checking_options
+from .command import command, option
 from .options import add_cloud_options, cloud_settings_from
-from .outputs import check_distinct, check_suffix, print_report
-from .progress import progress_bar
+from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -237,7 +235,7 @@ def draw_pictures(
     with replacing_folder(arguments.out) if is_many else nullcontext(arguments.out.parent) as folder:
         lines = [write(folder, name, shot) for name, shot in zip(names, poses, strict=True)]
     for line in lines:
-        print_report(arguments, outputs_of(arguments), json.dumps(line))
+        print_report(arguments, outputs_of(arguments), line)
 
 
 def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
@@ -264,7 +262,7 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
         distance, angle = pose_errors(at, goal)
         line |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
     line["loss"] = refined.loss if np.isfinite(refined.loss) else None
-    print_report(arguments, outputs_of(arguments), json.dumps(line))
+    print_report(arguments, outputs_of(arguments), line)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
@@ -277,7 +275,7 @@ def main(arguments: argparse.Namespace) -> int:
     poses = poses_from(arguments)
     check_files(arguments, poses)
 
-    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    workers = workers_from(arguments)
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
     print_warnings(arguments, cloud.warnings)
     if arguments.out:

@@ -1,24 +1,22 @@
 """Write a web page of results: plans of the storeys, photos as spheres, the scan seen from their poses."""
 
 import argparse
-import json
 from collections import Counter
 from pathlib import Path
 
 from ..errors import InputError
 from ..files.atomic import check_output
-from ..jobs.threads import Stopwatch, Workers, num_cores
+from ..jobs.threads import Stopwatch, num_cores
 from ..optional import import_optional
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
-from .command import check_least, command, option, print_warnings
-from .errors import UsageError, checking_options
+from .checks import UsageError, check_distinct, check_least, check_suffix, checking_options
+from .command import command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
-from .outputs import check_distinct, check_suffix, print_report
-from .progress import progress_bar, warn_once
+from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -99,7 +97,7 @@ def main(arguments: argparse.Namespace) -> int:
         cloud_settings = cloud_settings_from(arguments)
     check_files(arguments)
     entries = collect_entries(arguments.results)
-    workers = Workers(arguments.jobs, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    workers = workers_from(arguments, arguments.jobs)
     cache = cache_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, cache, workers, Stopwatch())
     line: dict[str, object] = {"photos": len(entries)}
@@ -113,5 +111,5 @@ def main(arguments: argparse.Namespace) -> int:
         line["url"] = report.page.resolve().as_uri()
         line["storeys"] = len(report.document["storeys"])
     line |= Counter(entry.result.status for entry in entries)
-    print_report(arguments, {"--plan": arguments.plan}, json.dumps(line))
+    print_report(arguments, {"--plan": arguments.plan}, line)
     return 0

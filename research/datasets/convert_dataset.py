@@ -5,12 +5,11 @@ import json
 from collections import Counter
 from dataclasses import fields
 
-from piccolo.cli.command import HelpFormatter, add_run_options, check_least, command, option
-from piccolo.cli.errors import EXIT_BAD_INPUT, print_error, print_note
-from piccolo.cli.outputs import check_folder_name
-from piccolo.cli.progress import progress_bar
+from piccolo.cli.checks import check_folder_name, check_least
+from piccolo.cli.command import HelpFormatter, add_run_options, command, option
+from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, workers_from
 from piccolo.errors import InputError
-from piccolo.jobs.threads import Progress, Workers, num_cores
+from piccolo.jobs.threads import Workers
 from piccolo.scene import read_scene
 
 from . import DATASETS
@@ -91,19 +90,18 @@ def main(arguments: argparse.Namespace) -> int:
     specs = choose_scenes(found.specs, arguments.rooms)
     for note in found.notes:
         print_note(arguments, note)
-    show = progress_bar(arguments.quiet)
+    workers = workers_from(arguments)
     # bad input goes before a bad fit
-    return max((convert_scene(spec, arguments, show) for spec in specs), default=0)
+    return max((convert_scene(spec, arguments, workers) for spec in specs), default=0)
 
 
-def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress) -> int:
+def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, workers: Workers) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
-        written = write_scene(spec, arguments.out, arguments.copy, show)
+        written = write_scene(spec, arguments.out, arguments.copy, workers.show)
         check = None
         if arguments.check:
-            scene = read_scene(written.folder, spec.name)
-            check = check_scene(scene, arguments.check, Workers(num_cores(), show), show)
+            check = check_scene(read_scene(written.folder, spec.name), arguments.check, workers)
     except InputError as error:
         return print_error(arguments, f"{spec.name}: {error}", EXIT_BAD_INPUT)
     for warning in written.warnings:

@@ -8,7 +8,6 @@ with L over the points that a camera at (x, y, z) sees, and the same rotations a
 """
 
 import argparse
-import json
 import math
 import time
 from pathlib import Path
@@ -18,17 +17,16 @@ import numpy as np
 from scipy.ndimage import minimum_filter
 
 from piccolo.arrays import Array, Int64s, Mask
-from piccolo.cli.command import command, option, print_warnings
-from piccolo.cli.errors import checking_options
+from piccolo.cli.checks import check_outputs, check_suffix, checking_options
+from piccolo.cli.command import command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
-from piccolo.cli.outputs import check_outputs, check_suffix, print_report
-from piccolo.cli.progress import progress_bar
+from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.jobs.threads import Workers, num_cores
+from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.optional import new_figure
 from piccolo.panorama import read_panorama
@@ -257,7 +255,7 @@ def main(arguments: argparse.Namespace) -> int:
     check_outputs(outputs, filter(None, inputs))
     new_figure()  # now: where matplotlib is missing, the work would be lost
 
-    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    workers = workers_from(arguments)
     panorama = shrink(read_panorama(arguments.pano), WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     cloud = open_points(arguments.cloud, cloud_settings, workers)
@@ -272,5 +270,5 @@ def main(arguments: argparse.Namespace) -> int:
     write_atomically(arguments.out, surface_png(surface, grid, cloud, known, arguments.pano.name))
     report = {"out": str(arguments.out)} | summary(surface, grid, cloud, known)
     report |= {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
-    print_report(arguments, outputs, json.dumps(report))
+    print_report(arguments, outputs, report)
     return 0

@@ -18,11 +18,11 @@ import numpy as np
 
 from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
-from piccolo.cli.command import check_least, command, option
-from piccolo.cli.errors import EXIT_BAD_INPUT, checking_options, print_error
-from piccolo.cli.executing import check_execution
+from piccolo.cli.checks import check_distinct, check_folder_name, check_least, checking_options
+from piccolo.cli.command import command, option
+from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
-from piccolo.cli.outputs import check_distinct, check_folder_name
+from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
 from piccolo.cloud import read_cloud
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings

@@ -8,7 +8,7 @@ from itertools import chain
 import numpy as np
 
 from piccolo.cli.command import option
-from piccolo.cli.errors import print_note
+from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization

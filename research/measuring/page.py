@@ -16,8 +16,9 @@ from scipy.stats import chi2
 
 import piccolo
 from piccolo.arrays import Bytes
-from piccolo.cli.command import check_least, option
-from piccolo.cli.errors import print_note
+from piccolo.cli.checks import check_least
+from piccolo.cli.command import option
+from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically

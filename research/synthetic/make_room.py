@@ -11,15 +11,14 @@ import numpy as np
 from piccolo import scene as scenes
 from piccolo.camera import Calibration
 from piccolo.camera.files import read_cameras
-from piccolo.cli.command import check_least, check_only_with, command, option
-from piccolo.cli.errors import UsageError, checking_options
-from piccolo.cli.outputs import check_folder_name
-from piccolo.cli.progress import progress_bar
+from piccolo.cli.checks import UsageError, check_folder_name, check_least, check_only_with, checking_options
+from piccolo.cli.command import command, option
+from piccolo.cli.terminal import workers_from
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.export.formats import tum_lines, write_lines
 from piccolo.export.video import writing_video
 from piccolo.files.atomic import write_atomically
-from piccolo.jobs.threads import Workers, num_cores
+from piccolo.jobs.threads import Workers
 from piccolo.optional import import_optional
 from piccolo.views.pictures import encode_image
 
@@ -215,7 +214,7 @@ def main(arguments: argparse.Namespace) -> int:
             worlds.check_cameras(cameras)
     if arguments.video:
         import_optional("--video", "av", "video")
-    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    workers = workers_from(arguments)
     for number in range(max(1, arguments.scenes)):
         folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
         line = write_scene(arguments, arguments.seed + number, folder, cameras, workers)

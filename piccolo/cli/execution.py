@@ -1,33 +1,40 @@
-"""Executors of a batch: this process, several, or a cluster; and its end by a signal."""
+"""The work of a batch: in this process, several, or a cluster, until a signal ends it."""
 
 import argparse
 import os
 import signal
-from collections.abc import Callable, Collection, Iterable, Iterator
+import sys
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from ..batch.localizer import Localizer
-from ..confidence.confidence import LOCALIZED
-from ..errors import InputError
+from tqdm import tqdm
+
+from ..batch.localizer import Answer, Localizer, Task
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED
+from ..errors import InputError, printable
 from ..jobs.cluster import LOCAL, Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Processes
 from ..jobs.tasks import Here
 from ..jobs.threads import num_cores
+from ..localization.focal_length import WIDE
 from ..opened_scan import OpenedScan
-from ..result import FAILED, UNREADABLE
+from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .errors import EXIT_BAD_INPUT, UsageError, print_error
+from .checks import UsageError
 from .options import PHOTOS_OF_A_JOB
+from .start import for_terminal
+from .terminal import EXIT_BAD_INPUT, print_error
 
 EXIT_SOME_NOT = 1
+MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
 SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 Item = TypeVar("Item")
@@ -39,6 +46,35 @@ def choose_exit_code(statuses: Collection[str]) -> int:
     if UNREADABLE in statuses or FAILED in statuses:
         return EXIT_BAD_INPUT
     return 0 if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
+
+
+def advise(result: Result) -> list[str]:
+    """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
+    is_ruled_out = result.best_pose is None or result.confidence == 0.0
+    if result.status == LOCALIZED or is_ruled_out or result.probability_none is None:
+        return []
+    focal = result.focal_length
+    if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:
+        return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
+    if result.status == AMBIGUOUS:
+        return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
+    if result.confidence >= MIN_FIT:
+        others = "add photos taken beside it" if result.cameras else "localize photos of a walk (--walk)"
+        return [f"  to be sure, look at the --overlay, give --near, or {others}"]
+    lens = ", a wrong focal length" if result.cameras else ""
+    return [f"  it fits nowhere well: another scan{lens}, or bare walls?"]
+
+
+def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequence[str]) -> None:
+    """Print an error; or, unless --quiet, what was found, the warnings, and what to do if it is doubtful."""
+    if result.error is not None:
+        print_error(arguments, result.error, EXIT_BAD_INPUT)
+        return
+    if arguments.quiet:
+        return
+    lines = [f"  warning: {for_terminal(printable(warning))}" for warning in warnings]
+    for line in (result.summary(), *lines, *advise(result)):
+        tqdm.write(line, file=sys.stderr)
 
 
 def check_execution(arguments: argparse.Namespace) -> None:
@@ -198,3 +234,21 @@ def interruptible() -> Iterator[Interruption]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def answer_all(
+    executor: Executor,
+    localizer: Localizer,
+    tasks: Iterator[Task],
+    show: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    interruption: Interruption | None = None,
+    cloud_sha256: str | None = None,
+) -> Iterator[Answer]:
+    """Yield the answers to tasks, in their order.
+
+    `show` wraps the tasks as they are done. After a signal come those that are done already.
+    """
+    values = executor.values(tasks)
+    pairs = show(values)
+    for task, wait in interruption.each(pairs, values.take_finished()) if interruption else pairs:
+        yield localizer.wait_for(task, wait, cloud_sha256)

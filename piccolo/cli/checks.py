@@ -1,17 +1,59 @@
-"""Outputs of a command, checked before it begins to work."""
+"""Options that make no sense, and outputs that can't be written, are refused before any work."""
 
 import argparse
+import math
 import os
 import stat
-import sys
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from ..errors import InputError
 from ..files.atomic import check_output, is_stdout, is_stream
 from ..panorama.cube import SUFFIXES
-from .errors import UsageError
 
 Outputs = Mapping[str, Path | None]  # by option; None where it is not given
+
+
+class UsageError(InputError):
+    """The options are wrong, whatever the files hold."""
+
+
+@contextmanager
+def checking_options() -> Iterator[None]:
+    """Within this, an InputError is a UsageError."""
+    try:
+        yield
+    except InputError as error:
+        raise UsageError(str(error)) from error
+
+
+def check_least(arguments: argparse.Namespace, **limits: float) -> None:
+    """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
+    for name, limit in limits.items():
+        value = getattr(arguments, name, None)
+        if value is not None and not limit <= value < math.inf:
+            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+
+
+def check_alone(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
+    """Refuse options, by their names in `arguments`, that do not go with what is asked for."""
+    for name in others:
+        if is_given(arguments, name):
+            raise UsageError(f"--{name.replace('_', '-')}: not with {what}")
+
+
+def check_only_with(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
+    """Refuse options, by their names in `arguments`, that mean something only with what is not asked for."""
+    for name in others:
+        if is_given(arguments, name):
+            raise UsageError(f"--{name.replace('_', '-')}: only with {what}")
+
+
+def is_given(arguments: argparse.Namespace, name: str) -> bool:
+    """Return True for an option without a default, by its name in `arguments`, that was given."""
+    value = getattr(arguments, name)
+    return value is not None and value is not False
 
 
 def check_outputs(outputs: Outputs, inputs: Iterable[Path] = ()) -> None:
@@ -80,11 +122,3 @@ def check_folder_name(option: str, path: Path | None) -> None:
     """Refuse stdout and devices where a folder is wanted."""
     if path and is_stream(path):
         raise UsageError(f"{option} {path}: found stdout or a device, wanted a folder's name")
-
-
-def print_report(arguments: argparse.Namespace, outputs: Outputs, text: str, end: str = "\n") -> None:
-    """Print what a command says on stdout; to stderr, without --quiet, where one of its outputs is stdout."""
-    if not any(path and is_stdout(path) for path in outputs.values()):
-        print(text, end=end)
-    elif not arguments.quiet:
-        print(text, end=end, file=sys.stderr)
