@@ -282,6 +282,13 @@ def with_localization(result: Result, found: Localization) -> Result:
     return replace(result, best_pose=found.pose, warnings=result.warnings + found.warnings, **values)
 
 
+def localization_of(result: Result) -> Localization:
+    """Return what was found of a photo, without warnings and cameras, from its result."""
+    own = {f.name for f in fields(result)} - {"warnings", "cameras"}
+    values = {f.name: getattr(result, f.name) for f in fields(Localization) if f.name in own}
+    return Localization(pose=result.best_pose, **values)
+
+
 class Failure(NamedTuple):
     """Why a photo has no result."""
 

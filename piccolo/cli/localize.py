@@ -16,9 +16,8 @@ import numpy as np
 
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas
 from ..batch.localizer import Answer, Localizer
-from ..batch.outputs import FileOutput, Output, StreamOutput
 from ..batch.priors import read_priors
-from ..batch.results_file import Records
+from ..batch.results_file import FileOutput, Output, Records, StreamOutput
 from ..batch.second_look import LISTINGS, Look, list_changed_by_consensus
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import InputError

@@ -3,6 +3,7 @@
 import argparse
 import json
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import fields
 
 from piccolo.cli.checks import check_folder_name, check_least
@@ -12,14 +13,23 @@ from piccolo.errors import InputError
 from piccolo.jobs.threads import Workers
 from piccolo.scene import read_scene
 
-from . import DATASETS
+from . import generic, research, stanford
 from .checking import check_scene
 from .files import AXES, DIRECTIONS
-from .model import ConvertOptions, SceneSpec
+from .model import ConvertOptions, PosedPanorama, SceneList, SceneSpec
 from .writing import write_scene
 
+DATASETS = {  # a line on each, and what finds its scenes
+    stanford.NAME: ("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.list_scenes),
+    research.OMNISCENES: ("OmniScenes, all splits", research.list_omniscenes),
+    research.MPO: ("MPO scans with panoramas, moved randomly as in the PICCOLO paper", research.list_mpo),
+    research.MATTERPORT: ("Matterport3D skyboxes and house meshes", research.list_matterport),
+    research.LOC360: ("360Loc 360-degree queries, with a cloud of your own", research.list_360loc),
+    generic.NAME: ("any panoramas with poses in a CSV, JSON or TUM file", generic.list_scenes),
+}
+
 EXIT_BAD_FIT = 1
-_DATASETS = "\n".join(f"  {name:<14} {dataset.description}" for name, dataset in DATASETS.items())
+_DATASETS = "\n".join(f"  {name:<14} {text}" for name, (text, _) in DATASETS.items())
 EPILOG = f"""\
 datasets:
 {_DATASETS}
@@ -36,8 +46,8 @@ A scene with a damaged file is left out and named on stderr. Prints one JSON obj
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """All options; those that one dataset alone has are in its own subparser."""
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
-    for name, dataset in DATASETS.items():
-        one = subparsers.add_parser(name, description=dataset.description, formatter_class=HelpFormatter)
+    for name, (description, _) in DATASETS.items():
+        one = subparsers.add_parser(name, description=description, formatter_class=HelpFormatter)
         option(one, "--from FOLDER", "folder of the dataset", required=True, dest="folder")
         option(one, "--out FOLDER", "folder of the scenes; created if missing", required=True)
         text = "only these, the last parts of scene names: office_1, weddingHall_1, a house"
@@ -67,6 +77,24 @@ def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
         option(parser, "--direction", text, choices=DIRECTIONS)
 
 
+def list_scenes(dataset: str, options: ConvertOptions) -> SceneList:
+    """Return the scenes in a folder; InputError if there are none. None is read from files outside of it."""
+    _, find = DATASETS[dataset]
+    found = find(options)
+    specs = (spec._replace(panoramas=_inside(options, spec)) for spec in found.specs)
+    return found._replace(specs=tuple(specs))
+
+
+def _inside(options: ConvertOptions, spec: SceneSpec) -> Iterator[PosedPanorama]:
+    """Yield the panoramas of a scene; InputError if its cloud or one of their files lies outside."""
+    for part in spec.cloud:
+        options.inside(part.path)
+    for panorama in spec.panoramas:
+        for file in panorama.files.values():
+            options.inside(file)
+        yield panorama
+
+
 def choose_scenes(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     """Return the scenes of some rooms, or all."""
     counts = Counter(spec.name for spec in specs)
@@ -86,7 +114,7 @@ def main(arguments: argparse.Namespace) -> int:
     # a dataset's subparser has only some of the options
     own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
     options = ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})
-    found = DATASETS[arguments.dataset].list_scenes(options)
+    found = list_scenes(arguments.dataset, options)
     specs = choose_scenes(found.specs, arguments.rooms)
     for note in found.notes:
         print_note(arguments, note)

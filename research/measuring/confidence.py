@@ -21,9 +21,9 @@ from piccolo.photo import Photo
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scene import Scene, document_of_pose, read_scene
 
+from ..synthetic.layout import PLAIN
 from ..synthetic.photos import change_sensor, cut_photo, occlude
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
-from ..synthetic.room import PLAIN
 from ..synthetic.world import VARIANTS, World, make_query, make_world, scan_world
 from .calibration import Case, print_cases
 from .trials import Points, Trial, damage_trial, make_sceneless, thin_points, turn_over
