@@ -1,4 +1,4 @@
-"""What a command says: results on stdout; errors, warnings and progress, which vanishes, on stderr."""
+"""Output of a command: results on stdout; errors, warnings and progress, which vanishes, on stderr."""
 
 import argparse
 import json

@@ -24,13 +24,7 @@ from piccolo.cli.checks import (
 )
 from piccolo.cli.command import Terminated, command, option
 from piccolo.cli.execution import Interruption
-from piccolo.cli.terminal import (
-    EXIT_BAD_INPUT,
-    print_error,
-    print_note,
-    print_report,
-    progress_bar,
-)
+from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, print_report, progress_bar
 from piccolo.errors import InputError
 from piccolo.files.atomic import check_output, is_stream, write_atomically
 from piccolo.files.line_file import open_locked
