@@ -1,7 +1,7 @@
 """A scan prepared for a method: `Scan`, the commands and the batches localize photos in it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from .cloud.soa import PackedPoints
 from .confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from .confidence.localization import FocalLength, Localization
 from .confidence.occlusion import occlusion_mask
-from .errors import InputError
+from .errors import InputError, is_passing
 from .files.json_file import reading_once
 from .geometry.colors import Labels
 from .geometry.nearness import CONFIRMED
@@ -83,9 +83,7 @@ class OpenedScan:
         """Localize a photo; `focal` is its focal length as found with those of others, which counts then."""
         watch = Stopwatch()
         self.check_options(photo, settings)
-        with watch.stage("read"), reading_once():
-            picture = expect_focal(self.read(photo), focal)
-            facts = read_photo_facts(photo)
+        picture, facts = self._take(photo, focal, watch)
         gps = None
         if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
             gps = self.make_gps_prior(facts, settings.prior)
@@ -135,9 +133,7 @@ class OpenedScan:
         watch = Stopwatch(dict(first.seconds))
         prepared, settings = self.require_default_method("photos beside others", settings)
         focal = first.focal_length
-        with watch.stage("read"), reading_once():
-            picture = expect_focal(self.read(photo), focal)
-            facts = read_photo_facts(photo)
+        picture, facts = self._take(photo, focal, watch)
         if has_guessed_focal(picture) or prepared.has_shape or facts.sha256 != first.source.pano_sha256:
             return first, ()
         known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
@@ -156,6 +152,14 @@ class OpenedScan:
             found = replace(found, focal_length=alone)
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
         return replace(self.add_localization(blank, found), gps_prior=first.gps_prior), names
+
+    def _take(self, photo: Photo, focal: FocalLength | None, watch: Stopwatch) -> tuple[Panorama, PhotoFacts]:
+        """Read a photo, with the focal length that other photos of its camera have, if that is known."""
+        with watch.stage("read"), reading_once():
+            picture = self.read(photo)
+            if focal is not None and focal.others_px is not None and focal.others_std_px is not None:
+                picture = picture.expect_focal(focal.others_px, focal.others_std_px / focal.others_px)
+            return picture, read_photo_facts(photo)
 
     def require_default_method(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
         """Return the map and settings; InputError for the preset paper, which does not have `what`."""
@@ -245,13 +249,6 @@ class OpenedScan:
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
 
 
-def expect_focal(picture: Panorama, focal: FocalLength | None) -> Panorama:
-    """Return a photo with the focal length that other photos of its camera have, if that is known."""
-    if focal is None or focal.others_px is None or focal.others_std_px is None:
-        return picture
-    return picture.expect_focal(focal.others_px, focal.others_std_px / focal.others_px)
-
-
 def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Photo) -> dict[str, object]:
     """Return the settings as a result's JSON has them."""
     labels = cloud_settings.labels and asdict(cloud_settings.labels)
@@ -282,20 +279,9 @@ def make_failed_result(
 
     `name` replaces the photo's path in the result.
     """
-    text, is_passing = describe_failure(error)
+    name = name or photo.name
     digest = None if isinstance(photo.picture, np.ndarray) else sha256_of(photo.path, photo.instant)
-    return unreadable_result(
-        text.replace(photo.name, name or photo.name),
-        scan.name,
-        name or photo.name,
-        is_passing,
-        settings=settings_json(settings, scan.cloud_settings, photo),
-        source=Source(scan.prepared.scan_sha256 or None, digest),
-    )
-
-
-def replace_settings(settings: Settings, given: dict[str, Any]) -> Settings:
-    """Return settings with options changed; InputError if the method has no such option."""
-    if unknown := given.keys() - {f.name for f in fields(settings)}:
-        raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
-    return replace(settings, **given)
+    source = Source(scan.prepared.scan_sha256 or None, digest)
+    about = {"settings": settings_json(settings, scan.cloud_settings, photo), "source": source}
+    text = describe_failure(error).replace(photo.name, name)
+    return unreadable_result(text, scan.name, name, is_passing(error), **about)

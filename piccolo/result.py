@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from .camera.files import read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
-from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
+from .errors import UNPRINTABLE, InputError, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose
 from .geometry.rotations import heading_pitch_roll_deg
@@ -289,19 +289,12 @@ def localization_of(result: Result) -> Localization:
     return Localization(pose=result.best_pose, **values)
 
 
-class Failure(NamedTuple):
-    """Why a photo has no result."""
-
-    text: str  # one line
-    is_passing: bool  # it may have one when it is tried again
-
-
-def describe_failure(error: Exception) -> Failure:
-    """Return the failure of a photo; an error of none, but of the program, is raised."""
+def describe_failure(error: Exception) -> str:
+    """Return in one line why a photo has no result; an error of none, but of the program, is raised."""
     if isinstance(error, OSError | InputError):
-        return Failure(text_of(error), is_passing(error))
+        return text_of(error)
     if is_shortage(error):
-        return Failure(f"not enough memory ({' '.join(str(error).split()) or 'none is left'})", True)
+        return f"not enough memory ({' '.join(str(error).split()) or 'none is left'})"
     raise error
 
 

@@ -36,24 +36,11 @@ def check_least(arguments: argparse.Namespace, **limits: float) -> None:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
 
 
-def check_alone(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
-    """Refuse options, by their names in `arguments`, that do not go with what is asked for."""
-    for name in others:
-        if is_given(arguments, name):
-            raise UsageError(f"--{name.replace('_', '-')}: not with {what}")
-
-
-def check_only_with(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
-    """Refuse options, by their names in `arguments`, that mean something only with what is not asked for."""
-    for name in others:
-        if is_given(arguments, name):
-            raise UsageError(f"--{name.replace('_', '-')}: only with {what}")
-
-
-def is_given(arguments: argparse.Namespace, name: str) -> bool:
-    """Return True for an option without a default, by its name in `arguments`, that was given."""
-    value = getattr(arguments, name)
-    return value is not None and value is not False
+def refuse_given(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:
+    """Refuse options without a default that are given, by their names in `arguments`."""
+    for name in options:
+        if getattr(arguments, name) not in (None, False):
+            raise UsageError(f"--{name.replace('_', '-')}: {why}")
 
 
 def check_outputs(outputs: Outputs, inputs: Iterable[Path] = ()) -> None:

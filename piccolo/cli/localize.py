@@ -204,12 +204,6 @@ def localize_all(
     return interruption
 
 
-def list_all_looks(run: Run, output: Output) -> list[Look]:
-    """Return which of the finished photos are to be looked at again."""
-    texts = follow_consensus(run, output) if run.looks_again else []
-    return [look for list_looks in LISTINGS for look in list_looks(texts)]
-
-
 def follow_consensus(run: Run, output: Output) -> Sequence[str]:
     """Change results by what all photos of a camera say of its focal length; return the lines."""
     settings = run.localizer.settings
@@ -339,7 +333,8 @@ def main(arguments: argparse.Namespace) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        looks = list_all_looks(run, output) if first is None else []
+        texts = follow_consensus(run, output) if first is None and run.looks_again else []
+        looks = [look for list_looks in LISTINGS for look in list_looks(texts)]
         if first is None and not looks:
             terminal.print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)

@@ -223,12 +223,8 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     if crs:
         check_crs(crs)
     channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
-    return CloudSettings(scale, arguments.up, channels, _labels_from(arguments), crs)
-
-
-def _labels_from(arguments: argparse.Namespace) -> Labels | None:
-    """Return how labels are to be read, None for colours."""
-    return None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
+    labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
+    return CloudSettings(scale, arguments.up, channels, labels, crs)
 
 
 def cache_from(arguments: argparse.Namespace) -> CachePolicy:

@@ -2,6 +2,7 @@
 
 import argparse
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 
 from ..errors import InputError
@@ -63,16 +64,10 @@ def settings_from(arguments: argparse.Namespace) -> ReportSettings:
     for number, *_ in arguments.own_plan:
         if not number.isdecimal():
             raise UsageError(f"--own-plan: found storey {number!r}, wanted a number, 1 for the lowest")
-    return ReportSettings(
-        title=arguments.title or "",
-        storeys=arguments.storeys,
-        images=arguments.images,
-        full_size=arguments.full_size,
-        self_contained=arguments.self_contained,
-        own_plans={int(k): (image, csv) for k, image, csv in arguments.own_plan},
-        crs=arguments.crs or "",
-        force=arguments.force,
-    )
+    own_plans = {int(k): (image, csv) for k, image, csv in arguments.own_plan}
+    names = {f.name for f in fields(ReportSettings)}
+    given = {name: value for name, value in vars(arguments).items() if name in names and value is not None}
+    return ReportSettings(own_plans=own_plans, **given)
 
 
 def check_files(arguments: argparse.Namespace) -> None:

@@ -37,7 +37,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..walk.motion import Motion
 from . import terminal
-from .checks import UsageError, check_alone, check_only_with
+from .checks import UsageError, refuse_given
 from .execution import EXIT_SOME_NOT, Interruption, choose_exit_code, interruptible, print_result
 from .options import DEFAULT_EVERY
 
@@ -55,17 +55,17 @@ def check_joint_options(arguments: argparse.Namespace) -> None:
     """Refuse options that do not go with photos that help each other, or with each other."""
     a = arguments
     if not a.video:
-        check_only_with(a, "--video", ("every",))
+        refuse_given(a, ("every",), "only with --video")
     if not (a.walk or a.video):
         if not a.pano:
             raise UsageError("the following arguments are required: --pano")
-        check_only_with(a, "--walk or --video", ONLY_WITH_WALKS)
+        refuse_given(a, ONLY_WITH_WALKS, "only with --walk or --video")
     elif bool(a.video) == bool(a.pano):
         raise UsageError("--walk, --video: wanted --walk with --pano, or --video alone")
     asked = {"a video": a.video, "a walk": a.walk or a.video, "--relative": a.relative}
     asked["--color-scan"] = a.color_scan
     for what in (what for what, is_asked in asked.items() if is_asked):
-        check_alone(a, what, NOT_WITH[what])
+        refuse_given(a, NOT_WITH[what], f"not with {what}")
     if (a.walk or a.color_scan) and is_from_stdin(a.pano):
         option = "--walk" if a.walk else "--color-scan"
         raise UsageError(f"{option}: found names on stdin, wanted files or folders")

@@ -250,7 +250,7 @@ def localize_queries(
         try:
             executor, localizer = stack.enter_context(place)
         except Exception as error:
-            print_error(arguments, f"{scene.name}: {describe_failure(error).text}", EXIT_BAD_INPUT)
+            print_error(arguments, f"{scene.name}: {describe_failure(error)}", EXIT_BAD_INPUT)
             return
         tasks = (localizer.task((has_labels and q.labels) or q.image, q.calibration) for q in queries)
 

@@ -11,7 +11,7 @@ import numpy as np
 from piccolo import scene as scenes
 from piccolo.camera import Calibration
 from piccolo.camera.files import read_cameras
-from piccolo.cli.checks import UsageError, check_folder_name, check_least, check_only_with, checking_options
+from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
 from piccolo.cli.command import command, option
 from piccolo.cli.terminal import workers_from
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
@@ -102,7 +102,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
     if not arguments.walk:
-        check_only_with(arguments, "--walk", [name for name in OF_WALKS if getattr(arguments, name)])
+        refuse_given(arguments, [name for name in OF_WALKS if getattr(arguments, name)], "only with --walk")
     if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
     if arguments.walk and (arguments.labels or arguments.camera):
