@@ -1,7 +1,7 @@
 """A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -29,14 +29,6 @@ from .walk.second_look import finish
 from .walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
-
-
-@dataclass(frozen=True)
-class Kept:
-    """A frame as it is kept on disk until the walk is finished."""
-
-    blank: str  # its result without a pose, as JSON
-    frame: Frame
 
 
 class Prepared(NamedTuple):
@@ -151,17 +143,18 @@ class Walk:
         """Return what is known of the last frame on one line, for `restore`."""
         from msgspec import to_builtins  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = Kept(self.blanks[-1].to_json(), self.tracker.frames[-1])
+        kept = self.blanks[-1].to_json(), self.tracker.frames[-1]
         return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
 
     def restore(self, text: str, photo: Photo) -> None:
         """Take the next frame, of a photo, from a text of `last_to_json`; ValueError if it is none."""
         from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = convert(json.loads(text), Kept, dec_hook=lambda _, rows: np.array(rows))
+        kept = tuple[str, Frame]
+        blank, frame = convert(json.loads(text), kept, dec_hook=lambda _, rows: np.array(rows))
         self.photos.append(photo)
-        self.blanks.append(replace(Result.from_json(kept.blank), settings=self.settings_of(photo)))
-        self.tracker.accept(kept.frame)
+        self.blanks.append(replace(Result.from_json(blank), settings=self.settings_of(photo)))
+        self.tracker.accept(frame)
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""

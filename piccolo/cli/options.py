@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from .. import __version__
-from ..batch.frame_times import EXIF, NAMES, ORDER
+from ..batch.inputs import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
 from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis, check_crs
 from ..errors import InputError

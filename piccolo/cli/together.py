@@ -14,8 +14,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from ..batch.frame_times import times_of
-from ..batch.inputs import is_from_stdin
+from ..batch.inputs import is_from_stdin, times_of
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import find_scale, read_odometry, read_relative_poses
 from ..batch.results_file import WAYS, Records, write_results

@@ -39,7 +39,6 @@ from piccolo.scene import Query, Scene, find_scenes, input_files
 from . import query_result, tables
 from .plots import errors_figure, figure_png, risk_figure
 from .query_result import QueryResult, Thresholds
-from .walks import alone_table, group_walks, walk_table
 
 EPILOG = """\
 examples:
@@ -110,8 +109,8 @@ def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: 
         found.append(tables.summary_table(inside, thresholds, title))
     found.append(tables.threshold_table(rows, thresholds))
     found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
-    if walks := group_walks(scenes, rows):
-        found += [walk_table(walks, thresholds), alone_table(walks, thresholds)]
+    if walks := tables.group_walks(scenes, rows):
+        found += [tables.walk_table(walks, thresholds), tables.alone_table(walks, thresholds)]
     return "\n".join(table.markdown() for table in found)
 
 
