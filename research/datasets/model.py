@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo import InputError, Pose
 from piccolo.arrays import Array
-from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
 
 Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
 

@@ -16,15 +16,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy.ndimage import minimum_filter
 
+from piccolo import InputError, Pose
 from piccolo.arrays import Array, Int64s, Mask
 from piccolo.cli.checks import check_outputs, check_suffix, checking_options
 from piccolo.cli.command import command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
 from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
-from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss

@@ -16,6 +16,7 @@ from zlib import crc32
 import cv2
 import numpy as np
 
+from piccolo import CoarseToFineSettings, InputError, PaperSettings, Photo
 from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
 from piccolo.cli.checks import check_distinct, check_folder_name, check_least, checking_options
@@ -26,16 +27,12 @@ from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
 from piccolo.cloud import read_cloud
 from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
-from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
 from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.geometry.rotations import random_rotation
 from piccolo.jobs.memory import limit_memory
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
-from piccolo.paper.settings import PaperSettings
-from piccolo.photo import Photo
 from piccolo.scan_map.open_map import CachePolicy
 from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 

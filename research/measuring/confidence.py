@@ -7,6 +7,7 @@ from itertools import chain
 
 import numpy as np
 
+from piccolo import CoarseToFineSettings, Photo
 from piccolo.cli.command import option
 from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
@@ -15,9 +16,7 @@ from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import is_correct
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scene import Scene, document_of_pose, read_scene
 

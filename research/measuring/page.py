@@ -15,19 +15,16 @@ import numpy as np
 from scipy.stats import chi2
 
 import piccolo
+from piccolo import InputError, PaperSettings, Pose, Result
 from piccolo.arrays import Bytes
 from piccolo.cli.checks import check_least
 from piccolo.cli.command import option
 from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
-from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import subtract
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.panorama import read_panorama
-from piccolo.paper.settings import PaperSettings
-from piccolo.result import Result
 from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.query_result import QueryResult

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
-from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
 
 from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
