@@ -38,7 +38,6 @@ from .scan_map.gps import GpsPrior, gps_prior
 from .scan_map.named_scans import add_places, check_within
 from .scan_map.scan_map import ScanMap
 
-OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
@@ -85,7 +84,11 @@ class OpenedScan:
         self.check_options(photo, settings)
         picture, facts = self._take(photo, focal, watch)
         gps = None
-        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+        if isinstance(self.prepared, PaperMap):
+            assert isinstance(settings, PaperSettings)
+            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
+        else:
+            assert isinstance(settings, CoarseToFineSettings)
             gps = self.make_gps_prior(facts, settings.prior)
             run = localize_guessed if has_guessed_focal(picture) else localize
             found = Localization()
@@ -95,10 +98,6 @@ class OpenedScan:
             if found.status != LOCALIZED:
                 gps = gps and replace(gps, is_used=False)
                 found = run(self.prepared, picture, settings, self.workers, watch)
-        elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
-            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
-        else:
-            raise InputError(OTHER_METHOD)
         if focal is not None:
             found = replace(found, focal_length=focal.after(found.focal_length))
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
@@ -275,10 +274,7 @@ def labels_of(result: Result) -> Labels | None:
 def make_failed_result(
     scan: OpenedScan, photo: Photo, error: Exception, settings: Settings, name: str | None = None
 ) -> Result:
-    """Return the result of a photo that raised an error; an error in the program is raised again.
-
-    `name` replaces the photo's path in the result.
-    """
+    """Return the result of a photo, by `name`, that raised an error; one in the program is raised again."""
     name = name or photo.name
     digest = None if isinstance(photo.picture, np.ndarray) else sha256_of(photo.path, photo.instant)
     source = Source(scan.prepared.scan_sha256 or None, digest)

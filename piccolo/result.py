@@ -363,10 +363,7 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
 
 
 def _parse_result(text: str) -> Result:
-    """Return a result of one line.
-
-    Refused are names and numbers that can't be written.
-    """
+    """Return the result of a line; names and numbers that can't be written are refused."""
     result = Result.from_json(text)
     texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
     for label, value in texts.items():

@@ -39,7 +39,6 @@ def list_panoramas(
 
     A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
     pictures in it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.
-
     Raises InputError if a list can't be read, or a folder holds no picture.
     """
     for word in words:
@@ -80,10 +79,7 @@ def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool])
 
 
 def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[Path, bool]]:
-    """Yield a folder and those in it, and whether each is one panorama.
-
-    By a link only what has no other name.
-    """
+    """Yield a folder and those in it, by a link only what has no other name; and if each is one panorama."""
     waiting = deque([top])
     seen = set[tuple[int, int]]()
     while waiting:
@@ -111,9 +107,7 @@ def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
     """Seconds of each frame, by the clock of its source; None where only their order counts.
 
     By EXIF, by the last number in each name, or by a table; without a source by EXIF if it tells the times of
-    all frames, one after another.
-
-    Raises InputError if the source lacks a frame, or its times do not rise.
+    all frames, one after another. Raises InputError if the source lacks a frame, or its times do not rise.
     """
     if source == ORDER:
         return None

@@ -88,7 +88,6 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
     [deg], height [m] above the floor, gravity_x, gravity_y, gravity_z (down, in the camera's axes, of any
     length), within (names of the map's scans, with semicolons between them).
-
     Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
     rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")

@@ -134,10 +134,7 @@ def executing(
     cluster: Cluster | None,
     open_scan: Callable[[Localizer, int], OpenedScan],
 ) -> Iterator[tuple[Executor, Localizer]]:
-    """Yield an executor, and the localizer for it.
-
-    `open_scan` prepares the scan before, with so many threads.
-    """
+    """Yield an executor, and the localizer for it; `open_scan` prepares the scan, with so many threads."""
     is_kept = localizer.cache.is_used
     with ExitStack() as stack:
         if not is_kept and (cluster or num_jobs > 1):  # others will open what is prepared here

@@ -350,10 +350,7 @@ def query_near(query: Query, pose: Pose, radius: float) -> Query:
 
 
 def find_places(query: Query, own: Pose) -> list[Place]:
-    """Find the distinct poses in the map that look like a photo, best first, beside its own pose.
-
-    They have the tilt of that, and any heading.
-    """
+    """Find the distinct poses, of the tilt of its own, that look like a photo beside that; best first."""
     ends = descend_briefly(query_near(query, own, math.inf))
     return list_places(query, ends, score_near(query, own))
 

@@ -81,10 +81,8 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers) -> Check:
 def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
     """Return the pose under each convention that may have been mixed up, by its name.
 
-    Positions are less `origin`.
-
     The camera's axes in any order and sign; and the rotation, or the whole transform, of a camera with known
-    axes inverted.
+    axes inverted. Positions are less `origin`.
     """
     inverted = {"": pose}
     for axes, other_from_cam in AXES.items():
