@@ -1,6 +1,6 @@
 """Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -43,7 +43,7 @@ keeps its other properties and faces. Prints one JSON object to stdout; without 
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py")
     option(parser, "--out FILE", "write the rotated cloud to this PLY file; - is stdout")
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--pano FILE", "localize this upright photo in the scan, and take its up direction")
 
 
-def check_arguments(a: argparse.Namespace) -> None:
+def check_arguments(a: Namespace) -> None:
     """Refuse options that do not go together."""
     refusals = {
         "--queries needs --out": a.queries and not a.out,
@@ -69,7 +69,7 @@ def check_arguments(a: argparse.Namespace) -> None:
 
 
 def find_known_up(
-    arguments: argparse.Namespace, cloud: CloudStream, evident: Array | None, reason: str
+    arguments: Namespace, cloud: CloudStream, evident: Array | None, reason: str
 ) -> tuple[Array | None, str]:
     """Return the direction (3,) that is up, None if that is not known, and why.
 
@@ -97,7 +97,7 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     return up, f"{photo} is {result.status}"
 
 
-def find(arguments: argparse.Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
+def find(arguments: Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
     """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on.
 
     It is the least turn that makes z up, and with --yaw-walls the least further one about z, about the middle
@@ -130,7 +130,7 @@ def find(arguments: argparse.Namespace, cloud: CloudStream) -> tuple[Array, dict
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 up is not known")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Find a transform, write what is sure; returns the exit code."""
     with checking_options():
         check_arguments(arguments)

@@ -1,9 +1,9 @@
 """Options that make no sense, and outputs that can't be written, are refused before any work."""
 
-import argparse
 import math
 import os
 import stat
+from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -28,7 +28,7 @@ def checking_options() -> Iterator[None]:
         raise UsageError(str(error)) from error
 
 
-def check_least(arguments: argparse.Namespace, **limits: float) -> None:
+def check_least(arguments: Namespace, **limits: float) -> None:
     """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
     for name, limit in limits.items():
         value = getattr(arguments, name, None)
@@ -36,7 +36,7 @@ def check_least(arguments: argparse.Namespace, **limits: float) -> None:
             raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
 
 
-def refuse_given(arguments: argparse.Namespace, options: Sequence[str], why: str) -> None:
+def refuse_given(arguments: Namespace, options: Sequence[str], why: str) -> None:
     """Refuse options without a default that are given, by their names in `arguments`."""
     for name in options:
         if getattr(arguments, name) not in (None, False):

@@ -1,6 +1,6 @@
 """Colour a scan by photos that were localized in it."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 
 from ..coloring.color_scan import check_suffix, write_colored_scan
 from ..localization.settings import CoarseToFineSettings
@@ -23,7 +23,7 @@ point as the property `photos`, LAS and LAZ as user data. Prints one JSON object
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     add_cloud_options(parser, "files of the scan in which the photos were localized")
@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, align, paint, write; returns the exit code."""
     with checking_options():
         settings = cloud_settings_from(arguments)

@@ -1,9 +1,9 @@
 """The work of a batch: in this process, several, or a cluster, until a signal ends it."""
 
-import argparse
 import os
 import signal
 import sys
+from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -65,7 +65,7 @@ def advise(result: Result) -> list[str]:
     return [f"  it fits nowhere well: another scan{lens}, or bare walls?"]
 
 
-def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequence[str]) -> None:
+def print_result(arguments: Namespace, result: Result, warnings: Sequence[str]) -> None:
     """Print an error; or, unless --quiet, what was found, the warnings, and what to do if it is doubtful."""
     if result.error is not None:
         print_error(arguments, result.error, EXIT_BAD_INPUT)
@@ -77,7 +77,7 @@ def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequen
         tqdm.write(line, file=sys.stderr)
 
 
-def check_execution(arguments: argparse.Namespace) -> None:
+def check_execution(arguments: Namespace) -> None:
     """Refuse options that do not go together."""
     if is_remote(arguments) and arguments.jobs not in (None, 1):
         raise UsageError(f"--jobs: not with --dask {arguments.dask}, whose scheduler starts the workers")
@@ -85,12 +85,12 @@ def check_execution(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--mask {arguments.mask}: wanted an absolute path with --dask {arguments.dask}")
 
 
-def is_remote(arguments: argparse.Namespace) -> bool:
+def is_remote(arguments: Namespace) -> bool:
     """Return True if a cluster that others have begun does the work."""
     return arguments.dask not in (None, LOCAL)
 
 
-def count_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
+def count_jobs(arguments: Namespace, num_left: int | None) -> int:
     """Return the processes asked for, or as many as are worth their start for `num_left` photos, if known."""
     if arguments.jobs is not None:
         return int(min(arguments.jobs, num_left or arguments.jobs))
@@ -99,7 +99,7 @@ def count_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
     return max(1, min(num_cores(), num_left // PHOTOS_OF_A_JOB))
 
 
-def count_fitting(arguments: argparse.Namespace, num_jobs: int) -> int:
+def count_fitting(arguments: Namespace, num_jobs: int) -> int:
     """Return how many of the processes memory is left for; called where one has what each will need."""
     if arguments.jobs is not None:
         return num_jobs
@@ -107,7 +107,7 @@ def count_fitting(arguments: argparse.Namespace, num_jobs: int) -> int:
     return max(1, min(num_jobs, int((memory_left() + taken) // (taken + QUERY_MEMORY))))
 
 
-def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
+def share_of_a_job(arguments: Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
     """Return the localizer of one of some processes, which divide cores and --max-memory."""
     if is_remote(arguments):
         return replace(localizer, num_threads=arguments.threads or 1, max_memory=arguments.max_memory)
@@ -118,7 +118,7 @@ def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs
     return replace(localizer, num_threads=num_threads, max_memory=memory)
 
 
-def connecting(arguments: argparse.Namespace, num_jobs: int) -> AbstractContextManager[Cluster | None]:
+def connecting(arguments: Namespace, num_jobs: int) -> AbstractContextManager[Cluster | None]:
     """Return the cluster of --dask; None without."""
     if not arguments.dask:
         return nullcontext()
@@ -128,7 +128,7 @@ def connecting(arguments: argparse.Namespace, num_jobs: int) -> AbstractContextM
 
 @contextmanager
 def executing(
-    arguments: argparse.Namespace,
+    arguments: Namespace,
     localizer: Localizer,
     num_jobs: int,
     cluster: Cluster | None,
@@ -156,7 +156,7 @@ def executing(
 
 
 def at_the_workers(
-    arguments: argparse.Namespace, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
+    arguments: Namespace, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
 ) -> Localizer:
     """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()
@@ -203,7 +203,7 @@ class Interruption:
         finally:
             self.is_at_work = False
 
-    def stop(self, arguments: argparse.Namespace, done: str, is_kept: bool) -> int:
+    def stop(self, arguments: Namespace, done: str, is_kept: bool) -> int:
         """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
         same = "the same command"
         how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
@@ -241,10 +241,7 @@ def answer_all(
     interruption: Interruption | None = None,
     cloud_sha256: str | None = None,
 ) -> Iterator[Answer]:
-    """Yield the answers to tasks, in their order.
-
-    `show` wraps the tasks as they are done. After a signal come those that are done already.
-    """
+    """Yield the answers to tasks in order, after a signal those that are done; `show` wraps the tasks."""
     values = executor.values(tasks)
     pairs = show(values)
     for task, wait in interruption.each(pairs, values.take_finished()) if interruption else pairs:

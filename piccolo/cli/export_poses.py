@@ -1,6 +1,6 @@
 """Write the poses of localize.py for other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,7 +35,7 @@ EXIT_CODES = "0 done, 1 pictures that the format can't hold were left out"
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options. One that is not given stays None, and keeps its default."""
     source = parser.add_mutually_exclusive_group(required=True)
     option(source, "--results FILE ...", "results of localize.py, JSON lines", default=[])
@@ -61,7 +61,7 @@ def _takers(option: str) -> str:
     return ", ".join(form.name for form in FORMATS.values() if option in form.options)
 
 
-def options_from(arguments: argparse.Namespace) -> Options:
+def options_from(arguments: Namespace) -> Options:
     """Return the options given; one that the format does not take is refused."""
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     form = FORMATS[arguments.format]
@@ -84,7 +84,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         yield f"poses in {num_clouds} clouds are assumed to be in one coordinate system; --cloud selects"
 
 
-def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:
+def check_content(arguments: Namespace, results: Sequence[Result]) -> Iterable[str]:
     """Yield notes on results of other clouds than those chosen; without --force they are refused."""
     for cloud in dict.fromkeys(result.cloud for result in results if result.cloud_name in arguments.cloud):
         paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
@@ -96,7 +96,7 @@ def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> I
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, EXIT_CODES)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, choose, write; returns the exit code."""
     with checking_options():
         options = options_from(arguments)

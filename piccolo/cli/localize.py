@@ -1,9 +1,9 @@
 """Command line: a coloured scan and photos in, camera poses out."""
 
-import argparse
 import itertools
 import os
 import sys
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -57,7 +57,7 @@ Write = Callable[[str], object]
 class Run:
     """A command's batch, and what it has done so far."""
 
-    arguments: argparse.Namespace
+    arguments: Namespace
     localizer: Localizer
     panoramas: Iterable[Path]
     total: int | None  # of the panoramas; None if they come on standard input
@@ -73,7 +73,7 @@ class Run:
         return is_default and self.total not in (None, 1) and not self.localizer.sends_photos
 
 
-def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
+def check_files(arguments: Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
     a = arguments
     given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative, a.odometry))
@@ -94,7 +94,7 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
         check_output(path)
 
 
-def prepare_run(arguments: argparse.Namespace) -> Run:
+def prepare_run(arguments: Namespace) -> Run:
     """Return what is to be done: the options, the panoramas, and how many there are."""
     with checking_options():
         check_arguments(arguments)
@@ -125,7 +125,7 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     return Run(arguments, localizer, known, len(known), left_out, Counter())
 
 
-def note_unused_priors(arguments: argparse.Namespace, localizer: Localizer) -> None:
+def note_unused_priors(arguments: Namespace, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
     if localizer.priors and (names := localizer.priors.names_without_panorama):
         note = f"{len(names)} names without a photo, such as {names[0]}"
@@ -314,7 +314,7 @@ def run_jointly(run: Run) -> int:
 
 
 @command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
     watch = Stopwatch()
     run = prepare_run(arguments)

@@ -1,6 +1,6 @@
 """Prepare the map of a cloud: a file that localize.py takes instead of the cloud."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 
 from ..jobs.threads import Stopwatch
 from ..scan_map.named_scans import check_name, name_scan
@@ -23,7 +23,7 @@ Prints one JSON object that describes the map to stdout.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py")
     text = "add the scan to this map with the same coordinate system; only changed parts are prepared again"
@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Build and write the map; returns the exit code."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)

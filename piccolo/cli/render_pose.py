@@ -1,6 +1,6 @@
 """Render the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
@@ -71,7 +71,7 @@ class Shot(NamedTuple):
     camera: Camera | None  # None for a sphere
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     group = parser.add_argument_group("pose, one of")
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--animate FILE", text)
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
+def check_usage(arguments: Namespace) -> None:
     """Refuse options that make no sense, whatever the files hold."""
     cloud_settings_from(arguments)
     if not (arguments.out or arguments.animate):
@@ -108,7 +108,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     check_pose_options(arguments)
 
 
-def check_pose_options(arguments: argparse.Namespace) -> None:
+def check_pose_options(arguments: Namespace) -> None:
     """Refuse options that do not go with where the pose is from."""
     angles = [arguments.heading, arguments.pitch, arguments.roll]
     if not arguments.at and any(angle is not None for angle in angles):
@@ -119,7 +119,7 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
         raise InputError("--at and angles must be finite numbers")
 
 
-def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+def outputs_of(arguments: Namespace) -> dict[str, Path | None]:
     """Return the outputs by option."""
     return {name: getattr(arguments, name[2:].replace("-", "_")) for name in SUFFIXES}
 
@@ -134,7 +134,7 @@ def suffix_of(option: str, path: Path) -> str:
     return SUFFIXES[option][0] if is_stream(path) else path.suffix.lower()
 
 
-def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
+def check_files(arguments: Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     given = (arguments.result, arguments.queries, arguments.pose, arguments.camera)
     photos = [find_photo(arguments, shot.pano) for shot in poses]
@@ -143,12 +143,12 @@ def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
         (check_output_folder if is_folder(path) else check_output)(path)
 
 
-def find_photo(arguments: argparse.Namespace, name: str) -> Path:
+def find_photo(arguments: Namespace, name: str) -> Path:
     """Return the panorama that a pose's file names."""
     return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
 
-def poses_from(arguments: argparse.Namespace) -> list[Shot]:
+def poses_from(arguments: Namespace) -> list[Shot]:
     """Return poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
     given = read_calibration(arguments.camera).mounts if arguments.camera else ()
     if len(given) > 1:
@@ -206,9 +206,7 @@ def depth_file(depth: Array32, suffix: str) -> bytes:
     return file.getvalue()
 
 
-def draw_pictures(
-    arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers
-) -> None:
+def draw_pictures(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
     """Write the pictures; one JSON line each."""
     is_many = is_folder(arguments.out)
     names = [f"{Path(shot.pano).stem}.png" for shot in poses] if is_many else [arguments.out.name]
@@ -238,7 +236,7 @@ def draw_pictures(
         print_report(arguments, outputs_of(arguments), line)
 
 
-def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
+def animate(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
     """Write the descent towards the pose; one JSON line."""
     ((name, pose, camera),) = poses
     if camera is not None:
@@ -266,7 +264,7 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)

@@ -1,6 +1,6 @@
 """Write a web page of results: plans of the storeys, photos as spheres, the scan seen from their poses."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 from collections import Counter
 from dataclasses import fields
 from pathlib import Path
@@ -34,7 +34,7 @@ scan's coordinates), and two rows or more. Prints one JSON object to stdout.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
@@ -53,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--cache FOLDER", CACHE_TEXT)
 
 
-def settings_from(arguments: argparse.Namespace) -> ReportSettings:
+def settings_from(arguments: Namespace) -> ReportSettings:
     """Return what the options ask for; those that make no sense are refused."""
     check_least(arguments, jobs=1)
     if not (arguments.out or arguments.plan):
@@ -70,7 +70,7 @@ def settings_from(arguments: argparse.Namespace) -> ReportSettings:
     return ReportSettings(own_plans=own_plans, **given)
 
 
-def check_files(arguments: argparse.Namespace) -> None:
+def check_files(arguments: Namespace) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     own = [Path(name) for _, *names in arguments.own_plan for name in names]
     inputs = [*arguments.results, *arguments.cloud, *own]
@@ -85,7 +85,7 @@ def check_files(arguments: argparse.Namespace) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, draw, write; returns the exit code."""
     with checking_options():
         settings = settings_from(arguments)

@@ -1,10 +1,10 @@
 """Output of a command: results on stdout; errors, warnings and progress, which vanishes, on stderr."""
 
-import argparse
 import json
 import logging
 import sys
 import traceback
+from argparse import Namespace
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -26,7 +26,7 @@ STEPS = {"find free space": 1, "render views": 2, "find features": 3, "sort feat
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 
 
-def print_error(arguments: argparse.Namespace, text: str, exit_code: int) -> int:
+def print_error(arguments: Namespace, text: str, exit_code: int) -> int:
     """One line on stderr, with --debug after the traceback of the error at hand; returns the exit code."""
     if arguments.debug and sys.exc_info()[0]:
         traceback.print_exc()
@@ -34,19 +34,19 @@ def print_error(arguments: argparse.Namespace, text: str, exit_code: int) -> int
     return exit_code
 
 
-def print_note(arguments: argparse.Namespace, text: str) -> None:
+def print_note(arguments: Namespace, text: str) -> None:
     """One line on stderr, but not with --quiet."""
     if not arguments.quiet:
         tqdm.write(f"{arguments.program}: {for_terminal(printable(text))}", file=sys.stderr)
 
 
-def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
+def print_warnings(arguments: Namespace, warnings: Iterable[str]) -> None:
     """Print a line on stderr for each warning, unless --quiet."""
     for warning in warnings:
         print_note(arguments, f"warning: {warning}")
 
 
-def print_report(arguments: argparse.Namespace, outputs: Outputs, report: Mapping[str, object] | str) -> None:
+def print_report(arguments: Namespace, outputs: Outputs, report: Mapping[str, object] | str) -> None:
     """Print JSON, or text, on stdout; on stderr, without --quiet, where one of the outputs is stdout."""
     text = report if isinstance(report, str) else f"{json.dumps(report, allow_nan=False)}\n"
     if not any(path and is_stdout(path) for path in outputs.values()):
@@ -55,7 +55,7 @@ def print_report(arguments: argparse.Namespace, outputs: Outputs, report: Mappin
         print(text, end="", file=sys.stderr)
 
 
-def workers_from(arguments: argparse.Namespace, num_threads: int | None = None) -> Workers:
+def workers_from(arguments: Namespace, num_threads: int | None = None) -> Workers:
     """Return workers, by default one a core, whose progress and warnings are shown, or not with --quiet."""
     show = progress_bar(arguments.quiet)
     return Workers(num_threads or num_cores(), show, warn_once(arguments.quiet))

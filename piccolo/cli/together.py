@@ -3,8 +3,8 @@
 Results are written when all are known. Until then the steps of the job are kept beside them.
 """
 
-import argparse
 import json
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -50,7 +50,7 @@ ONLY_WITH_WALKS = ("times", "max_speed", "odometry")
 NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
 
 
-def check_joint_options(arguments: argparse.Namespace) -> None:
+def check_joint_options(arguments: Namespace) -> None:
     """Refuse options that do not go with photos that help each other, or with each other."""
     a = arguments
     if not a.video:
@@ -85,7 +85,7 @@ class Job(NamedTuple):
     output: Path | None = None  # that is written beside the results
 
 
-def run_together(arguments: argparse.Namespace, job: Job) -> int:
+def run_together(arguments: Namespace, job: Job) -> int:
     """Do a job, or what an earlier run has left of it; write and print the results, return the exit code."""
     out = arguments.out
     path = steps_file(out)
@@ -134,7 +134,7 @@ def is_finished(out: Path, job: Job) -> bool:
 
 
 def make_bundle_job(
-    arguments: argparse.Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
+    arguments: Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
 ) -> Job:
     """Return the job of localizing photos as one camera, by --relative; a stopped one begins again."""
     poses = read_relative_poses(arguments.relative, photos)
@@ -156,7 +156,7 @@ def make_bundle_job(
 
 
 def make_coloring_job(
-    arguments: argparse.Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
+    arguments: Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
 ) -> Job:
     """Return the job of localizing photos in the colours of the others, and of colouring the scan by them.
 
@@ -212,12 +212,9 @@ class WalkInput(NamedTuple):
 
 @contextmanager
 def walk_frames(
-    arguments: argparse.Namespace, photo: Photo, panoramas: Sequence[Path]
+    arguments: Namespace, photo: Photo, panoramas: Sequence[Path]
 ) -> Iterator[tuple[list[WalkInput], Motion]]:
-    """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried.
-
-    `photo` has the options of all.
-    """
+    """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
     with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
         times = None
         if arguments.video:
@@ -239,7 +236,7 @@ def walk_frames(
         yield frames, Motion(max_speed=arguments.max_speed, is_timed=is_timed)
 
 
-def make_walk_job(arguments: argparse.Namespace, frames: Sequence[WalkInput], walk: Walk) -> Job:
+def make_walk_job(arguments: Namespace, frames: Sequence[WalkInput], walk: Walk) -> Job:
     """Return the job of localizing the frames of a walk."""
     if arguments.odometry:
         walk.more_settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
@@ -260,7 +257,7 @@ def make_walk_job(arguments: argparse.Namespace, frames: Sequence[WalkInput], wa
 
 
 def follow_all(
-    arguments: argparse.Namespace, walk: Walk, frames: Sequence[WalkInput], journal: Journal
+    arguments: Namespace, walk: Walk, frames: Sequence[WalkInput], journal: Journal
 ) -> Interruption:
     """Follow the frames, and keep what was found of each; say why one can't be read."""
     steps = (frame.step(sha256_of(frame.photo.path, frame.photo.instant)) for frame in frames)

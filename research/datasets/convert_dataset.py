@@ -1,10 +1,10 @@
 """Write research datasets, or your own panoramas with known poses, as scenes that tools/evaluate.py reads."""
 
-import argparse
 import json
 import math
 import os
 import shutil
+from argparse import ArgumentParser, Namespace
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields
@@ -57,7 +57,7 @@ A scene with a damaged file is left out and named on stderr. Prints one JSON obj
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options; those that one dataset alone has are in its own subparser."""
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     for name, (description, _) in DATASETS.items():
@@ -73,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_run_options(one)
 
 
-def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
+def add_own_options(parser: ArgumentParser, dataset: str) -> None:
     """Add the options of one dataset alone; of `generic` those where the list has no column."""
     if dataset == "stanford2d3ds":
         option(parser, "--areas 1-6 ...", "only these areas", default=[])
@@ -199,7 +199,7 @@ def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, copi
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
     check_least(arguments, check=0, seed=0)
     check_folder_name("--out", arguments.out)
@@ -215,7 +215,7 @@ def main(arguments: argparse.Namespace) -> int:
     return max((convert_scene(spec, arguments, workers) for spec in specs), default=0)
 
 
-def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, workers: Workers) -> int:
+def convert_scene(spec: SceneSpec, arguments: Namespace, workers: Workers) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
         written = write_scene(spec, arguments.out, arguments.copy, workers.show)

@@ -1,8 +1,8 @@
 """Localize the panoramas of scenes with true poses, and measure the errors of the poses."""
 
-import argparse
 import json
 import signal
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
@@ -59,7 +59,7 @@ and the exit code is 3.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     group = parser.add_argument_group("input and output")
     option(group, "--scenes FOLDER ...", "scenes with true poses")
@@ -83,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_execution_options(parser, default_jobs=1)
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
+def check_usage(arguments: Namespace) -> None:
     """Refuse options that do not go together, and values that are wrong whatever the files hold."""
     if (arguments.scenes is None) == (arguments.compare is None):
         raise UsageError("--scenes: needed with --out and --results, not with --compare")
@@ -115,7 +115,7 @@ def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: 
 
 
 def write_report(
-    arguments: argparse.Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
+    arguments: Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
 ) -> None:
     """Print the tables of one run or two, and write them and the plot of their errors if asked for."""
     if arguments.markdown:
@@ -125,7 +125,7 @@ def write_report(
     print_report(arguments, outputs_of(arguments), text)
 
 
-def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
+def compare(arguments: Namespace, thresholds: Thresholds) -> int:
     """Print two runs side by side."""
     runs = [query_result.read_run(path)[0] for path in arguments.compare]
     if arguments.variants:
@@ -143,12 +143,12 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     return 0
 
 
-def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+def outputs_of(arguments: Namespace) -> dict[str, Path | None]:
     """Return the files beside a run, by option."""
     return {f"--{name}": getattr(arguments, name) for name in ("csv", "markdown", "errors", "risk")}
 
 
-def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
+def check_files(arguments: Namespace, inputs: list[Path]) -> None:
     """Refuse outputs that would replace an input, a run or each other."""
     given = arguments.results, arguments.mask, arguments.camera, arguments.rig
     more = filter(None, (*given, *(arguments.compare or ())))
@@ -156,7 +156,7 @@ def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
     check_outputs(outputs_of(arguments))
 
 
-def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: argparse.Namespace) -> None:
+def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: Namespace) -> None:
     """Refuse results of other content than the scenes' clouds have, or with --force say so."""
     for scene in scenes:
         results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
@@ -167,11 +167,7 @@ def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments
 
 
 def run_scenes(
-    arguments: argparse.Namespace,
-    path: Path,
-    config: Localizer,
-    scenes: Sequence[Scene],
-    variants: Sequence[str],
+    arguments: Namespace, path: Path, config: Localizer, scenes: Sequence[Scene], variants: Sequence[str]
 ) -> tuple[list[QueryResult], int]:
     """Localize the queries that a run does not have yet; `config` is for any scan, no variants are all.
 
@@ -212,7 +208,7 @@ def run_scenes(
     return own, len(keys) - len(own)
 
 
-def select_labelled(arguments: argparse.Namespace, scene: Scene, queries: Sequence[Query]) -> list[Query]:
+def select_labelled(arguments: Namespace, scene: Scene, queries: Sequence[Query]) -> list[Query]:
     """Return the queries that have labels; say which have none."""
     for query in queries:
         if query.labels is None:
@@ -222,7 +218,7 @@ def select_labelled(arguments: argparse.Namespace, scene: Scene, queries: Sequen
 
 
 def localize_queries(
-    arguments: argparse.Namespace,
+    arguments: Namespace,
     config: Localizer,
     scene: Scene,
     queries: Sequence[Query],
@@ -266,7 +262,7 @@ def localize_queries(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Run or read the results, print the tables; returns the exit code."""
     check_usage(arguments)
     with checking_options():

@@ -7,9 +7,9 @@ Kim et al. (ICCV 2021) show such a surface to argue that their loss has a deep, 
 with L over the points that a camera at (x, y, z) sees, and the same rotations at each place.
 """
 
-import argparse
 import math
 import time
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -172,7 +172,7 @@ NUM_ROTATIONS = 1000  # of SO(3)
 HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     option(parser, "--pano FILE", "the panorama", required=True)
@@ -184,7 +184,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--gravity", text, choices=["known", "unknown"], default="known")
 
 
-def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
+def read_known_poses(arguments: Namespace, cloud: LocalCloud) -> KnownPoses:
     """Return the pose found and the true one of the panorama, as far as files are given."""
     name = arguments.pano.name
     known: KnownPoses = {}
@@ -201,7 +201,7 @@ def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownP
     return known
 
 
-def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
+def grid_from(arguments: Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
     """Return the poses to try over all of the cloud, in the frame of the points."""
     points = cloud.points
     ends = [np.percentile(c, [0.5, 99.5]) for c in (points.x, points.y)]
@@ -242,7 +242,7 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, compute, write."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)

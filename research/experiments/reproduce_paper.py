@@ -4,8 +4,8 @@ The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an
 2021): they say what to expect of a trend, and compare in full only on the same data.
 """
 
-import argparse
 import tempfile
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -255,7 +255,7 @@ A repeated command resumes a stopped experiment. Modified clouds and images are 
 PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     names = list(EXPERIMENTS)
     parser.add_argument("names", nargs="+", choices=names, metavar="NAME", help="experiments, see below")
@@ -274,7 +274,7 @@ def file_name(condition: Condition) -> str:
 
 
 def run_condition(
-    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
+    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: Namespace
 ) -> tuple[list[QueryResult], int]:
     """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
@@ -299,7 +299,7 @@ def run_condition(
 
 
 def run_experiment(
-    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: argparse.Namespace
+    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: Namespace
 ) -> int:
     """All conditions of an experiment and its table; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
@@ -329,7 +329,7 @@ def run_experiment(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
     check_least(arguments, jobs=1, threads=1)
     check_folder_name("--out", arguments.out)

@@ -1,7 +1,7 @@
 """Fit the confidence to trials, and check it and the covariances on others."""
 
-import argparse
 import json
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -142,14 +142,14 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
     print(Table("", columns, tuple(rows)).markdown())
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--fit FILE ...", "trials to which the weights are fitted", default=[])
     option(parser, "--check FILE ...", "other trials, on which they are checked", default=[])
     option(parser, "--without CASE ...", "leave these cases out", default=[])
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Fit the weights, print the tables."""
 
     def read(paths: Sequence[Path]) -> list[Outcome]:

@@ -1,7 +1,7 @@
 """Measure the status on seeded queries with and without an answer: how often each is called localized."""
 
-import argparse
 import json
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from itertools import chain
 
@@ -128,7 +128,7 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
     yield (cloud.points + cloud.origin_world, cloud.colors), trials
 
 
-def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
+def all_trials(arguments: Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
@@ -161,7 +161,7 @@ def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, objec
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", required=True)
     text = "kinds of places that look alike"
@@ -173,7 +173,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--threads N", "number of threads", default=num_cores())
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Localize every trial, write its line, print the table."""
     workers = Workers(arguments.threads)
     rows: list[Case] = []

@@ -1,10 +1,10 @@
 """Measure accuracy, damage, phone photos, time and memory, and write them as one page of Markdown."""
 
-import argparse
 import datetime
 import platform
 import subprocess
 import tempfile
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -127,7 +127,7 @@ def camera_path(scene: Scene, query: Query) -> Path:
 class Bench:
     """Measurements of one run of the command."""
 
-    def __init__(self, arguments: argparse.Namespace) -> None:
+    def __init__(self, arguments: Namespace) -> None:
         self.arguments = arguments
         scenes = [read_scene(folder) for folder in arguments.scenes]
         if empty := [scene for scene in scenes if not scene.queries]:
@@ -285,7 +285,7 @@ def processor_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def page_head(arguments: argparse.Namespace) -> str:
+def page_head(arguments: Namespace) -> str:
     """Return title, date, commit, options, versions and machine."""
     words = ["all", "--scenes", *(folder.resolve().name for folder in arguments.scenes)]
     for name in ("only", "damaged", "photos", "points", "rooms"):
@@ -303,7 +303,7 @@ def page_head(arguments: argparse.Namespace) -> str:
     )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
     option(parser, "--only PART ...", "measure only these parts", choices=PARTS, default=list(PARTS))
@@ -317,7 +317,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out FILE", "write the page here (default: print it)")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Measure, and write the page."""
     check_least(arguments, damaged=0, photos=0)
     head = page_head(arguments)

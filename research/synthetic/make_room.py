@@ -1,8 +1,8 @@
 """Make a synthetic furnished room from a seed: a coloured scan, and panoramas with true poses."""
 
-import argparse
 import itertools
 import json
+from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -55,7 +55,7 @@ mirrored or taken elsewhere, each kind a variant, with "answerable": false: they
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     option(parser, "--out FOLDER", "folder of the scene; created if missing", required=True)
     option(parser, "--seed N", "seed; equal seeds give equal files", default=0)
@@ -87,12 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--video", "also write FOLDER/VARIANT_walk_K.mp4")
 
 
-def is_building(arguments: argparse.Namespace) -> bool:
+def is_building(arguments: Namespace) -> bool:
     """Return True if the rooms are to be joined."""
     return bool(arguments.storeys or arguments.walk)
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
+def check_usage(arguments: Namespace) -> None:
     """Refuse options that do not go together."""
     check_least(arguments, panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
     if arguments.twins and not is_building(arguments):
@@ -111,14 +111,14 @@ def check_usage(arguments: argparse.Namespace) -> None:
         walk_options(arguments, variant)  # refuses what can't be made
 
 
-def walk_options(arguments: argparse.Namespace, variant: str) -> WalkOptions:
+def walk_options(arguments: Namespace, variant: str) -> WalkOptions:
     """Return the options of walks of a variant."""
     a = arguments
     return WalkOptions(a.frame_rate, variant, a.people, a.blur, a.bad_frames, a.width)
 
 
 def write_photos(
-    arguments: argparse.Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
+    arguments: Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> list[scenes.Query]:
     """Write single photos, of each variant as many; those of a rig are a folder."""
     queries = []
@@ -143,9 +143,7 @@ def write_photos(
     return queries
 
 
-def write_walks(
-    arguments: argparse.Namespace, office: Office, folder: Path, workers: Workers
-) -> list[scenes.Query]:
+def write_walks(arguments: Namespace, office: Office, folder: Path, workers: Workers) -> list[scenes.Query]:
     """Write the frames, poses and videos of all walks."""
     walker = Walker(office)
     queries: list[scenes.Query] = []
@@ -172,7 +170,7 @@ def write_walks(
 
 
 def write_scene(
-    arguments: argparse.Namespace, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
+    arguments: Namespace, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> dict[str, object]:
     """Make and write one scene; returns what was written."""
     office = None
@@ -204,7 +202,7 @@ def write_scene(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Make and write all scenes."""
     check_folder_name("--out", arguments.out)
     cameras = read_cameras(arguments.camera) if arguments.camera else None
