@@ -31,8 +31,7 @@ from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
 from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
-from .kernels import kernel_table
-from .scaling import clean_queries, size_table
+from .speed import clean_queries, kernel_table, size_table
 from .trials import DAMAGED_SCANS, Points, Trial, damage_trial
 
 EPILOG = """\
