@@ -179,12 +179,9 @@ class Walk:
         """Read the photo of an earlier frame; None if it can't be read, or is another now."""
         photo = self.photos[k]
         blank = self.blanks[k]
+        if blank.error is not None:
+            return None
         with reading_once():
-            is_readable = blank.error is None and self._is_of(photo, blank)
-            return self._read(photo, blank.pano) if is_readable else None
-
-    def _is_of(self, photo: Photo, result: Result) -> bool:
-        """Return True if a result is of what a photo shows now."""
-        if isinstance(photo.picture, np.ndarray):
-            return True
-        return sha256_of(photo.path, photo.instant) == result.source.pano_sha256
+            is_array = isinstance(photo.picture, np.ndarray)
+            is_same = is_array or sha256_of(photo.path, photo.instant) == blank.source.pano_sha256
+            return self._read(photo, blank.pano) if is_same else None

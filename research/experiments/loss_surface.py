@@ -111,16 +111,11 @@ def loss_surface(
     return LossSurface(loss=loss, height=height, rotation=rotation, is_free=is_free)
 
 
-def plan_shift(cloud: LocalCloud) -> Array:
-    """Return the offset (3,) [m] from the frame of the points to the plan's, which has the world's origin."""
-    return np.asarray(cloud.R_local_from_world @ cloud.origin_world)
-
-
 def surface_png(
     surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
 ) -> bytes:
     """Draw the surface over the plan, with the known poses marked, and return the PNG."""
-    shift = plan_shift(cloud)
+    shift = cloud.R_local_from_world @ cloud.origin_world  # (3,) [m] to the plan, with the world's origin
     x = grid.x + shift[0]
     y = grid.y + shift[1]
     aspect = (y[-1] - y[0] + 1.0) / (x[-1] - x[0] + 1.0)
