@@ -17,7 +17,7 @@ from piccolo.geometry.pose import is_correct
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
-from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scan_map.scan_map import ScanMap, prepare_map
 from piccolo.scene import Scene, document_of_pose, read_scene
 
 from ..synthetic.layout import PLAIN
@@ -143,6 +143,13 @@ def all_trials(arguments: Namespace, workers: Workers) -> Iterator[tuple[str, Po
             yield scene.name, points, trials
 
 
+def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers) -> Localization:
+    """Localize the photo of a trial."""
+    settings = CoarseToFineSettings(gravity=trial.gravity)
+    photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
+    return localize(scan_map, photo, settings, workers, Stopwatch())
+
+
 def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
     """Return what tools/benchmark.py calibration reads of a trial."""
     poses = [found.pose, *(a.pose for a in found.alternatives)] if found.pose else []
@@ -182,9 +189,7 @@ def run(arguments: Namespace) -> int:
             cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
             scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
-                settings = CoarseToFineSettings(gravity=trial.gravity)
-                photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
-                found = localize(scan_map, photo, settings, workers, Stopwatch())
+                found = localize_trial(scan_map, trial, workers)
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(found.pose, truth)
                 rows.append((trial.case, found.status, ok))
