@@ -39,7 +39,8 @@ def check_least(arguments: Namespace, **limits: float) -> None:
 def refuse_given(arguments: Namespace, options: Sequence[str], why: str) -> None:
     """Refuse options without a default that are given, by their names in `arguments`."""
     for name in options:
-        if getattr(arguments, name) not in (None, False):
+        value = getattr(arguments, name)
+        if value is not None and value is not False:
             raise UsageError(f"--{name.replace('_', '-')}: {why}")
 
 

@@ -139,11 +139,11 @@ def make_bundle_job(
     """Return the job of localizing photos as one camera, by --relative; a stopped one begins again."""
     poses = read_relative_poses(arguments.relative, photos)
     more = {"relative_sha256": sha256_of(arguments.relative, None)}
-    given = {str(path): localizer.ask(path)[0] for path in photos}
+    asked = [localizer.ask(path)[0] for path in photos]
 
     def run(_journal: Journal) -> list[Result]:
         scale = find_scale(arguments.relative)
-        found = scan.localize_bundle([*given.values()], poses, localizer.settings, scale)
+        found = scan.localize_bundle(asked, poses, localizer.settings, scale)
         return [replace(result, settings={**result.settings, **more}) for result in found]
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
@@ -152,7 +152,7 @@ def make_bundle_job(
         return "", True
 
     fields = localizer.expect(scan.prepared.scan_sha256, more)
-    return Job("photos together", given, fields, run, report)
+    return Job("photos together", {photo.name: photo for photo in asked}, fields, run, report)
 
 
 def make_coloring_job(
