@@ -3,7 +3,7 @@
 import json
 import signal
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
@@ -180,6 +180,12 @@ def run_scenes(
     settings = settings_json(config.settings, config.cloud_settings, config.photo)
     with open_locked(path) as file:
         rows, size = query_result.read_run(path)
+
+        def keep(row: QueryResult) -> None:
+            line = replace(row, result=replace(row.result, settings=settings)).to_json()
+            file.append(line)
+            rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
+
         query_result.check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
         pairs = [(scene, query) for scene in scenes for query in scene.queries]
         keys = {(s.name, s.name_of(q)) for s, q in pairs if not variants or q.variant in variants}
@@ -192,16 +198,9 @@ def run_scenes(
                 execution.connecting(arguments, num_jobs) as cluster,
                 execution.interruptible() as interruption,
             ):
-                new_rows = (
-                    row
-                    for scene, queries in left
-                    if not interruption.number
-                    for row in localize_queries(arguments, config, scene, queries, cluster, interruption)
-                )
-                for row in new_rows:
-                    line = replace(row, result=replace(row.result, settings=settings)).to_json()
-                    file.append(line)
-                    rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
+                for scene, queries in left:
+                    if not interruption.number:
+                        localize_queries(arguments, config, scene, queries, cluster, interruption, keep)
             if interruption.number:
                 raise Terminated if interruption.number == signal.SIGTERM else KeyboardInterrupt
     own = [row for row in rows if row.key in keys]
@@ -224,8 +223,9 @@ def localize_queries(
     queries: Sequence[Query],
     cluster: Cluster | None,
     interruption: Interruption,
-) -> Iterator[QueryResult]:
-    """Localize queries of a scene until a signal, and say why one has no result."""
+    keep: Callable[[QueryResult], None],
+) -> None:
+    """Localize queries of a scene until a signal; keep each result as it comes, or say why there is none."""
     show = progress_bar(arguments.quiet)
     are_inside: list[bool] = []  # the cloud's box
 
@@ -256,7 +256,7 @@ def localize_queries(
         for query, is_inside, (result, *_) in zip(queries, are_inside, answers, strict=False):
             if result.error is None or (result.status == UNREADABLE and not query.is_answerable):
                 in_box = None if result.error else is_inside
-                yield query_result.make_query_result(scene, query, result, in_box)
+                keep(query_result.make_query_result(scene, query, result, in_box))
             else:
                 print_error(arguments, result.error, EXIT_BAD_INPUT)
 
