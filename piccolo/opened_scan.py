@@ -102,7 +102,7 @@ class OpenedScan:
         else:
             raise InputError(OTHER_METHOD)
         if focal is not None:
-            found = replace(found, focal_length=focal.after(found.focal_length))
+            found = replace(found, focal_length=focal.update(found.focal_length))
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
         return replace(self.add_localization(blank, found), gps_prior=gps)
 
@@ -150,7 +150,7 @@ class OpenedScan:
         if not names or not (is_surer or is_other):
             return first, ()
         if focal is not None:
-            found = replace(found, focal_length=focal.after(found.focal_length))
+            found = replace(found, focal_length=focal.update(found.focal_length))
         elif found.focal_length is not None:  # only what a photo says alone counts for others
             alone = replace(found.focal_length, picture_px=None, picture_std_px=None)
             found = replace(found, focal_length=alone)
