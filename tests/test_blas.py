@@ -7,8 +7,7 @@ import pytest
 import rooms
 from threadpoolctl import threadpool_info, threadpool_limits
 
-from piccolo.jobs.blas import one_blas_thread
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Stopwatch, Workers, one_blas_thread
 from piccolo.localization import localize as method
 from piccolo.localization.settings import CoarseToFineSettings
 

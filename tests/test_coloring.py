@@ -15,15 +15,12 @@ from piccolo.cli import color_scan as tool
 from piccolo.cli import localize as command_line
 from piccolo.cli.together import steps_file
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.colored_writer import write_colored, writing_e57
 from piccolo.cloud.octree import build_octree, recolor
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_colored, write_ply, writing_e57
 from piccolo.coloring import alignment, color_scan
-from piccolo.coloring.alignment import Anchor, add_pairs, align
+from piccolo.coloring.alignment import Anchor, add_pairs, align, balance
 from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligned_brushes
-from piccolo.coloring.exposure import balance
-from piccolo.coloring.painting import find_medians, make_brushes, paint_points
-from piccolo.coloring.sight import look, weigh_points
+from piccolo.coloring.painting import find_medians, look, make_brushes, paint_points, weigh_points
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
 from piccolo.files.journal import Journal

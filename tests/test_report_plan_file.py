@@ -12,8 +12,8 @@ from report_scenes import HOSTILE, House, lifted
 
 from piccolo.cli import report
 from piccolo.errors import InputError
+from piccolo.report.pictures import PIXEL, plan_matrix, read_control_points
 from piccolo.report.plan_file import COLORS, DPI, color_of, segments_of
-from piccolo.report.plan_image import PIXEL, plan_matrix, read_control_points
 
 SVG = "{http://www.w3.org/2000/svg}"
 

@@ -31,8 +31,7 @@ from piccolo.localization.selection import assess_alone
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
-from piccolo.panorama.edges import draw_edges, soften
-from piccolo.panorama.manhattan import find_axes
+from piccolo.panorama.edges import draw_edges, find_axes, soften
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..arrays import Array, Array32
 from ..cloud import open_cloud
-from ..cloud.colored_writer import SUFFIXES, write_colored
 from ..cloud.octree import recolor
+from ..cloud.writers import SUFFIXES, write_colored
 from ..errors import InputError
 from ..files.journal import Journal
 from ..geometry.pose import Pose

@@ -6,8 +6,7 @@ from pathlib import Path
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder
 from ..result import Result
-from .formats import COLMAP, CSV, GEOJSON, GPX, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
-from .gpano import GPANO
+from .formats import COLMAP, CSV, GEOJSON, GPANO, GPX, KITTI, NERFSTUDIO, OPENSFM, POTREE, TUM
 from .posed_images import Format, LeftOut, Options, Selection, select, select_images, true_results
 
 __all__ = ["FORMATS", "Format", "Options", "Selection", "export", "select", "true_results"]

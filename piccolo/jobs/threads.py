@@ -1,14 +1,20 @@
-"""Serial kernels on several threads: whole items are spread, and results come back in the items' order."""
+"""Serial kernels on several threads: whole items are spread, and results come back in the items' order.
+
+BLAS has one thread meanwhile: those of OpenBLAS spin for tens of milliseconds after each product, on the
+cores that the next kernels want.
+"""
 
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager
+from contextlib import ContextDecorator, contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any, Generic, TypeVar
+
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from ..errors import InputError
 from .memory import check_address_space
@@ -168,3 +174,37 @@ class Stopwatch:
         begin = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+@cache
+def _controller() -> ThreadpoolController:
+    """Of the BLAS that NumPy has loaded."""
+    return ThreadpoolController().select(user_api="blas")
+
+
+class _OneBlasThread(ContextDecorator):
+    """A context, and a decorator, within which BLAS has one thread; several threads may be within at once."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._depth = 0
+        self._limiter: Any = None
+
+    def __enter__(self) -> None:
+        """Take the threads, if this is the first one in."""
+        with self._lock:
+            self._depth += 1
+            if self._depth == 1:
+                self._limiter = _controller().limit(limits=1)
+
+    def __exit__(self, *_: object) -> None:
+        """Give the threads back, if this is the last one out."""
+        with self._lock:
+            self._depth -= 1
+            if self._depth == 0:
+                OpenBLASController.clear_controlling_thread(force=True)  # another thread may have come first
+                self._limiter.restore_original_limits()
+                OpenBLASController.clear_controlling_thread()
+
+
+one_blas_thread = _OneBlasThread()

@@ -16,8 +16,7 @@ from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, skew
 from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama

@@ -10,10 +10,9 @@ from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..panorama import Panorama
-from ..panorama.manhattan import find_axes
+from ..panorama.edges import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate

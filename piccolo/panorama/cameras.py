@@ -9,10 +9,9 @@ import numpy as np
 
 from ..arrays import Array, Mask
 from ..camera import Calibration, Mount
-from ..camera.files import find_calibration
+from ..camera.calibration import compute_extent, find_calibration
 from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
 from ..camera.resampling import View, shrunk
-from ..camera.rig import compute_extent
 from ..errors import InputError
 from ..photo import Photo
 from .cube import face_pixels

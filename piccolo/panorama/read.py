@@ -7,8 +7,8 @@ import numpy as np
 
 from ..arrays import Bytes, Mask
 from ..camera import Calibration, Mount
+from ..camera.calibration import MAX_OFFSET
 from ..camera.resampling import View, make_sphere, sphere_width
-from ..camera.rig import MAX_OFFSET
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..jobs.memory import check_memory

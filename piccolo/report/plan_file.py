@@ -12,8 +12,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..files.atomic import write_atomically
-from ..files.temporary import temporary_folder
+from ..files.atomic import temporary_folder, write_atomically
 from ..optional import import_optional, new_figure
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap

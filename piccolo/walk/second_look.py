@@ -9,8 +9,7 @@ import numpy as np
 
 from ..confidence.confidence import MIN_CONFIDENCE
 from ..geometry.pose import Pose, carry
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Progress, no_progress
+from ..jobs.threads import Progress, no_progress, one_blas_thread
 from ..localization.query import Query
 from .beliefs import Belief, believe
 from .frames import Frame
