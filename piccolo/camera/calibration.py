@@ -142,10 +142,7 @@ class Calibration:
         return self.mounts
 
     def images_in(self, folder: Path) -> list[Path]:
-        """Return the picture of each camera of a rig in the folder of one instant, in order.
-
-        Raises InputError if a camera has none or several.
-        """
+        """Return the picture of each camera in the folder of one instant; InputError for none or several."""
         names = _names_in(folder)
         images = []
         for mount in self.mounts:

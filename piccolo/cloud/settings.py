@@ -52,6 +52,17 @@ def check_crs(crs: str) -> Any:
         raise InputError(f"`crs`: found {crs[:80]!r}, {wanted}") from error
 
 
+def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
+    """Return x and y of a place in a projected system, in its unit; None if there are none."""
+    system = check_crs(crs)
+    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    if not system.is_projected:
+        return None
+    transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
+    x, y = transformer.transform(longitude_deg, latitude_deg)
+    return (float(x), float(y)) if math.isfinite(x) and math.isfinite(y) else None
+
+
 IN_METRES = CloudSettings()
 IN_COLORS = CloudSettings(channels=("colors",))  # of files that must have colours
 

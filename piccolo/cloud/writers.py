@@ -55,10 +55,7 @@ def _rows(columns: dict[str, NDArray[Any]], dtype: np.dtype[Any]) -> Rows:
 
 
 def header(dtype: np.dtype[Any], num_vertices: int, comments: Sequence[str], more: Sequence[str]) -> bytes:
-    """Return the header of binary vertices; its size does not depend on their number.
-
-    `more` are the lines of the elements that follow the vertices.
-    """
+    """Return the header, of a fixed size, of binary vertices, with lines of the elements that follow them."""
     # The room that the number doesn't need stands in a comment: a padded number is not read everywhere.
     room = "comment " + "." * (MAX_DIGITS - len(str(num_vertices)))
     properties = [f"property {TYPE_NAMES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]

@@ -168,10 +168,7 @@ def read_colors(
 
 @kernel
 def find_medians(colors: Array32, weights: Array32, medians: Bytes, counts: Bytes) -> None:
-    """Write weighted medians (N, 3) of colours (K, N, 3), and how many (N,) of weights (K, N) are above 0.
-
-    Half of the weight is of colours that are not above the median.
-    """
+    """Write weighted medians (N, 3) of colours (K, N, 3), and how many weights (K, N) are above 0 (N,)."""
     num = len(weights)
     values = np.empty(num, np.float32)
     loads = np.empty(num, np.float32)

@@ -119,7 +119,9 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
                 yield file
                 file.flush()
                 if old:
-                    _keep_owner(handle, old)
+                    with suppress(PermissionError):  # where that is not allowed
+                        os.fchown(handle, old.st_uid, old.st_gid)
+                    os.fchmod(handle, mode)
                 # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
                 # no room, and after a power cut the new name might stand for an empty file.
                 os.fsync(handle)
@@ -127,13 +129,6 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-
-
-def _keep_owner(handle: int, old: os.stat_result) -> None:
-    """Give an open file the owner, where that is allowed, and the mode of the one that it replaces."""
-    with suppress(PermissionError):
-        os.fchown(handle, old.st_uid, old.st_gid)
-    os.fchmod(handle, stat.S_IMODE(old.st_mode))
 
 
 def _write_stream(path: Path, file: IO[bytes]) -> None:
@@ -168,10 +163,7 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`, which is new or empty; it is renamed to `path` at the end.
-
-    Nobody sees it half full, and after an error nothing is left.
-    """
+    """Yield a folder that becomes `path`, new or empty, at the end; after an error nothing is left."""
     target = _target_of(path)
     temporary = _temporary_beside(target)
     try:

@@ -122,7 +122,9 @@ class Processes:
         self._is_closed = False
         resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
         # What a thread blocks, its processes do from their first moment on.
-        self._threads = ThreadPoolExecutor(num_processes, initializer=_block_signals)
+        self._threads = ThreadPoolExecutor(
+            num_processes, initializer=signal.pthread_sigmask, initargs=(signal.SIG_BLOCK, SIGNALS)
+        )
 
     def values(self, items: Iterator[Any]) -> InFlight:
         """Begin with the items."""
@@ -191,10 +193,6 @@ def _exit_code_of(child: BaseProcess) -> int:
             return child.exitcode
         time.sleep(POLL_S)
     return 0
-
-
-def _block_signals() -> None:
-    signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
 
 
 @contextmanager

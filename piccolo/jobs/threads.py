@@ -9,7 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ContextDecorator, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache, partial
 from typing import Any, Generic, TypeVar
@@ -176,35 +176,22 @@ class Stopwatch:
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
-@cache
-def _controller() -> ThreadpoolController:
-    """Of the BLAS that NumPy has loaded."""
-    return ThreadpoolController().select(user_api="blas")
+_blas = cache(lambda: ThreadpoolController().select(user_api="blas"))  # that NumPy has loaded
+_limiting = threading.Lock()
+_limiters: list[Any] = []  # of the threads of BLAS, for each of those within `one_blas_thread`
 
 
-class _OneBlasThread(ContextDecorator):
-    """A context, and a decorator, within which BLAS has one thread; several threads may be within at once."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._depth = 0
-        self._limiter: Any = None
-
-    def __enter__(self) -> None:
-        """Take the threads, if this is the first one in."""
-        with self._lock:
-            self._depth += 1
-            if self._depth == 1:
-                self._limiter = _controller().limit(limits=1)
-
-    def __exit__(self, *_: object) -> None:
-        """Give the threads back, if this is the last one out."""
-        with self._lock:
-            self._depth -= 1
-            if self._depth == 0:
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Within this, BLAS has one thread; several threads may be within at once."""
+    with _limiting:
+        _limiters.append(_limiters[0] if _limiters else _blas().limit(limits=1))
+    try:
+        yield
+    finally:
+        with _limiting:
+            limiter = _limiters.pop()
+            if not _limiters:
                 OpenBLASController.clear_controlling_thread(force=True)  # another thread may have come first
-                self._limiter.restore_original_limits()
+                limiter.restore_original_limits()
                 OpenBLASController.clear_controlling_thread()
-
-
-one_blas_thread = _OneBlasThread()

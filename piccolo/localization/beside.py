@@ -54,7 +54,7 @@ class Neighbor(NamedTuple):
     pose: Pose  # of the other, by the matches
 
 
-@one_blas_thread
+@one_blas_thread()
 def locate(
     scan_map: ScanMap,
     panorama: Panorama,
@@ -74,7 +74,7 @@ def locate(
     return SurePhoto(place_keypoints(query, pose), found.confidence, gaussian)
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize_beside(
     scan_map: ScanMap,
     panorama: Panorama,

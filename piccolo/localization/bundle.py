@@ -69,7 +69,7 @@ class Agreed(NamedTuple):
     warnings: tuple[str, ...]
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize_bundle(
     scan_map: ScanMap,
     panoramas: Sequence[Panorama],

@@ -41,7 +41,7 @@ class Found(NamedTuple):
     fit: FocalFit | None  # of the photo of one camera, unless the poses are hopeless
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize(
     scan_map: ScanMap,
     panorama: Panorama,

@@ -163,10 +163,7 @@ def _on_sphere(
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of a panorama's file, or of the sphere of a folder of faces, not decoded.
-
-    Raises InputError if EXIF rotates it, which many programs ignore.
-    """
+    """Return width and height [px] of a file's panorama, not decoded; InputError if EXIF rotates it."""
     if not path.is_dir():
         if (orientation := picture_orientation(path)) not in (None, 1):
             turned = f"found it stored rotated (EXIF orientation {orientation})"

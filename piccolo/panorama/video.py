@@ -30,10 +30,7 @@ class VideoFrame(NamedTuple):
 
 
 def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
-    """Write a frame every `every` seconds into a folder, the sharpest around each time, and yield it.
-
-    InputError if the file is no video or is damaged, or PyAV is not there.
-    """
+    """Write and yield the sharpest frame around each time step [s]; InputError for what is no video."""
     best: tuple[float, float, Bytes] | None = None  # sharpness, time, RGB
     slot = 0
     for time, frame in _decode(video):

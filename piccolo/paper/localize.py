@@ -47,10 +47,7 @@ def box_grid(low: Array, high: Array, num_cells: int) -> Array:
 
 
 def farthest_point_sampling(positions: Array, count: int) -> Array:
-    """Return at most `count` of the positions (N, 3), in their order.
-
-    Each is chosen farthest from those chosen before it.
-    """
+    """Return at most `count` positions (N, 3), in order, each chosen farthest from those chosen before."""
     if len(positions) <= count:
         return positions
     chosen = [0]

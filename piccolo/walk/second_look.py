@@ -19,7 +19,7 @@ from .tracker import Expected, Followed, Tracker, find_near, refine_state
 Find = Callable[[Query], Followed | None]
 
 
-@one_blas_thread
+@one_blas_thread()
 def finish(tracker: Tracker, show: Progress = no_progress) -> tuple[Path, list[Belief]]:
     """Find the path of all frames of a tracker, and what each may be.
 

@@ -95,7 +95,7 @@ class Tracker:
             image()
         return query
 
-    @one_blas_thread
+    @one_blas_thread()
     def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
         """Localize the next frame, whose query is prepared; the first one waits until free space is known."""
         frame = Frame(time, odometry=odometry)
