@@ -117,7 +117,7 @@ def test_a_photo_sees_what_is_in_front_and_nothing_behind_walls():
     points = np.concatenate([leaves, leaves + 0.5 * away / np.linalg.norm(away, axis=1, keepdims=True)])
     found = np.empty(len(points), np.float32)
     R, t = poses[0].R_cam_from_world, poses[0].center_world
-    weigh_points(np.ascontiguousarray(points, np.float32), *sight, R, t, found)
+    weigh_points(np.ascontiguousarray(points, np.float32), sight, R, t, found)
     assert (found[: len(leaves)] > 0.0).mean() > 0.5
     assert (found[len(leaves) :] > 0.0).mean() < 0.1
 
@@ -212,10 +212,10 @@ def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
     rng = np.random.default_rng(5)
     weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
 
-    def weigh(points, ranges, sight, R_cam_from_map, center_map, found):
+    def weigh(points, sight, R_cam_from_map, center_map, found):
         found[:] = weights[int(center_map[0])]
 
-    monkeypatch.setattr(alignment, "look", lambda octree, pose: (None, None))
+    monkeypatch.setattr(alignment, "look", lambda octree, pose: None)
     monkeypatch.setattr(alignment, "weigh_points", weigh)
     poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
     sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))

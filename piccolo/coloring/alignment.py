@@ -6,7 +6,8 @@ optimised jointly, because overlapping photos are coupled. After Zhou and Koltun
 for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -86,9 +87,10 @@ def align(
         sized = [resize(panorama, width) for panorama in panoramas]
         texels = [pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
         sightings = find_sightings(octree, points, poses, workers)
-        values = read_all(points, sightings, texels, np.ones_like(gains), poses, workers).values
+        read = partial(read_all, points, sightings, texels, workers)
+        values = read(poses, np.ones_like(gains)).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
-        poses = descend(points, sightings, texels, gains, poses, anchors, workers)
+        poses = descend(partial(read, gains=gains), sightings, poses, anchors)
     return poses, gains
 
 
@@ -96,9 +98,8 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
     """Find which photos see points (N, 3), those alone that several see."""
 
     def weigh(pose: Pose) -> Array32:
-        sight = look(octree, pose)
         found = np.empty(len(points), np.float32)
-        weigh_points(points, *sight, pose.R_cam_from_world, pose.center_world, found)
+        weigh_points(points, look(octree, pose), pose.R_cam_from_world, pose.center_world, found)
         return found
 
     best = np.zeros((len(points), MOST_SEEN), np.float32)
@@ -123,9 +124,9 @@ def read_all(
     points: Array32,
     sightings: Sightings,
     texels: Sequence[Texels],
-    gains: Array32,
-    poses: Sequence[Pose],
     workers: Workers,
+    poses: Sequence[Pose],
+    gains: Array32,
 ) -> Readings:
     """Read what the photos show at all points that they see."""
     count = len(sightings.point)
@@ -144,18 +145,12 @@ def read_all(
 
 
 def descend(
-    points: Array32,
-    sightings: Sightings,
-    texels: Sequence[Texels],
-    gains: Array32,
-    poses: list[Pose],
-    anchors: Sequence[Anchor],
-    workers: Workers,
+    read: Callable[[Sequence[Pose]], Readings], sightings: Sightings, poses: list[Pose], anchors: list[Anchor]
 ) -> list[Pose]:
     """Return the poses at which photos agree best: Levenberg-Marquardt on all of them."""
 
     def equations(at: Sequence[Pose]) -> tuple[float, Array, Array]:
-        readings = read_all(points, sightings, texels, gains, at, workers)
+        readings = read(at)
         matrix = np.zeros((6 * len(at), 6 * len(at)))
         gradient = np.zeros(6 * len(at))
         loss = add_pairs(sightings.first, sightings.photo, *readings, LOSS_SCALE, matrix, gradient)

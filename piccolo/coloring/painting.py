@@ -65,24 +65,19 @@ def look(octree: Octree, pose: Pose) -> Sight:
 
 @kernel
 def weigh_points(
-    points: Array32,
-    ranges: Array32,
-    weights: Array32,
-    R_cam_from_map: Array,
-    center_map: Array,
-    found: Array32,
+    points: Array32, sight: Sight, R_cam_from_map: Array, center_map: Array, found: Array32
 ) -> None:
     """Write how well a photo sees each of some points (N, 3) of the map, 0 for what is hidden."""
     pose = pose_float32(R_cam_from_map, center_map)
-    height, width = ranges.shape
+    height, width = sight.ranges.shape
     for n in range(len(points)):
         x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
         rho2 = x * x + y * y
         u, v = direction_to_pixel(x, y, z, np.sqrt(rho2), np.float32(width))
         i = min(whole(v), height - 1)
         j = min(whole(u), width - 1)
-        is_seen = np.sqrt(rho2 + z * z) <= ranges[i, j] * BEHIND + BEHIND_OFFSET
-        found[n] = weights[i, j] if is_seen else F0
+        is_seen = np.sqrt(rho2 + z * z) <= sight.ranges[i, j] * BEHIND + BEHIND_OFFSET
+        found[n] = sight.weights[i, j] if is_seen else F0
 
 
 class Brush(NamedTuple):
@@ -125,7 +120,7 @@ def paint_points(points: Array32, brushes: Sequence[Brush], workers: Workers) ->
         colors = np.empty((len(brushes), len(some), 3), np.float32)
         for k, (texels, pose, gains, sight) in enumerate(brushes):
             R, t = pose.R_cam_from_world, pose.center_world
-            weigh_points(some, *sight, R, t, weights[k])
+            weigh_points(some, sight, R, t, weights[k])
             read_colors(some, texels.rgbx, texels.width, gains, R, t, weights[k], colors[k])
         find_medians(colors, weights, paint.colors[part], paint.num_photos[part])
 
@@ -136,7 +131,7 @@ def paint_points(points: Array32, brushes: Sequence[Brush], workers: Workers) ->
 def sees_paint(brush: Brush, points: Array32, paint: Paint) -> bool:
     """Return True if enough of what a photo sees of points (N, 3), by its solid angle, has paint."""
     weights = np.empty(len(points), np.float32)
-    weigh_points(points, *brush.sight, brush.pose.R_cam_from_world, brush.pose.center_world, weights)
+    weigh_points(points, brush.sight, brush.pose.R_cam_from_world, brush.pose.center_world, weights)
     return bool(weights[paint.num_photos > 0].sum() > LEAST_PAINTED * weights.sum())
 
 

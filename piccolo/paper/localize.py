@@ -104,37 +104,6 @@ def histogram_similarity(points: PackedPoints, panorama: Panorama, pose: Pose, b
     return float(np.minimum(of_cloud, of_panorama).sum())
 
 
-def search(
-    points: PackedPoints,
-    panorama: Panorama,
-    loss: Loss,
-    positions: Array,
-    rotations: Array,
-    settings: PaperSettings,
-    workers: Workers,
-) -> list[Hypothesis]:
-    """Select the K2 poses to descend from, of all positions (N_t, 3) with all rotations (N_r, 3, 3)."""
-
-    def losses(center_world: Array) -> list[Hypothesis]:
-        seen = visible_points(points, center_world) if settings.use_visibility else points
-        poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
-        found = [Hypothesis(pose, -loss.value(seen, pose)) for pose in poses]
-        return [h for h in found if np.isfinite(h.score)]
-
-    scored = [h for batch in workers.map(losses, list(positions), "search") for h in batch]
-    near = Nearness(settings.min_distance, math.radians(settings.min_angle_deg))
-    if settings.initialization == "loss-only":
-        return best_distinct(scored, settings.num_by_histogram, near)
-    by_loss = best_distinct(scored, settings.num_by_loss, near)
-    small = shrink(panorama, settings.histogram_width)
-
-    def rescore(h: Hypothesis) -> Hypothesis:
-        return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
-
-    by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
-    return best_distinct(by_histogram, settings.num_by_histogram, near)
-
-
 @dataclass(frozen=True)
 class PaperMap(LocalCloud):
     """The paper's map, prepared once per cloud."""
@@ -150,6 +119,34 @@ def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     return PaperMap(points, np.eye(3), cloud.origin_world, cloud.warnings, positions)
 
 
+def search(
+    paper_map: PaperMap, panorama: Panorama, loss: Loss, settings: PaperSettings, workers: Workers
+) -> list[Hypothesis]:
+    """Select the K2 poses to descend from, of all N_t positions with all N_r rotations."""
+    points = paper_map.points
+    is_level = settings.gravity == "known"
+    rotations = (uniform_yaws if is_level else uniform_rotations)(settings.effective_num_rotations)
+
+    def losses(center_world: Array) -> list[Hypothesis]:
+        seen = visible_points(points, center_world) if settings.use_visibility else points
+        poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
+        found = [Hypothesis(pose, -loss.value(seen, pose)) for pose in poses]
+        return [h for h in found if np.isfinite(h.score)]
+
+    scored = [h for batch in workers.map(losses, list(paper_map.positions), "search") for h in batch]
+    near = Nearness(settings.min_distance, math.radians(settings.min_angle_deg))
+    if settings.initialization == "loss-only":
+        return best_distinct(scored, settings.num_by_histogram, near)
+    by_loss = best_distinct(scored, settings.num_by_loss, near)
+    small = shrink(panorama, settings.histogram_width)
+
+    def rescore(h: Hypothesis) -> Hypothesis:
+        return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
+
+    by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
+    return best_distinct(by_histogram, settings.num_by_histogram, near)
+
+
 def make_loss(panorama: Panorama, settings: PaperSettings) -> Loss:
     """Return the loss that the settings select."""
     if settings.loss == "photometric":
@@ -162,11 +159,9 @@ def localize(
 ) -> Localization:
     """Localize by Algorithm 1 of the paper: search, refine, select; then evaluate the selected pose."""
     points = paper_map.points
-    known = settings.gravity == "known"
-    rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
     loss = make_loss(panorama, settings)
     with watch.stage("search"):
-        starts = search(points, panorama, loss, paper_map.positions, rotations, settings, workers)
+        starts = search(paper_map, panorama, loss, settings, workers)
     with watch.stage("refine"):
         refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)

@@ -191,23 +191,14 @@ def make_source(
     return PointSource(path, readers[channel], num_points)
 
 
-def column_source(
-    path: Path,
-    read_columns: Callable[[], Iterator[Columns]],
-    types: Sequence[str],
-    channel: Channel,
-    labels: Labels | None,
-    num_points: int,
-) -> PointSource:
-    """Return points in columns x y z, with three colours of these types, or with a scalar, or alone."""
-    is_colored = len(types) == len(COLOR_NAMES[0])
-
-    def read() -> Iterator[Part]:
-        for columns in read_columns():
-            values = np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64)
-            yield points_of(columns), values
-
-    return make_source(path, read, channel, labels, num_points, types)
+def join_columns(read_columns: Callable[[], Iterator[Columns]]) -> Iterator[Part]:
+    """Yield points in columns x y z, with three colours, or with a scalar, or alone."""
+    for columns in read_columns():
+        is_colored = len(columns) == 6
+        yield (
+            points_of(columns),
+            np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64),
+        )
 
 
 def intensity_reader(read: PartReader) -> ChunkReader:
