@@ -23,7 +23,7 @@ from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligne
 from piccolo.coloring.painting import find_medians, look, make_brushes, paint_points, weigh_points
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
-from piccolo.files.journal import Journal
+from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize

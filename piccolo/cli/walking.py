@@ -13,7 +13,7 @@ from ..batch.inputs import is_from_stdin
 from ..batch.relative_poses import read_odometry
 from ..errors import InputError
 from ..files.atomic import temporary_folder
-from ..files.journal import Journal
+from ..files.line_file import Journal
 from ..geometry.pose import Pose
 from ..jobs.processes import InFlight
 from ..panorama.photo import sha256_of

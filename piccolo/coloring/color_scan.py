@@ -12,7 +12,7 @@ from ..cloud import open_cloud
 from ..cloud.octree import recolor
 from ..cloud.writers import SUFFIXES, write_colored
 from ..errors import InputError
-from ..files.journal import Journal
+from ..files.line_file import Journal
 from ..geometry.pose import Pose
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers

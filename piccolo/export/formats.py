@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..errors import InputError, printable
-from ..files.atomic import is_stream, replacing_folder, write_atomically
+from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_bytes
 from ..geometry import rotations
 from ..geometry.pose import Pose, log_so3, quaternion_wxyz
@@ -24,7 +24,8 @@ from ..geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM, OPTICAL_FROM_CAM,
 from ..optional import import_optional
 from ..panorama.gpano import with_pose
 from ..panorama.picture import WANTED
-from .posed_images import NO_UTF8, Format, Options, PosedImage
+from ..result import Result
+from .posed_images import NO_UTF8, Format, LeftOut, Options, PosedImage, select_images
 
 COLUMNS = (
     *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
@@ -349,3 +350,20 @@ GPX_TEXT = "track of the positions in WGS84; needs `crs` and the library pyproj"
 GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")
 GPANO_TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; `out` is a new folder"
 GPANO = Format("gpano", GPANO_TEXT, write_gpano, is_folder=True, forbidden="", cameras="spheres", check=_copy)
+_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, GPX, POTREE, GPANO
+FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
+
+
+def export(results: Sequence[Result], name: str, out: Path, options: Options) -> LeftOut:
+    """Write the poses of `results`, which all have one, to `out` in the format `name`, whole or not at all.
+
+    Returns the pictures that are left out, by why: the format can't hold them, or they can't be read.
+    Raises InputError if no pose is left, or `out` can't be written.
+    """
+    form = FORMATS[name]
+    (check_output_folder if form.is_folder else check_output)(out)
+    if not results:
+        raise InputError(f"{out}: there is no pose to write; `all` also writes those that are not localized")
+    images, left_out = select_images(results, form, options)
+    form.write(images, out, options)
+    return left_out

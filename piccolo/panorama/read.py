@@ -29,7 +29,7 @@ from .gpano import (
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
 from .model import FocalPrior, GPano, Panorama
 from .photo import elevation_deg
-from .picture import BYTES_PER_PIXEL, Picture, picture_orientation, picture_size, read_labels, read_picture
+from .picture import BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
@@ -164,13 +164,13 @@ def _on_sphere(
 
 def panorama_size(path: Path) -> tuple[int, int]:
     """Return width and height [px] of a file's panorama, not decoded; InputError if EXIF rotates it."""
-    if not path.is_dir():
-        if (orientation := picture_orientation(path)) not in (None, 1):
-            turned = f"found it stored rotated (EXIF orientation {orientation})"
-            raise InputError(f"{path}: {turned}, wanted it upright")
-        return picture_size(path)
-    size, _ = picture_size(face_paths(path)["f"])
-    return 4 * size, 2 * size
+    size, orientation = picture_shape(face_paths(path)["f"] if path.is_dir() else path)
+    if path.is_dir():
+        return 4 * size[0], 2 * size[0]
+    if orientation not in (None, 1):
+        turned = f"found it stored rotated (EXIF orientation {orientation})"
+        raise InputError(f"{path}: {turned}, wanted it upright")
+    return size
 
 
 def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
