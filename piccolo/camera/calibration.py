@@ -58,7 +58,6 @@ class Mount:
     image: str | None = None  # of a rig: which file of the folder is its picture, * and ? as in a shell
 
     def __post_init__(self) -> None:
-        """Refuse what is no place."""
         check_pose(Pose(self.rotation, np.array(self.center_cam)), "R_lens_from_cam, center_cam")
         if len(self.offset) != 2 or not all(isinstance(x, int) and x >= 0 for x in self.offset):
             raise InputError(f"found offset {self.offset}, wanted two whole numbers from 0 [px]")
@@ -100,7 +99,6 @@ class Calibration:
     has_sizes: bool = True  # False: the file does not say how large the pictures are
 
     def __post_init__(self) -> None:
-        """Refuse a file without cameras, or of a kind that makes no sense."""
         if not 1 <= len(self.mounts) <= MAX_CAMERAS and not self.is_choice:
             raise InputError(f"{self.path}: found {len(self.mounts)} cameras, wanted 1 to {MAX_CAMERAS}")
 

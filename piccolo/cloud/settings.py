@@ -31,7 +31,6 @@ class CloudSettings:
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 
     def __post_init__(self) -> None:
-        """Raise InputError for invalid values, and for labels of a scan whose colours are ignored."""
         if self.labels and "colors" not in self.channels:
             raise InputError("`ignore_colors`, `labels`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):

@@ -160,7 +160,9 @@ def descend(
         gradient /= variance
         for k, (pose, anchor) in enumerate(zip(at, anchors, strict=True)):
             own = slice(6 * k, 6 * k + 6)
-            away = measure_step(anchor.pose, pose)
+            turn = log_so3(pose.R_cam_from_world @ anchor.pose.R_cam_from_world.T)
+            move = anchor.pose.R_cam_from_world @ (pose.center_world - anchor.pose.center_world)
+            away = np.concatenate([turn, move])
             loss += 0.5 * float(away @ anchor.information @ away)
             matrix[own, own] += anchor.information
             gradient[own] += anchor.information @ away
@@ -183,12 +185,6 @@ def descend(
         if np.abs(delta).max() < SETTLED:
             break
     return poses
-
-
-def measure_step(pose: Pose, other: Pose) -> Array:
-    """Return the step (6,) [rad, m], in the camera's frame, from a pose to another near it."""
-    turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
-    return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
 
 
 @kernel

@@ -48,7 +48,6 @@ class Options:
     crs: str | None = None  # of the cloud's coordinates, such as EPSG:25832
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing, naming the option."""
         if self.size is not None:
             check_size("`size`", self.size)
         if self.offset is not None and not all(math.isfinite(value) for value in self.offset):

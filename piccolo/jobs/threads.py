@@ -92,7 +92,6 @@ class Workers:
     warn: Callable[[str], None] = ignore_warning  # of what should be known before the work is done
 
     def __post_init__(self) -> None:
-        """Refuse a count that means nothing."""
         if not 1 <= self.num_threads <= MAX_THREADS:
             raise InputError(f"`num_threads`: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 

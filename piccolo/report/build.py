@@ -72,7 +72,6 @@ class ReportSettings:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse values of another type, naming the option."""
         check_fields(self)
 
     @property

@@ -98,7 +98,9 @@ def make_pictures(
         view_width = min(full, SCAN_WIDTH) & ~1
         view = scan_view(surfels, poses[0], view_width)
         document["scan"] = _base64(scan_picture(view))
-        document["reach"] = _base64(measure_reach(view).tobytes())
+        # the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned
+        tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
+        document["reach"] = _base64(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA).tobytes())
         mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
         document["mask"] = _base64(encode_image(mask, ".png"))
         document["alternatives"] = [
@@ -119,12 +121,6 @@ def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
     """Return what the scan shows from a pose of its frame."""
     visible = surfels.take(visible_indices(surfels.points, pose.center_world))
     return render_surfels(visible, pose, width, Workers())
-
-
-def measure_reach(view: View) -> Bytes:
-    """Return the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned."""
-    tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
-    return np.asarray(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def scan_picture(view: View) -> bytes:

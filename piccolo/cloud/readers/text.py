@@ -230,7 +230,7 @@ def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
     num_lines = 0
     for line in head[start:].splitlines(keepends=True):
         text = line.decode("latin-1").strip()
-        delimiter = _delimiter(text)
+        delimiter = next((mark for mark in ";," if mark in text), None)
         fields = text.split(delimiter)
         is_count = len(fields) == 1 and line.strip().isdigit()
         if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
@@ -256,11 +256,6 @@ def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
         error = MissingChannelError if len(fields) >= NUM_COLUMNS["shape"] else InputError
         raise error(f"{path}: {found}, {WANTED}")
     return LineLayout(columns, start=start, delimiter=delimiter)
-
-
-def _delimiter(line: str) -> str | None:
-    """Return the mark between the columns of a line; None for blanks and tabs."""
-    return next((mark for mark in ";," if mark in line), None)
 
 
 def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
