@@ -18,9 +18,15 @@ from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree, recolor
 from piccolo.cloud.writers import vertex_rows, write_colored, write_ply, writing_e57
 from piccolo.coloring import alignment, color_scan
-from piccolo.coloring.alignment import Anchor, add_pairs, align, balance
-from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligned_brushes
-from piccolo.coloring.painting import find_medians, look, make_brushes, paint_points, weigh_points
+from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
+from piccolo.coloring.color_scan import (
+    PAINTED,
+    find_medians,
+    localize_by_colors,
+    make_aligned_brushes,
+    make_brushes,
+    paint_points,
+)
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
 from piccolo.files.line_file import Journal

@@ -3,21 +3,24 @@
 Minimised is the sum over points, and over the pairs of photos that see them, of a robust loss of the
 difference of their colours, with each pose's distance from where it was found before. All poses are
 optimised jointly, because overlapping photos are coupled. After Zhou and Koltun, "Color Map Optimization
-for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time.
+for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time. Before, gains make
+their exposures alike. A photo sees the nearest surfaces, best where it looks at them squarely from near.
 """
 
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s, Int64s
 from ..cloud.octree import Octree
 from ..geometry.pose import Pose, log_so3, step
-from ..geometry.sphere import pixel_jacobian
+from ..geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, Scalar, kernel
+from ..kernels.jit import F0, Scalar, kernel, whole
+from ..local_features.view_image import render_gray
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import FALL, FIRST_DAMPING, RISE
 from ..panorama import Panorama
@@ -31,7 +34,6 @@ from ..panorama.texels import (
     pack_texels,
     pose_float32,
 )
-from .painting import look, weigh_points
 
 WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000
@@ -47,6 +49,12 @@ DARKEST = 8.0  # [8-bit levels] darker and brighter colours say nothing of gains
 BRIGHTEST = 247.0
 SCALE = 0.2  # of the logarithm of a ratio, beyond which it counts little: the photos show different things
 NUM_ROUNDS = 4
+SIGHT_WIDTH = 1024  # [px] of the sphere on which ranges are found
+BEHIND = np.float32(1.02)  # what is farther than the surface by this factor
+BEHIND_OFFSET = np.float32(0.03)  # [m] and this is hidden
+NEIGHBOR = 2  # [px] between the pixels by which a surface's slope is found
+LEAST_COSINE = 0.02
+LEAST_RANGE = 0.3  # [m] nearer surfaces count as much as this
 
 
 class Anchor(NamedTuple):
@@ -54,6 +62,44 @@ class Anchor(NamedTuple):
 
     pose: Pose  # in the map
     information: Array  # (6, 6) of a step [rad, m] in the camera's frame
+
+
+class Sight(NamedTuple):
+    """The surfaces around a photo."""
+
+    ranges: Array32  # (H, W) [m], 0 where nothing is seen
+    weights: Array32  # (H, W) cosine of the angle to the surface's normal / range^2 [1 / m^2]
+
+
+def look(octree: Octree, pose: Pose) -> Sight:
+    """Return what a photo at a pose in the map sees."""
+    ranges = render_gray(octree, pose, np.ones((SIGHT_WIDTH // 2, SIGHT_WIDTH), np.bool_)).ranges
+    rays = pixel_rays(SIGHT_WIDTH)
+    smooth = np.asarray(cv2.medianBlur(ranges, 3), np.float64)
+    points = np.pad(rays * smooth[..., None], ((NEIGHBOR, NEIGHBOR), (0, 0), (0, 0)), mode="edge")
+    across = np.roll(points, -NEIGHBOR, axis=1) - np.roll(points, NEIGHBOR, axis=1)
+    normals = np.cross(across[NEIGHBOR:-NEIGHBOR], points[2 * NEIGHBOR :] - points[: -2 * NEIGHBOR])
+    along = np.abs((normals * rays).sum(axis=-1))
+    cosine = along / np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
+    weights = np.maximum(cosine, LEAST_COSINE) / np.maximum(ranges, LEAST_RANGE) ** 2
+    return Sight(ranges, np.where(ranges > 0.0, weights, 0.0).astype(np.float32))
+
+
+@kernel
+def weigh_points(
+    points: Array32, sight: Sight, R_cam_from_map: Array, center_map: Array, found: Array32
+) -> None:
+    """Write how well a photo sees each of some points (N, 3) of the map, 0 for what is hidden."""
+    pose = pose_float32(R_cam_from_map, center_map)
+    height, width = sight.ranges.shape
+    for n in range(len(points)):
+        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        rho2 = x * x + y * y
+        u, v = direction_to_pixel(x, y, z, np.sqrt(rho2), np.float32(width))
+        i = min(whole(v), height - 1)
+        j = min(whole(u), width - 1)
+        is_seen = np.sqrt(rho2 + z * z) <= sight.ranges[i, j] * BEHIND + BEHIND_OFFSET
+        found[n] = sight.weights[i, j] if is_seen else F0
 
 
 class Sightings(NamedTuple):
