@@ -23,17 +23,8 @@ from ..kernels.jit import F0, Scalar, kernel, whole
 from ..local_features.view_image import render_gray
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import FALL, FIRST_DAMPING, RISE
-from ..panorama import Panorama
+from ..panorama import Panorama, texels
 from ..panorama.model import resize
-from ..panorama.texels import (
-    Texels,
-    blend_with_gradient,
-    in_camera,
-    is_valid,
-    locate_texel,
-    pack_texels,
-    pose_float32,
-)
 
 WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000
@@ -90,10 +81,10 @@ def weigh_points(
     points: Array32, sight: Sight, R_cam_from_map: Array, center_map: Array, found: Array32
 ) -> None:
     """Write how well a photo sees each of some points (N, 3) of the map, 0 for what is hidden."""
-    pose = pose_float32(R_cam_from_map, center_map)
+    pose = texels.pose_float32(R_cam_from_map, center_map)
     height, width = sight.ranges.shape
     for n in range(len(points)):
-        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        x, y, z = texels.in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
         rho2 = x * x + y * y
         u, v = direction_to_pixel(x, y, z, np.sqrt(rho2), np.float32(width))
         i = min(whole(v), height - 1)
@@ -131,9 +122,9 @@ def align(
     gains = np.ones((len(poses), 3), np.float32)
     for width in WIDTHS:
         sized = [resize(panorama, width) for panorama in panoramas]
-        texels = [pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
+        images = [texels.pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
         sightings = find_sightings(octree, points, poses, workers)
-        read = partial(read_all, points, sightings, texels, workers)
+        read = partial(read_all, points, sightings, images, workers)
         values = read(poses, np.ones_like(gains)).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
         poses = descend(partial(read, gains=gains), sightings, poses, anchors)
@@ -169,7 +160,7 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
 def read_all(
     points: Array32,
     sightings: Sightings,
-    texels: Sequence[Texels],
+    images: Sequence[texels.Texels],
     workers: Workers,
     poses: Sequence[Pose],
     gains: Array32,
@@ -180,7 +171,7 @@ def read_all(
 
     def read(k: int) -> None:
         pose = poses[k]
-        image = texels[k]
+        image = images[k]
         read_photo(
             points, sightings.own[k], sightings.point, image.rgbx, image.width, gains[k],
             pose.R_cam_from_world, pose.center_world, *readings,
@@ -238,7 +229,7 @@ def read_photo(
     points: Array32,
     own: Int64s,
     point: Int64s,
-    texels: Int32s,
+    image: Int32s,
     width: int,
     gains: Array32,
     R_cam_from_map: Array,
@@ -247,18 +238,18 @@ def read_photo(
     rows: Array32,
 ) -> None:
     """Write the values (S, 3) and rows (S, 3, 6) of one photo's own sightings."""
-    pose = pose_float32(R_cam_from_map, center_map)
+    pose = texels.pose_float32(R_cam_from_map, center_map)
     for s in own:
         n = point[s]
-        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        x, y, z = texels.in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
         rho2 = x * x + y * y
-        k, fu, fv = locate_texel(x, y, z, np.sqrt(rho2), width)
+        k, fu, fv = texels.locate_texel(x, y, z, np.sqrt(rho2), width)
         below = k + width + 2
-        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[below], texels[below + 1]
+        t00, t10, t01, t11 = image[k], image[k + 1], image[below], image[below + 1]
         ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, rho2, np.float32(width))
-        is_shown = is_valid(t00, t10, t01, t11) > F0
+        is_shown = texels.is_valid(t00, t10, t01, t11) > F0
         for c in range(3):
-            value, by_u, by_v = blend_with_gradient(t00, t10, t01, t11, fu, fv, 8 * c)
+            value, by_u, by_v = texels.blend_with_gradient(t00, t10, t01, t11, fu, fv, 8 * c)
             values[s, c] = value * gains[c] if is_shown else np.float32(np.nan)
             gx = gains[c] * (by_u * ux + by_v * vx)
             gy = gains[c] * (by_u * uy + by_v * vy)

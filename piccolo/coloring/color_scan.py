@@ -21,18 +21,8 @@ from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, HALF, kernel
 from ..opened_scan import OpenedScan, labels_of, photo_of
-from ..panorama import Panorama, read_panorama
+from ..panorama import Panorama, read_panorama, texels
 from ..panorama.model import shrink
-from ..panorama.texels import (
-    Texels,
-    bilinear_weights,
-    blend,
-    in_camera,
-    is_valid,
-    locate_texel,
-    pack_texels,
-    pose_float32,
-)
 from ..result import FAILED, Result
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
@@ -57,7 +47,7 @@ FULL = np.float32(255.0)
 class Brush(NamedTuple):
     """A photo that gives colours."""
 
-    texels: Texels
+    image: texels.Texels
     pose: Pose  # in the map
     gains: Array32  # (3,) by which its colours are multiplied
     sight: Sight
@@ -77,7 +67,8 @@ def make_brushes(
 
     def make(k: int) -> Brush:
         shown = shrink(panoramas[k], WIDTH)
-        return Brush(pack_texels(shown.rgb, shown.is_valid), poses[k], gains[k], look(octree, poses[k]))
+        image = texels.pack_texels(shown.rgb, shown.is_valid)
+        return Brush(image, poses[k], gains[k], look(octree, poses[k]))
 
     return workers.map(make, range(len(poses)), "see")
 
@@ -92,10 +83,10 @@ def paint_points(points: Array32, brushes: Sequence[Brush], workers: Workers) ->
         some = points[part]
         weights = np.empty((len(brushes), len(some)), np.float32)
         colors = np.empty((len(brushes), len(some), 3), np.float32)
-        for k, (texels, pose, gains, sight) in enumerate(brushes):
+        for k, (image, pose, gains, sight) in enumerate(brushes):
             R, t = pose.R_cam_from_world, pose.center_world
             weigh_points(some, sight, R, t, weights[k])
-            read_colors(some, texels.rgbx, texels.width, gains, R, t, weights[k], colors[k])
+            read_colors(some, image.rgbx, image.width, gains, R, t, weights[k], colors[k])
         find_medians(colors, weights, paint.colors[part], paint.num_photos[part])
 
     workers.map(run, range(0, len(points), at_once), "paint")
@@ -112,7 +103,7 @@ def sees_paint(brush: Brush, points: Array32, paint: Paint) -> bool:
 @kernel
 def read_colors(
     points: Array32,
-    texels: Int32s,
+    image: Int32s,
     width: int,
     gains: Array32,
     R_cam_from_map: Array,
@@ -121,18 +112,18 @@ def read_colors(
     colors: Array32,
 ) -> None:
     """Write what a photo shows at points (N, 3) whose weights (N,) are above 0; masked, they become 0."""
-    pose = pose_float32(R_cam_from_map, center_map)
+    pose = texels.pose_float32(R_cam_from_map, center_map)
     for n in range(len(points)):
         if weights[n] <= F0:
             continue
-        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
-        k, fu, fv = locate_texel(x, y, z, np.sqrt(x * x + y * y), width)
+        x, y, z = texels.in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        k, fu, fv = texels.locate_texel(x, y, z, np.sqrt(x * x + y * y), width)
         below = k + width + 2
-        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[below], texels[below + 1]
-        weights[n] *= is_valid(t00, t10, t01, t11)
-        blended = bilinear_weights(fu, fv)
+        t00, t10, t01, t11 = image[k], image[k + 1], image[below], image[below + 1]
+        weights[n] *= texels.is_valid(t00, t10, t01, t11)
+        blended = texels.bilinear_weights(fu, fv)
         for c in range(3):
-            colors[n, c] = min(blend(t00, t10, t01, t11, blended, 8 * c) * gains[c], FULL)
+            colors[n, c] = min(texels.blend(t00, t10, t01, t11, blended, 8 * c) * gains[c], FULL)
 
 
 @kernel
