@@ -18,8 +18,8 @@ from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
-from piccolo.cloud.shape import paint_shape
 from piccolo.cloud.stream import Cloud
+from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3

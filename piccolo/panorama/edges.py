@@ -1,4 +1,4 @@
-"""Edges of a photo, as `cloud.shape` paints those of a scan without colours, and the axes of most of them.
+"""Edges of a photo, as `cloud.surfaces` paints those of a scan without colours, and the axes of most of them.
 
 A line's gradients are at right angles to it, wherever it is seen: an axis is the direction at right angles to
 most gradients (Coughlan and Yuille, "Manhattan World", ICCV 1999).
