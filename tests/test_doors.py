@@ -15,8 +15,8 @@ from test_result import RESULT
 import piccolo
 from piccolo import InputError, Pose, Result
 from piccolo.cli import localize as localize_command
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.soa import pack_points
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss

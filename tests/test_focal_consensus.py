@@ -15,7 +15,7 @@ from piccolo.batch.second_look import list_changed_by_consensus, list_looks_by_f
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
 from piccolo.confidence.localization import FocalLength
 from piccolo.geometry.pose import Pose, yaw_rotation

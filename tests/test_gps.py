@@ -13,7 +13,8 @@ from pyproj import Transformer
 from test_cloud_las import RAW
 
 import piccolo
-from piccolo.cloud.crs import from_wgs84, read_crs
+from piccolo.cloud.settings import from_wgs84
+from piccolo.cloud.stream import read_crs
 from piccolo.panorama.photo import GpsPosition, read_photo_facts
 from piccolo.prior import Prior
 from piccolo.scan_map.gps import gps_prior

@@ -18,7 +18,7 @@ import piccolo
 from piccolo.batch.localizer import Localizer
 from piccolo.batch.second_look import Look
 from piccolo.camera import Mount
-from piccolo.camera.files import document_of, read_rig
+from piccolo.camera.calibration import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.cloud.settings import CloudSettings

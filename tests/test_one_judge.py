@@ -11,10 +11,10 @@ from test_walk import _walk_through
 
 import piccolo
 from piccolo.camera import Mount
-from piccolo.camera.files import document_of
+from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results

@@ -16,7 +16,7 @@ from ..errors import InputError, is_passing
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
-from ..jobs.tasks import WorkerLostError
+from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.beside import SurePhoto
 from ..localization.settings import CoarseToFineSettings

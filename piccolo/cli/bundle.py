@@ -7,7 +7,7 @@ from pathlib import Path
 
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import find_scale, read_relative_poses
-from ..files.journal import Journal
+from ..files.line_file import Journal
 from ..opened_scan import OpenedScan
 from ..panorama.photo import sha256_of
 from ..result import Result

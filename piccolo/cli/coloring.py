@@ -10,7 +10,7 @@ from ..batch.localizer import Localizer
 from ..coloring import color_scan
 from ..coloring.color_scan import LEAST_PHOTOS, PAINTED
 from ..confidence.confidence import LOCALIZED
-from ..files.journal import Journal
+from ..files.line_file import Journal
 from ..opened_scan import OpenedScan
 from ..panorama.photo import sha256_of
 from ..result import Result

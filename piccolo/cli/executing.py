@@ -16,8 +16,7 @@ from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..jobs.cluster import LOCAL, Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
-from ..jobs.processes import Processes
-from ..jobs.tasks import Here
+from ..jobs.processes import Here, Processes
 from ..jobs.threads import num_cores
 from ..opened_scan import OpenedScan
 from ..result import FAILED, UNREADABLE

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..batch.localizer import Localizer
 from ..confidence.confidence import LOCALIZED
-from ..files.temporary import temporary_folder
+from ..files.atomic import temporary_folder
 from ..panorama import read_panorama
 from ..views.pictures import encode_image
 from .executing import Executor

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from ..batch.results_file import WAYS, Records, write_results
 from ..files.atomic import is_stream
-from ..files.journal import Journal, keeping_steps
+from ..files.line_file import Journal, keeping_steps
 from ..jobs.threads import Stopwatch
 from ..panorama.photo import sha256_of
 from ..photo import Photo

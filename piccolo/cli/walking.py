@@ -12,10 +12,10 @@ from ..batch.frame_times import times_of
 from ..batch.inputs import is_from_stdin
 from ..batch.relative_poses import read_odometry
 from ..errors import InputError
-from ..files.journal import Journal
-from ..files.temporary import temporary_folder
+from ..files.atomic import temporary_folder
+from ..files.line_file import Journal
 from ..geometry.pose import Pose
-from ..jobs.tasks import InFlight
+from ..jobs.processes import InFlight
 from ..panorama.photo import sha256_of
 from ..panorama.video import frames_of
 from ..photo import Photo

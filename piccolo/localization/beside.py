@@ -16,8 +16,7 @@ from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, skew
 from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
@@ -55,7 +54,7 @@ class Neighbor(NamedTuple):
     pose: Pose  # of the other, by the matches
 
 
-@one_blas_thread
+@one_blas_thread()
 def locate(
     scan_map: ScanMap,
     panorama: Panorama,
@@ -75,7 +74,7 @@ def locate(
     return SurePhoto(place_keypoints(query, pose), found.confidence, gaussian)
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize_beside(
     scan_map: ScanMap,
     panorama: Panorama,

@@ -19,8 +19,7 @@ from ..confidence.focal_length import MOST_CONFLICT, Consensus
 from ..confidence.localization import Localization
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (
@@ -71,7 +70,7 @@ class Agreed(NamedTuple):
     warnings: tuple[str, ...]
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize_bundle(
     scan_map: ScanMap,
     panoramas: Sequence[Panorama],

@@ -10,10 +10,9 @@ from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..panorama import Panorama
-from ..panorama.manhattan import find_axes
+from ..panorama.edges import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate
@@ -44,7 +43,7 @@ class Found(NamedTuple):
     fit: FocalFit | None  # of the photo of one camera, unless the poses are hopeless
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize(
     scan_map: ScanMap,
     panorama: Panorama,

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from piccolo.cloud import open_source
-from piccolo.cloud.ply_writer import vertex_rows, writing_ply
 from piccolo.cloud.readers.reader import CHUNK
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import PointValidator
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.errors import InputError, unreadable
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
 from piccolo.geometry.pose import move, transform_points

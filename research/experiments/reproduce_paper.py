@@ -24,8 +24,8 @@ from piccolo.cli.executing import check_execution
 from piccolo.cli.options import add_execution_options
 from piccolo.cli.outputs import check_distinct, check_folder_name
 from piccolo.cloud import read_cloud
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels

@@ -10,17 +10,17 @@ import numpy as np
 
 from piccolo import scene as scenes
 from piccolo.camera import Calibration
-from piccolo.camera.files import read_cameras
+from piccolo.camera.calibration import read_cameras
 from piccolo.cli.command import check_least, check_only_with, command, option
 from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.outputs import check_folder_name
 from piccolo.cli.progress import progress_bar
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.export.formats import tum_lines, write_lines
-from piccolo.export.video import writing_video
 from piccolo.files.atomic import write_atomically
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optional import import_optional
+from piccolo.panorama.video import writing_video
 from piccolo.views.pictures import encode_image
 
 from . import world as worlds
