@@ -119,7 +119,7 @@ def looked(monkeypatch):
 
     monkeypatch.setattr(OpenedScan, "localize", localize)
     monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
-    monkeypatch.setattr(Localizer, "locate", lambda self, scan, line: line)
+    monkeypatch.setattr(Localizer, "place_keypoints", lambda self, scan, line: line)
     return looked
 
 
@@ -290,7 +290,7 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
-    located, confidence, gaussian = localizer.locate(opened, text)
+    located, confidence, gaussian = localizer.place_keypoints(opened, text)
     assert confidence == json.loads(text)["confidence"]
     in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix
     np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
@@ -299,15 +299,15 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     assert (located.ranges > 0.0).all()
     asked = []
     with monkeypatch.context() as patch:
-        patch.setattr(Localizer, "locate", lambda self, scan, line: asked.append(line))
+        patch.setattr(Localizer, "place_keypoints", lambda self, scan, line: asked.append(line))
         patch.setattr(OpenedScan, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
         answer = localizer.answer_in(opened)
         for beside in ((text, " " + text), (" " + text, "  " + text)):
             answer(localizer.task(photo)._replace(look=Look(0, "ambiguous", str(photo), text, beside, "1")))
     assert [line.count(" {") - text.count(" {") for line in asked] == [0, 1, 1]
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert localizer.locate(opened, text) is None
+    assert localizer.place_keypoints(opened, text) is None
     photo.unlink()
-    assert localizer.locate(opened, text) is None
+    assert localizer.place_keypoints(opened, text) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
         opened.require_default_method("photos beside others", None)

@@ -167,7 +167,7 @@ def make_coloring_job(
     more = {"colors": "those of the other photos"}
 
     def localize(shown: ScanMap, k: int) -> Result:
-        result = localizer.answer(replace(scan, prepared=shown), localizer.task(photos[k])).result
+        result = localizer.answer_in(replace(scan, prepared=shown))(localizer.task(photos[k])).result
         return replace(result, settings={**result.settings, **more})
 
     def run(journal: Journal) -> list[Result]:

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
+from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, skew
@@ -55,23 +56,16 @@ class Neighbor(NamedTuple):
 
 
 @one_blas_thread()
-def locate(
-    scan_map: ScanMap,
-    panorama: Panorama,
-    found: Localization,
-    settings: CoarseToFineSettings,
-    workers: Workers,
+def place_sure(
+    query: Query, pose_world: Pose, covariance: PoseCovariance | None, confidence: float
 ) -> SurePhoto:
     """Return the keypoints of a photo that is localized, and its pose with its errors."""
-    if found.pose is None:
-        raise ValueError("a photo without a pose")
-    query = prepare_query(panorama, scan_map, settings, workers)
-    pose = scan_map.from_world(found.pose)
+    pose = query.scan_map.from_world(pose_world)
     gaussian = None
-    if found.covariance is not None:
-        in_map = turn_positions(found.covariance.matrix, scan_map.R_map_from_world)
+    if covariance is not None:
+        in_map = turn_positions(covariance.matrix, query.scan_map.R_map_from_world)
         gaussian = split_errors(query, pose, in_map)
-    return SurePhoto(place_keypoints(query, pose), found.confidence, gaussian)
+    return SurePhoto(place_keypoints(query, pose), confidence, gaussian)
 
 
 @one_blas_thread()
