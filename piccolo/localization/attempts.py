@@ -21,7 +21,7 @@ from .beam import brief_query, refine_matches, refine_starts, score_mirror, scor
 from .comparison import score_pose
 from .prior import contradictions
 from .query import Query
-from .search import Starts, Tilts, search_poses
+from .search import Tilts, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
 from .verification import verify
@@ -71,15 +71,16 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses
     first = brief_query(query)
     of_mirror = Once(partial(score_mirror, query))
     with query.workers.beside(of_mirror):
-        starts, refined = search_and_refine(first, "known", FIRST_BEAM, watch)
+        with watch.stage("search"):
+            starts = search_poses(first, "known")
         with watch.stage("refine"):
-            found = known + refined
+            found = known + refine_starts(first, starts, FIRST_BEAM)
             return found, is_clear(query, found) and score_starts(first, starts) >= MIRROR_RATIO * of_mirror()
 
 
 def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Search the few rotations of a photo whose lines lie along walls; True if one pose alone is clear."""
-    _, refined = search_and_refine(query, "known", FIRST_BEAM, watch)
+    refined = search_and_refine(query, "known", FIRST_BEAM, watch)
     with watch.stage("refine"):
         found = known + refined
         return found, is_clear(query, found)
@@ -114,20 +115,18 @@ def search_views(
 ) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
     asked = thin_query(query) if is_brief else query
-    _, refined = search_and_refine(asked, tilts, FIRST_BEAM if is_brief else query.method.beam, watch)
+    refined = search_and_refine(asked, tilts, FIRST_BEAM if is_brief else query.method.beam, watch)
     with watch.stage("refine"):
         found = known + add_verified(query, refined)
         return found, is_sure(query, found)
 
 
-def search_and_refine(
-    query: Query, tilts: Tilts, beam: Beam, watch: Stopwatch
-) -> tuple[Starts, list[Hypothesis]]:
-    """Search by whole views; return the starts, and the few poses to which they are refined."""
+def search_and_refine(query: Query, tilts: Tilts, beam: Beam, watch: Stopwatch) -> list[Hypothesis]:
+    """Search by whole views, and refine the starts to a few poses."""
     with watch.stage("search"):
         starts = search_poses(query, tilts)
     with watch.stage("refine"):
-        return starts, refine_starts(query, starts, beam)
+        return refine_starts(query, starts, beam)
 
 
 def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
@@ -148,7 +147,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
         return []
     settings = replace(query.settings, prior=NOTHING_KNOWN)
     anywhere = brief_query(replace(query, scan_map=scan_map, settings=settings))
-    return search_and_refine(anywhere, "known", FIRST_BEAM, watch)[1]
+    return search_and_refine(anywhere, "known", FIRST_BEAM, watch)
 
 
 def match_poses(query: Query) -> list[Pose]:
