@@ -2,6 +2,8 @@
 
 import functools
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +15,14 @@ from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.bundle import CONTRADICTS, NOT_FOUND, UNSEEN, compare_errors, localize_bundle
+from piccolo.localization.bundle import (
+    CONTRADICTS,
+    NOT_FOUND,
+    UNSEEN,
+    compare_errors,
+    judge_member,
+    localize_bundle,
+)
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.localization.bundle_search import (
     Member,
@@ -95,6 +104,21 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
     own = _support(30.0)
     assert weigh_bundles([[own, out, out]], members)[-1] > 0.9
     assert weigh_bundles([[own, own, out]], members)[0] > 0.9
+
+
+@pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])
+def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
+    query = SimpleNamespace(given=SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured)))
+    fit = conflict and SimpleNamespace(conflict=conflict)
+    alone = Localization(is_ruled_out=True, warnings=("mirrored",), confidence=0.0)
+    member = _alone(0.9)
+    member = replace(member, query=query, fit=fit, alone=alone)
+    assert member.own_poses == []
+    assert member.is_misplaced == (conflict == 5.0 and is_measured)
+    if not member.is_misplaced:
+        agreed = SimpleNamespace(warnings=("scale",))
+        result = judge_member(member, 0, SURE, agreed, [], np.array([1.0, 0.0]))
+        assert result == replace(alone, warnings=("mirrored", "scale"))
 
 
 def test_a_photo_belongs_to_the_others_or_does_not():

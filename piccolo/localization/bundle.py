@@ -247,6 +247,8 @@ def judge_member(
 
     `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
     """
+    if member.alone.is_ruled_out and not member.is_misplaced:
+        return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
     right, missed, *_ = support.shares
     if right + missed < EVEN or number in agreed.apart:
         return judge_apart(member, CONTRADICTS)

@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Array
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CONTRADICTED, posterior
+from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
@@ -45,6 +46,13 @@ class Member:
     fit: FocalFit | None
     alone: Localization
     cam_from_bundle: Pose
+
+    @property
+    def is_misplaced(self) -> bool:
+        """True if it is ruled out for another focal length than other photos tell: so its place is wrong."""
+        prior = self.query.given.focal_prior
+        has_conflict = self.fit is not None and self.fit.conflict > MOST_CONFLICT
+        return has_conflict and prior is not None and prior.is_measured
 
     @property
     def own_poses(self) -> list[tuple[Hypothesis, float]]:
