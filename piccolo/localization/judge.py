@@ -1,7 +1,11 @@
 """The judge: of the default method the only maker of a status, of confidences and of what is ruled out.
 
-A photo alone is judged by its evidence. Photos that help each other, guesses of a focal length, and walks
-hand over probabilities and a pose with its errors; they never make a status.
+Every status is made in `decide`. A photo alone comes here with its evidence (`judge`). Photos that help each
+other never make a status; each way for them hands over probabilities, and a pose with its errors:
+- `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`; a new way does this;
+- `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
+- `batch.second_look`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
+- `walk.results`: the probabilities of a frame's places along the path, to `decide`.
 """
 
 import math
