@@ -5,12 +5,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.geometry.pose import Pose, angle_between
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.localization.localize import localize
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
+from piccolo.scan import Scan
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import average_view, normalize_view
 from research.synthetic import make_room
@@ -19,6 +26,7 @@ from research.synthetic.world import make_query, make_world, scan_world
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000
 WIDTH = 512
+AUTO, KNOWN, UNKNOWN = (CoarseToFineSettings(gravity=gravity) for gravity in ("auto", "known", "unknown"))
 
 
 @functools.lru_cache
@@ -43,9 +51,25 @@ def query(seed, variant="clean", index=0, width=WIDTH):
     return make_query(room(seed)[0], index, variant, width, Workers(2))
 
 
+@functools.lru_cache
+def scan(seed, num_threads=2):
+    """A room as it is after it was opened."""
+    return Scan(OpenedScan(scan_map(seed), "room", CloudSettings(), AUTO, Workers(num_threads), {}))
+
+
 def as_panorama(rgb):
     """An image (H, W, 3) as it is read, all pixels valid."""
     return Panorama(rgb, np.ones(rgb.shape[:2], dtype=bool))
+
+
+def ask(panorama, scan_map, settings=AUTO, num_threads=2):
+    """The query of a panorama in a map."""
+    return prepare_query(panorama, scan_map, settings, Workers(num_threads))
+
+
+def locate(panorama, scan_map, settings=AUTO, num_threads=2):
+    """A panorama localized in a map."""
+    return localize(scan_map, panorama, settings, Workers(num_threads), Stopwatch())
 
 
 def errors(pose, true_pose):
@@ -57,6 +81,12 @@ def errors(pose, true_pose):
 def local(seed, pose, num_points=NUM_POINTS):
     """A pose of the world near a room's local origin."""
     return Pose(pose.R_cam_from_world, pose.center_world - room(seed, num_points)[1].origin_world)
+
+
+def points_world(seed, num_points=NUM_POINTS):
+    """The points (N, 3) of a room in the world, float64."""
+    cloud = room(seed, num_points)[1]
+    return cloud.points.astype(np.float64) + cloud.origin_world
 
 
 def packed(seed):
@@ -73,6 +103,13 @@ def scene(seed):
 def view(octree, center_map, config, shown):
     """What is seen around a centre on the cells that are shown."""
     return normalize_view(average_view(octree, center_map, config), center_map, config, shown)
+
+
+def write_cloud(path, seed, num_points=NUM_POINTS, flip=(1.0, 1.0, 1.0)):
+    """A room's points as a PLY, as they are or mirrored; returns its path as text."""
+    rows = vertex_rows(points_world(seed, num_points) * flip, room(seed, num_points)[1].colors)
+    write_ply(path, rows)
+    return str(path)
 
 
 def write_room(folder, words):

@@ -14,7 +14,6 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, query
 from piccolo.localization import localize as method
 from piccolo.localization.photo import ACROSS
-from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
@@ -22,15 +21,13 @@ from piccolo.localization.verification import Verified
 from piccolo.panorama import GPano
 from piccolo.prior import Prior
 
-KNOWN = CoarseToFineSettings(gravity="known")
 
-
-def _localized(panorama, settings=KNOWN):
+def _localized(panorama, settings=rooms.KNOWN):
     return method.localize(rooms.scan_map(1), panorama, settings, Workers(1), Stopwatch())
 
 
-def _query(panorama, settings=KNOWN):
-    return prepare_query(panorama, rooms.scan_map(1), settings, Workers(1))
+def _query(panorama, settings=rooms.KNOWN):
+    return rooms.ask(panorama, rooms.scan_map(1), settings)
 
 
 def _turned_over(panorama):
@@ -53,11 +50,11 @@ def test_a_clear_photo_needs_no_features_and_the_result_says_so(monkeypatch):
 
 @pytest.mark.parametrize("how", ["mirrored", "gravity unknown", "part of a sphere"])
 def test_features_are_asked_of_what_is_not_clear(how):
-    panorama, settings = rooms.as_panorama(rooms.query(1).rgb), KNOWN
+    panorama, settings = rooms.as_panorama(rooms.query(1).rgb), rooms.KNOWN
     if how == "mirrored":
         panorama = _turned_over(panorama)
     elif how == "gravity unknown":
-        settings = CoarseToFineSettings(gravity="unknown")
+        settings = rooms.UNKNOWN
     else:
         is_valid = panorama.is_valid.copy()
         is_valid[:, : is_valid.shape[1] // 3] = False
@@ -98,7 +95,7 @@ def test_of_a_clear_photo_the_mirrored_one_must_start_a_tenth_worse(
 def test_the_mirrored_query_is_that_of_the_mirrored_photo():
     """Its tilt is mirrored with it; where it heads, nothing is known."""
     panorama = rooms.as_panorama(rooms.query(1).rgb)
-    asked = _query(panorama, replace(KNOWN, prior=Prior(heading_deg=30.0)))
+    asked = _query(panorama, replace(rooms.KNOWN, prior=Prior(heading_deg=30.0)))
     photo = replace(asked.photo, R_cam_from_level=exp_so3(np.array([0.0, 0.3, 0.0])))
     tilted = replace(asked, photo=photo)
     mirror = tilted.mirror()
@@ -122,7 +119,7 @@ def test_the_mirrored_query_is_that_of_the_mirrored_photo():
 def test_gravity_and_gps_alone_exclude_no_pose_that_is_searched_for(monkeypatch):
     monkeypatch.setattr(attempts, "search_poses", lambda *_: pytest.fail("a search beyond gravity"))
     told = replace(rooms.as_panorama(rooms.query(1).rgb), gpano=GPano(0.0, 0.0))
-    asked = _query(told, replace(KNOWN, prior=Prior(use_gps=False)))
+    asked = _query(told, replace(rooms.KNOWN, prior=Prior(use_gps=False)))
     assert attempts.search_beyond_prior(asked, rooms.scan_map(1), Stopwatch()) == []
 
 
@@ -213,7 +210,7 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
     monkeypatch.setattr(method, "plan_attempts", plan)
     monkeypatch.setattr(method, "refine_best", lambda query, found: found)
     monkeypatch.setattr(method, "judge", lambda query, found, fit: (len(query.features), found))
-    how = CoarseToFineSettings(), Workers(1), Stopwatch()
+    how = rooms.AUTO, Workers(1), Stopwatch()
     num_parts, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)
     assert places(found) == [1, 2, 0][:num_made]
     assert num_parts == places(found)[-1]

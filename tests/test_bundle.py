@@ -23,16 +23,13 @@ from piccolo.localization.bundle_search import (
     propose_with_scale,
     weigh_bundles,
 )
-from piccolo.localization.localize import localize
 from piccolo.localization.selection import Selection
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
 from research.synthetic.photos import mask_outside_field
 from research.synthetic.world import photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5
-SETTINGS = CoarseToFineSettings(gravity="known")
 ERRORS = RelativeErrors()
 WHERE = (1, 2, 7)  # eighths of a turn; the first photo shows a bare wall
 
@@ -213,7 +210,7 @@ def _localized(seed, num_threads=2, far=0.0, eighths=WHERE):
     photos, poses = zip(*_taken(seed, eighths), strict=True)
     workers = Workers(num_threads)
     return localize_bundle(
-        rooms.scan_map(SEED), photos, _relative(poses, far), SETTINGS, workers, Stopwatch(), ERRORS
+        rooms.scan_map(SEED), photos, _relative(poses, far), rooms.KNOWN, workers, Stopwatch(), ERRORS
     )
 
 
@@ -223,7 +220,7 @@ def _bits(found):
 
 def test_photos_are_localized_together_of_which_one_is_not_alone():
     photos, poses = zip(*_taken(SEED), strict=True)
-    alone = localize(rooms.scan_map(SEED), photos[0], SETTINGS, Workers(2), Stopwatch())
+    alone = rooms.locate(photos[0], rooms.scan_map(SEED), rooms.KNOWN)
     assert alone.status == "not_localized"
     assert pose_errors(alone.pose, poses[0])[0] > 1.0
     found = _localized(SEED)
@@ -263,7 +260,7 @@ def test_photos_that_fit_nowhere_have_no_pose():
 def _together(photos, poses):
     """Results in room SEED of photos with relative poses."""
     scan_map = rooms.scan_map(SEED)
-    return localize_bundle(scan_map, photos, poses, SETTINGS, Workers(2), Stopwatch(), ERRORS)
+    return localize_bundle(scan_map, photos, poses, rooms.KNOWN, Workers(2), Stopwatch(), ERRORS)
 
 
 def test_a_stranger_is_named_and_lowers_nobody():
@@ -296,7 +293,7 @@ def test_a_photo_that_shows_nothing_is_not_localized():
         rooms.scan_map(SEED),
         [nothing, *photos[1:]],
         _relative(poses),
-        SETTINGS,
+        rooms.KNOWN,
         Workers(2),
         Stopwatch(),
         ERRORS,

@@ -5,20 +5,16 @@ import json
 import numpy as np
 import pytest
 from poses import SIZE, result
-from rooms import errors, scan_map
+from rooms import errors
+from rooms import scan as scan_of_room
 
 import piccolo
 from piccolo.cli.localize import main
-from piccolo.cloud.settings import CloudSettings
 from piccolo.export import Options, export
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.jobs.threads import Workers
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.opened_scan import OpenedScan
 from piccolo.paper.settings import PaperSettings
 from piccolo.photo import Photo
 from piccolo.result import read_results
-from piccolo.scan import Scan
 from piccolo.scene import read_scene
 
 COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))
@@ -117,29 +113,24 @@ def test_a_file_without_a_photos_pose_is_refused_before_any_work(scene, relative
     assert "an input as the output" in capsys.readouterr().err
 
 
-@pytest.fixture(scope="module")
-def opened():
-    return OpenedScan(scan_map(7), "room", CloudSettings(), CoarseToFineSettings(), Workers(2), {})
-
-
 def _photos_and_poses(scene):
     truth = read_scene(scene).by_name
     poses = [truth[name].pose @ COMMON_FROM_WORLD.inverse() for name in NAMES]
     return [scene / "images" / name for name in NAMES], poses
 
 
-def test_scan_localizes_many_together(scene, opened):
+def test_scan_localizes_many_together(scene):
     photos, poses = _photos_and_poses(scene)
-    results = Scan(opened).localize_bundle(iter(photos), poses, gravity="known")
+    results = scan_of_room(7).localize_bundle(iter(photos), poses, gravity="known")
     _assert_right(scene, results)
     assert all(piccolo.Result.from_json(r.to_json()).to_json() == r.to_json() for r in results)
     assert results[0].settings["gravity"] == "known"
-    assert Scan(opened).localize_bundle([], []) == []
+    assert scan_of_room(7).localize_bundle([], []) == []
 
 
-def test_relative_poses_that_are_none_are_refused(scene, opened, tmp_path):
+def test_relative_poses_that_are_none_are_refused(scene, tmp_path):
     photos, poses = _photos_and_poses(scene)
-    scan = Scan(opened)
+    scan = scan_of_room(7)
     R = poses[0].R_cam_from_world
     for given, text in (
         (poses[:2], "`relative_poses`: found 2 of 3 photos, wanted one of each photo"),

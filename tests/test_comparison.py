@@ -10,7 +10,6 @@ import rooms
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
-from piccolo.jobs.threads import Workers
 from piccolo.localization import judge as judging
 from piccolo.localization.comparison import (
     CONTRADICTS,
@@ -23,8 +22,6 @@ from piccolo.localization.comparison import (
     score_pose,
 )
 from piccolo.localization.judge import is_mirrored
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
@@ -38,7 +35,7 @@ AREAS = solid_angles(WIDTH)[:, None] / (4 * np.pi) * np.ones(WIDTH)
 
 def _query(rgb, is_hidden=None):
     is_valid = np.ones(rgb.shape[:2], bool) if is_hidden is None else ~is_hidden
-    return prepare_query(Panorama(rgb, is_valid), rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    return rooms.ask(Panorama(rgb, is_valid), rooms.scan_map(1))
 
 
 @functools.lru_cache

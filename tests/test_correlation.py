@@ -16,9 +16,7 @@ from piccolo.localization.correlation import (
     masked_correlation,
     weigh_by_area,
 )
-from piccolo.localization.query import prepare_query
 from piccolo.localization.search import turn_panorama
-from piccolo.localization.settings import CoarseToFineSettings
 
 AREA = make_grid(24).solid_angle
 WIDE_AREA = wider_cells(12)[1]
@@ -26,7 +24,7 @@ WIDE_AREA = wider_cells(12)[1]
 
 def test_scores_equal_correlations_one_by_one():
     rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    query = prepare_query(rooms.scene(1)[1], scan_map, CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.scene(1)[1], scan_map)
     samples, validity = turn_panorama(query.photo.images.search(), uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]

@@ -15,7 +15,6 @@ from test_result import RESULT
 import piccolo
 from piccolo import InputError, Pose, Result
 from piccolo.cli import localize as localize_command
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.kernels.jit import whole
@@ -50,10 +49,7 @@ BAD = {
 
 @pytest.fixture(scope="module")
 def scan():
-    cloud = rooms.room(1)[1]
-    return piccolo.open_scan(
-        piccolo.Cloud(cloud.points + cloud.origin_world, colors=cloud.colors), num_threads=2
-    )
+    return rooms.scan(1)
 
 
 def _assert_refused(message, function, *arguments, **options):
@@ -97,15 +93,13 @@ def test_a_pose_passes_with_every_bit_and_is_a_copy(w, center):
 
 def test_a_left_handed_scan_is_named_at_the_end_of_a_batch(tmp_path, capsys):
     """Its photos are localized mirrored; where one is localized as it is, nothing is tried."""
-    cloud = rooms.room(1)[1]
-    points = cloud.points.astype(np.float64) + cloud.origin_world
     photos = []
     for k in range(3):
         photos.append(str(tmp_path / f"{k}.png"))
         cv2.imwrite(photos[-1], rooms.query(1, index=k).rgb[..., ::-1])
     for name, flip in (("right", 1.0), ("left", -1.0)):
-        write_ply(tmp_path / f"{name}.ply", vertex_rows(points * [1.0, flip, 1.0], cloud.colors))
-        words = ["--cloud", str(tmp_path / f"{name}.ply"), "--cache", str(tmp_path), "--gravity", "known"]
+        cloud = rooms.write_cloud(tmp_path / f"{name}.ply", 1, flip=(1.0, flip, 1.0))
+        words = ["--cloud", cloud, "--cache", str(tmp_path), "--gravity", "known"]
         words += ["--jobs", "1", "--out", str(tmp_path / name), "--pano", *photos]
         code = localize_command.main(words)
         err = capsys.readouterr().err

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rooms
 from pictures import encoded, write
-from rooms import scan_map
-from test_localize_cameras import place, scan
+from test_localize_cameras import SEED, place, scan
 
 import piccolo
 from piccolo.camera import Calibration, Camera, Mount
@@ -20,10 +20,8 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization import localize as module
 from piccolo.localization.comparison import score_pose
-from piccolo.localization.localize import localize, select_likeliest
-from piccolo.localization.query import prepare_query
+from piccolo.localization.localize import select_likeliest
 from piccolo.localization.selection import Selection
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
@@ -42,7 +40,7 @@ def _panorama(rgb, **options):
 
 def _fit(rgb, pose, **options):
     panorama = _panorama(rgb, **options)
-    query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(panorama, rooms.scan_map(SEED))
     return panorama, focal.fit_focal(query, scan().from_world(pose))
 
 
@@ -89,7 +87,7 @@ def test_the_picture_tells_the_focal_length_within_its_deviation():
 def test_matches_with_photos_beside_follow_the_focal_length():
     """A ray goes to the same pixel of the picture, by the new focal length."""
     panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE)
-    query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(panorama, rooms.scan_map(SEED))
     rays = np.float32([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0]])
     beside = NO_MATCHES._replace(rays=rays)
     (turned,) = focal.recalibrate(replace(query, beside=(beside,)), np.array([0.02])).beside
@@ -138,7 +136,7 @@ def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
     assert result.focal_length.px == pytest.approx(TRUE, rel=0.03)
     wrong = Calibration("of another zoom", (Mount(pinhole(640, 480, 1.15 * TRUE)),))
     panorama = _panorama(rgb, camera=wrong)
-    far = localize(scan_map(5), panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
+    far = rooms.locate(panorama, rooms.scan_map(SEED))
     assert far.status == "not_localized"
     assert far.warnings[-1].endswith(" px, not 368: check `camera`")
     assert far.focal_length.px == pytest.approx(TRUE, rel=0.03)
@@ -196,7 +194,7 @@ def test_a_crest_is_that_of_the_design_that_tells_most(monkeypatch):
 def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, crest, share, std):
     """Beyond four deviations the picture alone says where to look next."""
     rgb, pose = _photo(pinhole(640, 480, TRUE))
-    query = prepare_query(_panorama(rgb, focal_px=TRUE), scan_map(5), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
     found = focal.Crest(np.array([crest]), np.array([[0.01**-2]]), np.ones((6, 1)))
     monkeypatch.setattr(focal, "find_crest", lambda *args: found)
     monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
@@ -212,9 +210,7 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
 
 def test_matches_lead_to_a_focal_length_that_is_far_off():
     rgb, pose = _photo(pinhole(640, 480, TRUE))
-    query = prepare_query(
-        _panorama(rgb, focal_px=0.8 * TRUE), scan_map(5), CoarseToFineSettings(), Workers(2)
-    )
+    query = rooms.ask(_panorama(rgb, focal_px=0.8 * TRUE), rooms.scan_map(SEED))
     found = Selection(score_pose(query, scan().from_world(pose)), ())
     query, found = focal.follow_matches(query, found)
     assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
@@ -225,7 +221,7 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
 
 
 def test_other_poses_with_other_guesses_share_the_probability():
-    settings = CoarseToFineSettings()
+    settings = rooms.AUTO
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     here, elsewhere = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
     sure = Localization("localized", 0.95, 0.05, here, evidence=evidence)
@@ -241,7 +237,7 @@ def test_other_poses_with_other_guesses_share_the_probability():
 
 
 def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_listed_twice():
-    settings = CoarseToFineSettings()
+    settings = rooms.AUTO
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     ahead, aside = Pose(np.eye(3), np.array([1.0, 0.1, 0.0])), Pose(np.eye(3), np.array([0.0, 1.0, 0.0]))
     first = replace(
@@ -265,7 +261,7 @@ def test_the_first_sure_guess_ends_the_search(monkeypatch):
         module, "localize", lambda *args: Localization(next(statuses), pose=Pose(np.eye(3), np.zeros(3)))
     )
     panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE, refine_focal=True)
-    module.localize_guessed(scan_map(5), panorama, CoarseToFineSettings(), Workers(1), Stopwatch())
+    module.localize_guessed(rooms.scan_map(SEED), panorama, rooms.AUTO, Workers(1), Stopwatch())
     assert not list(statuses)
 
 

@@ -9,14 +9,12 @@ import pytest
 import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import Matches
 from piccolo.localization.attempts import match_poses
-from piccolo.localization.localize import localize
 from piccolo.localization.prior import contradictions
-from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.prior import Prior
 
@@ -24,7 +22,7 @@ from piccolo.prior import Prior
 @functools.lru_cache
 def _query(seed, variant="clean"):
     panorama = rooms.as_panorama(rooms.query(seed, variant).rgb)
-    return prepare_query(panorama, rooms.scan_map(seed), CoarseToFineSettings(), Workers(2))
+    return rooms.ask(panorama, rooms.scan_map(seed))
 
 
 def _true_pose(seed, variant="clean"):
@@ -116,13 +114,11 @@ def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant
 def test_noise_has_no_pose_that_many_matches_agree_with():
     rgb = np.random.default_rng(9).integers(0, 256, (256, 512, 3)).astype(np.uint8)
     panorama, scan_map = rooms.as_panorama(rgb), rooms.scan_map(1)
-    query = prepare_query(panorama, scan_map, CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(panorama, scan_map)
     for level in (None, np.eye(3)):
         found = propose_poses(query.matches, level, 6, Workers(2))
         assert max([0, *(one.num_matches for one in found)]) < 8
-    flat = prepare_query(
-        rooms.as_panorama(np.full_like(rgb, 90)), scan_map, CoarseToFineSettings(), Workers(2)
-    )
+    flat = rooms.ask(rooms.as_panorama(np.full_like(rgb, 90)), scan_map)
     assert propose_poses(flat.matches, None, 6, Workers(2)) == []
 
 
@@ -159,7 +155,7 @@ def test_a_prior_that_excludes_the_place_makes_no_pose_sure():
     x, y, _ = rooms.query(1).pose.center_world
     prior = Prior(near=(x + 1.4, y, None), radius=0.5)
     settings = CoarseToFineSettings(gravity="known", prior=prior)
-    result = localize(rooms.scan_map(1), rooms.scene(1)[1], settings, Workers(2), Stopwatch())
+    result = rooms.locate(rooms.scene(1)[1], rooms.scan_map(1), settings)
     assert result.status == "not_localized"
     assert "from the place given, not within 0.5 m" in result.warnings[-1]
 
@@ -169,11 +165,9 @@ def test_without_features_the_search_finds_the_pose():
     featureless = replace(
         scan_map, local_features=make_feature_map(scan_map.octree, np.empty((0, 3)), Workers())
     )
-    settings = CoarseToFineSettings(gravity="known")
-    result = localize(featureless, rooms.scene(1)[1], settings, Workers(2), Stopwatch())
+    settings = rooms.KNOWN
+    result = rooms.locate(rooms.scene(1)[1], featureless, settings)
     assert rooms.errors(result.pose, rooms.query(1).pose)[0] < 0.02
-    unsure = localize(
-        featureless, rooms.scene(1)[1], replace(settings, gravity="unknown"), Workers(2), Stopwatch()
-    )
+    unsure = rooms.locate(rooms.scene(1)[1], featureless, replace(settings, gravity="unknown"))
     assert rooms.errors(unsure.pose, rooms.query(1).pose)[0] < 0.02
     assert (unsure.evidence.num_matches, unsure.evidence.alternative_matches) == (0, 0)

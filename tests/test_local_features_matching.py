@@ -21,8 +21,6 @@ from piccolo.local_features.feature_map import (
 )
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 
 
 def _descriptors(rng, count):
@@ -141,12 +139,12 @@ def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
 
 @pytest.fixture(scope="module")
 def matches():
-    query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
     return query.matches
 
 
 def test_matches_of_halves_are_those_of_the_whole_numbered_on():
-    query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
     halves = [half() for half in query.features]
     joined, keypoints = query.matches, query.keypoints
     assert len(joined.query) == sum(len(half.matches.query) for half in halves)

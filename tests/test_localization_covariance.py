@@ -14,11 +14,9 @@ from piccolo.cloud.readers.reader import RawCloud
 from piccolo.confidence.covariance import describe_errors
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.localization import covariance
 from piccolo.localization.comparison import compare
-from piccolo.localization.localize import localize
-from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama
@@ -26,8 +24,6 @@ from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import Cells
 from research.synthetic.places import make_alike
 from research.synthetic.world import World, make_query, scan_world
-
-SETTINGS = CoarseToFineSettings(gravity="known")
 
 
 class Photo(NamedTuple):
@@ -39,8 +35,8 @@ class Photo(NamedTuple):
 @pytest.fixture(scope="module")
 def found():
     scan_map, panorama = rooms.scan_map(2), as_panorama(query(2).rgb)
-    prepared = prepare_query(panorama, scan_map, SETTINGS, Workers(2))
-    result = localize(scan_map, panorama, SETTINGS, Workers(2), Stopwatch())
+    prepared = rooms.ask(panorama, scan_map, rooms.KNOWN)
+    result = rooms.locate(panorama, scan_map, rooms.KNOWN)
     return prepared, scan_map.from_world(result.pose), result
 
 
@@ -131,7 +127,7 @@ def test_deviations_are_of_the_size_of_the_errors():
         for variant in ("clean", "tilt", "change"):
             taken = query(seed, variant)
             how = CoarseToFineSettings(gravity="unknown" if variant == "tilt" else "known")
-            result = localize(scan_map, as_panorama(taken.rgb), how, Workers(2), Stopwatch())
+            result = rooms.locate(as_panorama(taken.rgb), scan_map, how)
             turn = log_so3(taken.pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
             error = np.concatenate([turn, taken.pose.center_world - result.pose.center_world])
             squares.append(error @ np.linalg.solve(result.covariance.matrix, error))
@@ -233,7 +229,7 @@ def test_a_half_that_is_turned_widens_the_covariance_until_it_covers_the_true_po
     taken, scan_map = query(seed), rooms.scan_map(seed)
     errors, stds = [], []
     for rgb in (taken.rgb, turn_half(taken.rgb, azimuth, np.array(turn))):
-        found = localize(scan_map, as_panorama(rgb), SETTINGS, Workers(2), Stopwatch())
+        found = rooms.locate(as_panorama(rgb), scan_map, rooms.KNOWN)
         error = taken.pose.center_world - found.pose.center_world
         errors.append(error @ np.linalg.solve(found.covariance.matrix[3:, 3:], error))
         stds.append(found)
@@ -262,7 +258,7 @@ def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(fou
     assert near.gaussian.covariance.tobytes() == own.gaussian.covariance.tobytes()
     rgb = query(2).rgb.copy()
     rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))
-    hidden = prepare_query(as_panorama(rgb), prepared.scan_map, SETTINGS, Workers(2))
+    hidden = rooms.ask(as_panorama(rgb), prepared.scan_map, rooms.KNOWN)
     seen = compare(hidden, pose)
     shown = covariance.mask_occluders(hidden, seen)
     assert shown is not hidden
@@ -282,7 +278,7 @@ def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     cloud = stream_points(Path("repeated"), RawCloud(points.astype(float), colors))
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
-    result = localize(built, panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
+    result = rooms.locate(panorama, built)
     poses = [result.pose, *(h.pose for h in result.alternatives)]
     distances = [errors(pose, taken.pose)[0] for pose in poses]
     assert min(distances) < 0.1

@@ -2,35 +2,27 @@
 
 import functools
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+import rooms
 from cameras import four_sides
 from pictures import encoded, write
 from PIL import Image
 from PIL.ExifTags import IFD, Base
-from rooms import room, scan_map, write_room
 
 import piccolo
-from piccolo.batch.localizer import Localizer
-from piccolo.batch.second_look import Look
 from piccolo.camera import Mount
 from piccolo.camera.files import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
-from piccolo.cloud.settings import CloudSettings
-from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
+from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import read_panorama
-from piccolo.panorama.photo import sha256_of
 from piccolo.photo import Photo
-from piccolo.result import Beside, Result, read_results
-from piccolo.scan import Scan
+from piccolo.result import Result, read_results
 from research.synthetic.world import (
     make_query,
     photograph,
@@ -45,15 +37,14 @@ DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(512, 0)))
 SEED = 5
 
 
-@functools.lru_cache
 def scan():
-    return Scan(OpenedScan(scan_map(SEED), "room", CloudSettings(), CoarseToFineSettings(), Workers(2), {}))
+    return rooms.scan(SEED)
 
 
 @functools.lru_cache
 def place(index=0):
     """The room as a query finds it, and the query's pose in the world."""
-    world = room(SEED)[0]
+    world = rooms.room(SEED)[0]
     this, _, _ = pose_of_query(world, index, "clean")
     return this, make_query(world, index, "clean", 128, Workers(2)).pose
 
@@ -151,7 +142,8 @@ def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):
 
 def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     """A folder of instants, and a photo with nothing but EXIF; each line names its camera."""
-    folder = write_room(tmp_path, "--seed 5 --points 60000 --panoramas 0")
+    scan = rooms.write_cloud(tmp_path / "cloud.ply", SEED)
+    cloud = ["--cloud", scan, "--cache", "none", "--gravity", "known"]
     this, pose = place()
     mounts = tuple(m.with_camera(pinhole(200, 200, 100.0)) for m in four_sides())
     rig = write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode())
@@ -160,7 +152,6 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
         instant.mkdir(parents=True)
         for mount in mounts:
             write(instant / mount.image, encoded(render_picture(mount, this, pose, Workers(2)), ".png"))
-    cloud = ["--cloud", str(folder / "cloud.ply"), "--cache", "none", "--gravity", "known"]
     main([*cloud, "--pano", str(tmp_path / "walk"), "--rig", str(rig), "--out", str(tmp_path / "out.jsonl")])
     results = read_results([tmp_path / "out.jsonl"])
     assert [Path(result.pano).name for result in results] == ["1", "2"]
@@ -201,31 +192,3 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
     assert results[0].settings["panorama"]["camera"] == str(cameras)
     assert results[2].status == "unreadable"
     assert f"found no calibration of it in {cameras}, wanted c.camera.json or c.json" in results[2].error
-
-
-def test_a_photo_that_was_not_found_is_found_beside_another(tmp_path):
-    """From pictures to results; a copy of itself is none beside it."""
-    this, pose = place(1)
-    beside = Pose(yaw_rotation(0.15) @ pose.R_cam_from_world, pose.center_world + np.array([0.2, 0.15, 0.0]))
-    paths = [tmp_path / "a.png", tmp_path / "b.png"]
-    for path, taken_at in zip(paths, (pose, beside), strict=True):
-        rgb = render_picture(Mount(pinhole(640, 480, 320.0)), this, taken_at, Workers(2))
-        cv2.imwrite(str(path), rgb[..., ::-1])
-    opened = scan()._opened
-    settings = opened.settings, opened.cloud_settings
-    localizer = Localizer((Path("room"),), *settings, Photo("", focal_px=320.0), None)
-    answer = localizer.answer_in(opened)
-    a = answer(localizer.task(paths[0])).result
-    assert a.status == "localized"
-    b = replace(a, pano=str(paths[1]), source=replace(a.source, pano_sha256=sha256_of(paths[1], None)))
-    lost = replace(b, status="not_localized", confidence=0.0, best_pose=None, alternatives=())
-    look = Look(0, lost.status, str(paths[1]), lost.to_json(), (a.to_json(),), "1")
-    found = answer(localizer.task(paths[1])._replace(look=look)).result
-    assert found.status == "localized"
-    assert found.confidence <= a.confidence
-    assert found.beside == Beside((str(paths[0]),), "1")
-    assert pose_errors(found.pose, beside)[0] < 0.05
-    assert Result.from_json(found.to_json()).to_json() == found.to_json()
-    itself = look._replace(beside=(b.to_json(),))
-    again = answer(localizer.task(paths[1])._replace(look=itself)).result
-    assert again.to_json() == replace(lost, beside=Beside((), "1")).to_json()

@@ -20,9 +20,9 @@ from piccolo.localization import query as query_module
 from piccolo.localization.beam import Ends, best_and_alternatives, narrow
 from piccolo.localization.comparison import CONTRADICTS, Comparison
 from piccolo.localization.ladder import AROUND_MIDDLE, FINE, SECOND, Limits
-from piccolo.localization.query import Cache, prepare_query
+from piccolo.localization.query import Cache
 from piccolo.localization.search import Starts
-from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.settings import METHOD
 from piccolo.views.view import Cells
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
@@ -43,7 +43,7 @@ def _asked(is_partial=False):
 
 @functools.lru_cache
 def _query(seed):
-    return prepare_query(rooms.scene(seed)[1], rooms.scan_map(seed), CoarseToFineSettings(), Workers(2))
+    return rooms.ask(rooms.scene(seed)[1], rooms.scan_map(seed))
 
 
 # What is compared

@@ -14,7 +14,6 @@ from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
 from piccolo.localization.photo import make_images
-from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
@@ -30,7 +29,7 @@ AREA = make_grid(24).solid_angle
 @functools.lru_cache
 def _query(gpano=None):
     panorama = dataclasses.replace(rooms.scene(1)[1], gpano=gpano)
-    return prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(num_yaws=12), Workers(2))
+    return rooms.ask(panorama, rooms.scan_map(1), CoarseToFineSettings(num_yaws=12))
 
 
 def _levels(texels):
@@ -144,7 +143,7 @@ def test_the_users_gravity_goes_before_the_tilt_in_the_metadata(tmp_path):
     path.write_bytes(with_metadata(content, xmp=xmp_packet({"PosePitchDegrees": 20})))
     assert read_panorama(path).gpano == GPano(pitch_deg=20.0)
     panorama = read_panorama(Photo(path, gravity_vector=(-9.0, 0.0, -9.0)))
-    photo = prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(), Workers(2)).photo
+    photo = rooms.ask(panorama, rooms.scan_map(1)).photo
     assert photo.has_tilt
     np.testing.assert_allclose(photo.R_cam_from_level @ [0.0, 0.0, -1.0], [-(0.5**0.5), 0.0, -(0.5**0.5)])
 

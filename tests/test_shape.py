@@ -24,9 +24,7 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
-from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.localize import localize
-from piccolo.localization.query import prepare_query
+from piccolo.jobs.threads import Workers
 from piccolo.localization.selection import assess_alone
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
@@ -167,7 +165,7 @@ def test_the_vertical_is_among_the_axes_of_a_photos_lines(turn):
 def test_a_photo_is_found_by_shape(gravity, R):
     taken = rooms.query(SEED, width=WIDTH)
     settings = CoarseToFineSettings(gravity=gravity)
-    found = localize(_shape_map(), _turned(taken.rgb, R), settings, Workers(2), Stopwatch())
+    found = rooms.locate(_turned(taken.rgb, R), _shape_map(), settings)
     true_pose = replace(taken.pose, R_cam_from_world=R @ taken.pose.R_cam_from_world)
     distance, angle_deg = rooms.errors(found.pose, true_pose)
     assert distance < 0.1
@@ -184,9 +182,9 @@ def test_intensity_is_a_channel_of_its_own():
         scan_map = prepare_map(made, Workers(2), has_features=False)
         assert scan_map.has_shape
         assert scan_map.has_intensity == (name == "intensity")
-        settings = CoarseToFineSettings(gravity="known")
+        settings = rooms.KNOWN
         photo = rooms.as_panorama(rooms.query(PATTERNED, width=WIDTH).rgb)
-        pose = localize(scan_map, photo, settings, Workers(2), Stopwatch()).pose
+        pose = rooms.locate(photo, scan_map, settings).pose
         found[name] = rooms.errors(pose, rooms.query(PATTERNED).pose)[0]
     assert found["intensity"] < 0.03
     assert found["shape"] > 1.0
@@ -213,7 +211,7 @@ def test_softer_images_are_whole_across_the_seam():
 
 def test_a_photo_of_another_room_is_not_localized():
     photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
-    found = localize(_shape_map(), photo, CoarseToFineSettings(), Workers(2), Stopwatch())
+    found = rooms.locate(photo, _shape_map())
     assert found.status == "not_localized"
 
 
@@ -222,7 +220,7 @@ def test_a_part_of_the_sphere_counts_less():
     is_valid = np.zeros(taken.rgb.shape[:2], bool)
     is_valid[:, : WIDTH // 4] = True
     for shown, ratio in ((np.ones_like(is_valid), 1.0), (is_valid, 0.5)):
-        query = prepare_query(Panorama(taken.rgb, shown), _shape_map(), CoarseToFineSettings(), Workers(1))
+        query = rooms.ask(Panorama(taken.rgb, shown), _shape_map())
         (standing,) = assess_alone(query, [Hypothesis(_shape_map().from_world(taken.pose), 0.2)])
         assert standing.score == pytest.approx(0.2 * ratio, rel=0.02)
 

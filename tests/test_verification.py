@@ -13,14 +13,11 @@ from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_indices, pixel_rays
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.localize import localize
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.verification import (
     PLACE,
     TURN,
@@ -39,7 +36,6 @@ from research.synthetic.world import change_light, photograph, scan_world
 
 NUM_POINTS = 200_000
 WIDTH = 1024
-SETTINGS = CoarseToFineSettings(gravity="unknown")
 SMALL = np.array([0.01, -0.02, 0.015, 0.05, -0.04, 0.03])  # [rad], [m]
 
 
@@ -51,7 +47,7 @@ def _narrow(seed=1, yaw=1.0):
 
 def _asked(num_threads=2):
     """A query of its own, with an empty cache."""
-    return prepare_query(_narrow()[0], rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(num_threads))
+    return rooms.ask(_narrow()[0], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN, num_threads)
 
 
 @functools.lru_cache
@@ -79,7 +75,7 @@ def _beside():
     rng = np.random.default_rng(0)
     rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
     panorama = Panorama(rgb, _narrow()[0].is_valid)
-    query = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    query = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
     return place_keypoints(query, rooms.local(1, pose, NUM_POINTS))
 
 
@@ -104,7 +100,7 @@ def test_what_moves_with_the_camera_is_no_match():
 def test_a_mirrored_photo_has_no_matches_beside():
     """It has some without that rule, as many things are symmetric."""
     taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
-    mirrored = prepare_query(taken, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    mirrored = rooms.ask(taken, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
     assert len(match_pictures(mirrored.photo.seen().keypoints, _beside().keypoints)[0]) > 0
     assert match_beside(mirrored, _beside()) is NO_MATCHES
 
@@ -128,7 +124,7 @@ def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
     both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
     order = morton_order(both.points, both.colors)
     both = Cloud(both.points[order], both.colors[order], both.origin_world)
-    query = prepare_query(_narrow()[0], prepare_map(both, Workers(2)), SETTINGS, Workers(2))
+    query = rooms.ask(_narrow()[0], prepare_map(both, Workers(2)), rooms.UNKNOWN)
     here = query.scan_map.from_world(_narrow()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
     others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]
@@ -148,7 +144,7 @@ def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     poster = cv2.resize(rng.integers(0, 255, (14, 16, 3), np.uint8), (80, 70), interpolation=cv2.INTER_CUBIC)
     rgb[230:300, 310:390] = poster
     given = Panorama(rgb, panorama.is_valid)
-    occluded = prepare_query(given, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    occluded = rooms.ask(given, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
     for asked, least, most in ((query, 0.5, 1.0), (occluded, 0.0, 0.1)):
         seen = asked.photo.seen().keypoints.rays
         kept = place_keypoints(asked, _true_pose()).keypoints.rays
@@ -259,7 +255,7 @@ def test_half_a_metre_off_the_matches_are_those_of_the_true_pose(offset):
 def test_whole_photos_and_whole_views_alone_are_not_drawn(monkeypatch):
     monkeypatch.setattr(verification, "verify", lambda *_: pytest.fail("drawn"))
     panorama = rooms.scene(1)[1]
-    whole = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    whole = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
     assert count_agreeing(whole, _true_pose()) == count_matches(whole.matches, _true_pose()) > 20
     assert count_agreeing(_query().by_views(), _true_pose()) == 0
 
@@ -319,7 +315,7 @@ def test_without_features_nothing_matches_and_a_lone_one_is_distinct():
 def test_a_narrow_photo_of_unknown_gravity_is_found(seed, yaw, most, most_deg):
     """70 degrees of a room, with furniture and pictures in view."""
     photo, true_pose = _narrow(seed, yaw)
-    found = localize(rooms.scan_map(seed, NUM_POINTS), photo, SETTINGS, Workers(2), Stopwatch())
+    found = rooms.locate(photo, rooms.scan_map(seed, NUM_POINTS), rooms.UNKNOWN)
     distance, angle_deg = rooms.errors(found.pose, true_pose)
     assert found.status == "localized"
     assert distance < most

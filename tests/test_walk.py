@@ -12,7 +12,6 @@ import rooms
 import piccolo
 from piccolo.cli import localize as localize_command
 from piccolo.cli.together import steps_file
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
 from piccolo.export.video import writing_video
@@ -50,9 +49,8 @@ def building(tmp_path_factory):
     """A scan of a room, frames and a video of a walk through it; the folder, and the frames."""
     folder = tmp_path_factory.mktemp("walk") / "a b"
     (folder / "images").mkdir(parents=True)
-    world, cloud = rooms.room(3)
-    points = cloud.points.astype(np.float64) + cloud.origin_world
-    write_ply(folder / "cloud.ply", vertex_rows(points, cloud.colors))
+    world = rooms.room(3)[0]
+    rooms.write_cloud(folder / "cloud.ply", 3)
     frames = []
     with writing_video(folder / "walk.mp4", 1 / STEP_S, (rooms.WIDTH, rooms.WIDTH // 2)) as add:
         for k, pose in enumerate(_walk_through(world)):
@@ -64,9 +62,9 @@ def building(tmp_path_factory):
     return folder, frames
 
 
-@pytest.fixture(scope="module")
-def scan(building):
-    return piccolo.open_scan(building[0] / "cloud.ply", cache=False, num_threads=2)
+@pytest.fixture
+def scan():
+    return rooms.scan(3)
 
 
 def _assert_right(results, queries):
@@ -107,12 +105,6 @@ def test_a_walk_keeps_within_a_prior(scan, building):
     assert results[3].status != "localized"
 
 
-def test_times_are_of_all_frames(scan, building):
-    frames = [q.image for q in building[1][:2]]
-    with pytest.raises(InputError, match=r"^`times`: found 1 of 2 frames, wanted one of each frame$"):
-        scan.localize_walk(frames, [0.0])
-
-
 def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(
     building, tmp_path, monkeypatch, capsys
 ):
@@ -149,17 +141,6 @@ def _short_at(path):
     return check
 
 
-def test_live_results_come_frame_by_frame_and_need_no_times(scan, building):
-    _, queries = building
-    tracker = scan.track(motion=piccolo.Motion(max_speed=0.5), gravity="known")
-    live = [tracker.add(q.image) for q in queries]
-    _assert_right(live, queries)
-    assert [result.walk.time for result in live] == [float(k) for k in range(len(queries))]
-    assert live[1].pano == str(queries[1].image)
-    assert live[1].source.pano_sha256 is not None
-    _assert_right(tracker.finish(), queries)
-
-
 def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, building):
     _, queries = building
     some = [queries[k] for k in (5, 0, 7, 2)]
@@ -181,12 +162,17 @@ def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, bu
     assert walk.add(queries[0].image, 14.0).status == "localized"
 
 
-def test_a_frame_that_has_moved_far_enough_is_compared_with_all_places(scan, building, monkeypatch):
+def test_live_results_need_no_times_and_after_some_way_a_frame_is_compared_with_all_places(
+    scan, building, monkeypatch
+):
     _, queries = building
     monkeypatch.setattr(tracker_module, "BETWEEN_KEYS", 0.4)  # [m] the camera goes 0.23 at a time
-    walk = scan.track(motion=piccolo.Motion(max_speed=0.6), gravity="known")
-    live = [walk.add(q.image, q.time) for q in queries]
+    walk = scan.track(motion=piccolo.Motion(max_speed=0.3), gravity="known")
+    live = [walk.add(q.image) for q in queries]
     _assert_right(live, queries)
+    assert [result.walk.time for result in live] == [float(k) for k in range(len(queries))]
+    assert live[1].pano == str(queries[1].image)
+    assert live[1].source.pano_sha256 is not None
     assert [frame.is_key for frame in walk.tracker.frames] == [k % 2 == 0 for k in range(NUM_FRAMES)]
     assert min(len(frame.states) for frame in walk.tracker.frames[::2]) > 1
     results = walk.finish()
@@ -209,7 +195,7 @@ def test_a_key_frame_that_nobody_departs_from_is_followed_from_where_it_was_trac
     assert pose_errors(result.pose, queries[3].pose)[0] < 0.03
 
 
-def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_path):
+def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_path, capsys):
     """The camera goes too far between frames to be tracked without; on the command line, too."""
     folder, queries = building
     some = [queries[k] for k in (0, 5, 7)]
@@ -219,15 +205,20 @@ def test_odometry_leads_to_where_frames_without_a_view_end(scan, building, tmp_p
     results = scan.localize_walk(frames, odometry=odometry, gravity="known")
     _assert_right(results, some)
     assert [r.walk.how for r in results] == ["alone", "tracked", "tracked"]
-    with pytest.raises(InputError, match=r"^`odometry`: found 1 of 3 frames, wanted one of each frame$"):
-        scan.localize_walk(frames, odometry=odometry[:1])
+    for name, few in (("odometry", odometry[:1]), ("times", [0.0])):
+        with pytest.raises(InputError, match=rf"^`{name}`: found 1 of 3 frames, wanted one of each frame$"):
+            scan.localize_walk(frames, **{name: few})
     lines = tum_lines([(f"{k}", pose) for k, pose in enumerate(odometry)], "optical")
     (tmp_path / "odometry.tum").write_text("\n".join(lines))
     out = tmp_path / "a.jsonl"
     words = ["--walk", "--pano", *map(str, frames), "--odometry", str(tmp_path / "odometry.tum")]
     assert _command(folder, *words, "--out", str(out)) == 0
     assert [r.walk.how for r in read_results([out])] == ["alone", "tracked", "tracked"]
+    before = out.read_bytes()
     assert _command(folder, *words[:-2], "--out", str(out)) == 3  # the results are of another walk
+    assert "use --overwrite to start again" in capsys.readouterr().err
+    assert out.read_bytes() == before
+    assert _command(folder, *words[:-2], "--out", str(out), "--overwrite") == 0
 
 
 def test_odometry_has_the_clock_by_which_frames_are_named(building, tmp_path):
@@ -283,19 +274,6 @@ def test_a_video_of_an_unknown_camera_is_refused_once(building, tmp_path, capsys
     frames[-1].write_bytes(queries[0].image.read_bytes())
     assert _command(folder, "--walk", "--pano", *map(str, frames), "--out", str(out)) == 3
     assert [r.status for r in read_results([out])] == ["unreadable"] * 4 + ["localized"]
-
-
-def test_a_walk_is_the_same_with_any_number_of_threads(building):
-    folder, queries = building
-    found = []
-    for num_threads in (1, 2):
-        scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=num_threads)
-        found.append(scan.localize_walk([q.image for q in queries[:4]], [q.time for q in queries[:4]]))
-    for a, b in zip(*found, strict=True):
-        assert a.pose.R_cam_from_world.tobytes() == b.pose.R_cam_from_world.tobytes()
-        assert a.pose.center_world.tobytes() == b.pose.center_world.tobytes()
-        assert a.covariance.matrix.tobytes() == b.covariance.matrix.tobytes()
-        assert a.confidence == b.confidence
 
 
 def _command(folder, *words):
@@ -357,15 +335,15 @@ def test_frames_come_back_from_their_lines(scan, building):
     assert again.blanks[1].error == walk.blanks[1].error is not None
 
 
-def test_a_narrow_walk_goes_on_with_the_same_bits(building, tmp_path):
-    """Frames are matched with those before, which are read again; with any number of threads."""
-    folder, queries = building
-    is_hidden = abs(np.linspace(-1.0, 1.0, rooms.WIDTH)) > 0.33
+@pytest.mark.parametrize("shown", [0.33, 1.0])
+def test_a_walk_goes_on_with_the_same_bits(building, tmp_path, shown):
+    """Narrow frames are matched with those before, which are read again; with any number of threads."""
+    _, queries = building
+    is_hidden = abs(np.linspace(-1.0, 1.0, rooms.WIDTH)) > shown
     cv2.imwrite(str(tmp_path / "mask.png"), np.uint8(255) * np.tile(is_hidden, (rooms.WIDTH // 2, 1)))
     ends, lines = [], []
     for num_threads, num_kept in ((2, 0), (1, 2)):
-        scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=num_threads)
-        walk = scan.track(gravity="known")
+        walk = rooms.scan(3, num_threads).track(gravity="known")
         for k, query in enumerate(queries[:5]):
             photo = Photo(query.image, mask=tmp_path / "mask.png")
             if k < num_kept:
@@ -376,17 +354,6 @@ def test_a_narrow_walk_goes_on_with_the_same_bits(building, tmp_path):
         ends.append([{**json.loads(result.to_json()), "seconds": None} for result in walk.finish()])
     assert ends[0] == ends[1]
     assert [(end["status"], end["walk"]["how"]) for end in ends[0]].count(("localized", "tracked")) >= 2
-
-
-def test_results_of_another_walk_are_not_overwritten(building, tmp_path, capsys):
-    folder, queries = building
-    walk = ["--walk", "--pano", *(str(q.image) for q in queries[:2]), "--out", str(tmp_path / "a.jsonl")]
-    assert _command(folder, *walk, "--times", _times(folder, queries)) == 0
-    before = (tmp_path / "a.jsonl").read_bytes()
-    assert _command(folder, *walk, "--times", "order") == 3
-    assert "use --overwrite to start again" in capsys.readouterr().err
-    assert (tmp_path / "a.jsonl").read_bytes() == before
-    assert _command(folder, *walk, "--times", "order", "--overwrite") == 0
 
 
 def test_a_video_is_a_walk(building, tmp_path):
@@ -401,46 +368,33 @@ def test_a_video_is_a_walk(building, tmp_path):
     assert len(results) == (len(queries) + 1) // 2
 
 
-REFUSED = {
-    "--video and --pano": (
-        ["--video", "a.mp4", "--pano", "a.jpg"],
-        2,
-        "wanted --walk with --pano, or --video",
-    ),
-    "no frame": (["--walk"], 2, "wanted --walk with --pano, or --video alone"),
-    "no photo": ([], 2, "the following arguments are required: --pano"),
-    "stdin": (["--walk", "--pano", "-"], 2, "--walk: found names on stdin, wanted files or folders"),
-    "speed alone": (["--pano", "a.jpg", "--max-speed", "2"], 2, "--max-speed: only with --walk or --video"),
-    "no speed of photos": (["--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: only with --walk or"),
-    "step of photos": (["--pano", "a.jpg", "--every", "1"], 2, "--every: only with --video"),
-    "jobs": (["--walk", "--pano", "a.jpg", "--jobs", "2"], 2, "--jobs: not with a walk"),
-    "times of a video": (["--video", "a.mp4", "--times", "order"], 2, "--times: not with a video"),
-    "no step of time": (
-        ["--video", "a.mp4", "--every", "nan"],
-        2,
-        "--every: found nan, wanted at least 0.01",
-    ),
-    "step of a walk": (["--walk", "--pano", "a.jpg", "--every", "1"], 2, "--every: only with --video"),
-    "paper": (["--walk", "--pano", "a.jpg", "--preset", "paper"], 2, "not an option of the preset paper"),
-    "odometry alone": (["--pano", "a.jpg", "--odometry", "a.tum"], 2, "--odometry: only with --walk"),
-    "no odometry": (
-        ["--walk", "--pano", "a.jpg", "--times", "order", "--odometry", "missing.tum"],
-        3,
-        "missing.tum: cannot be read (No such file or directory)",
-    ),
-    "no step": (["--walk", "--pano", "a.jpg", "--max-speed", "0"], 2, "--max-speed: found 0.0, wanted"),
-    "no video": (["--video", "missing.mp4"], 3, "missing.mp4: no such file, wanted a video that PyAV reads"),
-    "none of a video": (["--video", "broken.mp4"], 3, "wanted a video that PyAV reads, such as MP4"),
-    "no table": (["--walk", "--pano", "a.jpg", "--times", "missing.csv"], 3, "missing.csv"),
-}
+REFUSED = [
+    ("--video a.mp4 --pano a.jpg", 2, "wanted --walk with --pano, or --video"),
+    ("--walk", 2, "wanted --walk with --pano, or --video alone"),
+    ("", 2, "the following arguments are required: --pano"),
+    ("--walk --pano -", 2, "--walk: found names on stdin, wanted files or folders"),
+    ("--pano a.jpg --max-speed 2", 2, "--max-speed: only with --walk or --video"),
+    ("--pano a.jpg --max-speed 0", 2, "--max-speed: only with --walk or"),
+    ("--walk --pano a.jpg --max-speed 0", 2, "--max-speed: found 0.0, wanted"),
+    ("--pano a.jpg --every 1", 2, "--every: only with --video"),
+    ("--walk --pano a.jpg --every 1", 2, "--every: only with --video"),
+    ("--video a.mp4 --every nan", 2, "--every: found nan, wanted at least 0.01"),
+    ("--walk --pano a.jpg --jobs 2", 2, "--jobs: not with a walk"),
+    ("--video a.mp4 --times order", 2, "--times: not with a video"),
+    ("--walk --pano a.jpg --preset paper", 2, "not an option of the preset paper"),
+    ("--pano a.jpg --odometry a.tum", 2, "--odometry: only with --walk"),
+    ("--walk --pano a.jpg --times order --odometry none.tum", 3, "none.tum: cannot be read (No such file or"),
+    ("--walk --pano a.jpg --times none.csv", 3, "none.csv"),
+    ("--video none.mp4", 3, "none.mp4: no such file, wanted a video that PyAV reads"),
+    ("--video broken.mp4", 3, "wanted a video that PyAV reads, such as MP4"),
+]
 
 
-@pytest.mark.parametrize("case", REFUSED)
-def test_wrong_words_are_one_line(case, building, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(("words", "code", "text"), REFUSED)
+def test_wrong_words_are_one_line(words, code, text, building, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     Path("broken.mp4").write_bytes(b"no video" * 100)
-    words, code, text = REFUSED[case]
-    assert _command(building[0], *words) == code
+    assert _command(building[0], *words.split()) == code
     error = capsys.readouterr().err
     assert text in error
     assert error.count("\n") == 1 or code == 2
