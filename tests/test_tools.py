@@ -1,7 +1,10 @@
 """The measuring tools, on small cases: that they run, and that their tables say what was measured."""
 
+import ast
 import datetime
+import importlib
 import json
+import math
 import re
 
 import cv2
@@ -12,12 +15,13 @@ from batches import ROOT, command_of, run
 from rooms import write_room
 
 from piccolo.geometry.pose import Pose
+from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
 from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, read_scene, write_queries
 from research.evaluation.query_result import QueryResult
-from research.measuring import benchmark, confidence, page, scaling, trials
+from research.measuring import benchmark, confidence, page, scaling, sensitivity, trials
 from research.synthetic import photos
 
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
@@ -148,6 +152,37 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
     assert benchmark.main(["calibration", "--fit", str(tmp_path / "none.jsonl")]) == 3
     (tmp_path / "odd.jsonl").write_text("{}")
     assert benchmark.main(["calibration", "--check", str(tmp_path / "odd.jsonl")]) == 3
+
+
+def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypatch):
+    few = {"localization.attempts": ("MIRROR_RATIO", "NUM_MATCHED")}
+    monkeypatch.setattr(sensitivity, "CONSTANTS", few)
+    assert benchmark.main(["sensitivity", "--scenes", str(scene), "--most", "1", "--quiet"]) == 0
+    head, _, before, *rows = capsys.readouterr().out.strip().splitlines()
+    assert head == "| constant | right | localized | wrong of these | median [mm] | changed |"
+    assert re.fullmatch(r"\| as they are \| [12] \| [12] \| 0 \| \d+\.\d\d \| 0 \|", before)
+    names = [f"localization.attempts.{name} x {factor}" for name in few.popitem()[1] for factor in (0.8, 1.2)]
+    assert [row.split(" | ")[0].strip("| ") for row in rows] == names
+    assert (attempts.MIRROR_RATIO, attempts.NUM_MATCHED) == (1.1, 6)
+
+
+def test_every_constant_that_is_moved_decides_outside_of_kernels():
+    for module, names in sensitivity.CONSTANTS.items():
+        source = (ROOT / "piccolo" / f"{module.replace('.', '/')}.py").read_text()
+        functions = [node for node in ast.walk(ast.parse(source)) if isinstance(node, ast.FunctionDef)]
+        compiled = [
+            node for node in functions if any("kernel" in ast.unparse(d) for d in node.decorator_list)
+        ]
+        used = {name.id for node in compiled for name in ast.walk(node) if isinstance(name, ast.Name)}
+        assert not used & set(names)
+        for name in names:
+            value = getattr(importlib.import_module(f"piccolo.{module}"), name)
+            assert sensitivity.move(value, name, 0.8) != value != sensitivity.move(value, name, 1.2)
+
+
+def test_a_cosine_is_moved_by_its_angle_and_a_number_by_one_at_least():
+    assert sensitivity.move(math.cos(0.5), "COS_AGREE", 1.2) == pytest.approx(math.cos(0.6))
+    assert (sensitivity.move(2, "NUM", 0.8), sensitivity.move(10, "NUM", 1.2)) == (1, 12)
 
 
 def test_fuzzing_runs_and_finds_nothing_at_once(tmp_path):

@@ -4,14 +4,19 @@ import argparse
 
 from piccolo.cli.command import HelpFormatter, add_run_options, command
 
-from . import calibration, confidence, page
+from . import calibration, confidence, page, sensitivity
 
 EPILOG = """\
 example:
   python tools/benchmark.py all --scenes datasets/stanford --out BENCHMARK.md
 
 """
-MEASUREMENTS = {"all": page, "confidence": confidence, "calibration": calibration}
+MEASUREMENTS = {
+    "all": page,
+    "confidence": confidence,
+    "calibration": calibration,
+    "sensitivity": sensitivity,
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
