@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 from scipy.stats import chi2
-from test_pose_gaussian import covariance
+from test_pose import covariance
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract

@@ -1,4 +1,4 @@
-"""The API: what options mean, and what is refused. docs/API.md and examples/ are run by test_examples.py."""
+"""The API: what options mean, and what is refused. docs/API.md and examples/ are run by test_documents.py."""
 
 import dataclasses
 import hashlib

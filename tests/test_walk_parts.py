@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from rooms import write_room
-from test_gps import write_photo
+from test_priors import write_photo
 
 import piccolo
 from piccolo.batch.frame_times import times_of

@@ -1,25 +1,29 @@
-"""The path through a walk's key frames, against the sum over every way there is."""
+"""The path through a walk's key frames, against the sum over every way there is; and lost frames."""
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.walk.beliefs import believe
+from piccolo.walk import second_look
+from piccolo.walk.beliefs import NOTHING, Belief, believe
 from piccolo.walk.frames import MOST_EXPECTED, Frame, State
 from piccolo.walk.motion import JUMP_LOG, Motion, check_times
 from piccolo.walk.path import (
     COPY_LOG_ODDS,
     Gap,
+    Path,
     build_lattice,
     emissions,
     is_moved,
     log_transition,
     motion_between,
 )
+from piccolo.walk.tracker import Followed, expect
 
 MOTION = Motion(max_speed=1.0)
 
@@ -283,3 +287,101 @@ def test_refusals():
         check_times([0.0, np.nan])
     with pytest.raises(InputError, match=r"^`max_speed`: found -1.0, wanted a number above 0$"):
         Motion(max_speed=-1.0)
+
+
+TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
+LOST = 2
+
+
+def _at(x):
+    return Pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+@pytest.fixture
+def walk():
+    """Key frames along a line at 1 m/s, of which one is lost; and what is believed of each."""
+    sure = [State(_at(time), 8.0, 0.5) for time in TIMES]
+    frames = [
+        Frame(time, [state], is_key=True, departed=state.pose)
+        for time, state in zip(TIMES, sure, strict=True)
+    ]
+    frames[LOST] = Frame(TIMES[LOST])
+    beliefs = [Belief([state], np.array([0.99])) for state in sure]
+    beliefs[LOST] = NOTHING
+    probabilities = [belief.probabilities for belief in beliefs]
+
+    def find(query, frame, near):
+        expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
+        return second_look.find_near(query, expected)
+
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), find=find, query_of=lambda k: k)
+    return tracker, Path(probabilities, [None] * len(frames)), beliefs
+
+
+def _find(walk, monkeypatch, x, how="near", is_alone=True):
+    """Look for the lost frame, which is found at a place; return it, and where it was expected."""
+    asked = []
+
+    def find(query, expected):
+        asked.append(expected)
+        return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
+
+    monkeypatch.setattr(second_look, "find_near", find)
+    tracker, path, beliefs = walk
+    second_look._find_lost(tracker, path, beliefs, LOST)
+    return tracker.frames[LOST], asked
+
+
+def test_a_lost_frame_is_expected_from_the_sure_frames_nearest_in_time(walk, monkeypatch):
+    frame, asked = _find(walk, monkeypatch, 10.1)
+    assert [expected.last.center_world[0] for expected in asked] == [9.5]
+    assert asked[0].pose.center_world[0] == pytest.approx(10.0)
+    assert asked[0].reach == Motion().reach(0.5)
+    assert (frame.key, frame.how, frame.is_key) == (1, "near", False)
+    assert frame.arrived.center_world[0] == pytest.approx(10.1)
+    assert walk[2][LOST].states[0].pose.center_world[0] == pytest.approx(10.1)
+
+
+@pytest.mark.parametrize(("x", "is_alone"), [(7.5, True), (10.1, False)])
+def test_a_place_out_of_reach_or_one_of_several_is_none(walk, monkeypatch, x, is_alone):
+    """From the frame after it, at 12 m, one at 7.5 m could not have been reached in 2 s."""
+    frame, asked = _find(walk, monkeypatch, x, "near", is_alone)
+    assert len(asked) == 1
+    assert frame == Frame(TIMES[LOST])
+    assert walk[2][LOST] is NOTHING
+
+
+def test_a_sure_frame_is_not_looked_for(walk, monkeypatch):
+    walk[2][LOST] = walk[2][1]
+    assert _find(walk, monkeypatch, 10.1)[1] == []
+
+
+def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeypatch):
+    """Whatever looks like that place near it."""
+    expected = _at(10.2)
+    tracker, _, beliefs = walk
+    tracker.frames[LOST].key = 1
+    beliefs[LOST] = Belief([State(expected, 4.0)], np.array([0.5]), expected)
+    frame, asked = _find(walk, monkeypatch, 10.1, "tracked", is_alone=False)
+    assert asked[0].pose is expected
+    assert frame.arrived.center_world[0] == pytest.approx(10.1)
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "is_refined", "listed"),
+    [
+        ([0.95, 0.04], [True, False], []),
+        ([0.8, 0.15], [True, False], [1]),
+        ([0.87, 0.05, 0.08], [True, False, False], [2]),
+        ([0.7, 0.06, 0.09, 0.08, 0.07], [True] + 4 * [False], [2, 3, 4]),
+        ([0.86, 0.09, 0.02, 0.02], [True, False, False, False], [1]),
+        ([0.4, 0.09, 0.09], [True, False, False], []),
+        ([0.04, 0.4, 0.3], [True, False, False], [1, 2]),
+    ],
+)
+def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is_refined, listed):
+    """Of those that do so together, as many as leave it sure without them."""
+    states = [State(_at(5.0 * k), 1.0, 0.5 if r else None) for k, r in enumerate(is_refined)]
+    tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
+    path = Path([np.array(probabilities)], [None])
+    assert second_look._list_rough(tracker, path, 0) == listed
