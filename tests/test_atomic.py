@@ -150,10 +150,8 @@ def test_devices_are_written_to_and_a_full_one_is_named():
     assert Path("/dev/full").is_char_device()
 
 
-@pytest.mark.parametrize(
-    ("out", "reason"), [("link.csv", "File too large"), ("-", "No space left on device")]
-)
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, reason):
+@pytest.mark.parametrize(("out", "why"), [("link.csv", "File too large"), ("-", "No space left on device")])
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, why):
     """A limit to the size of files stands for the disk, /dev/full for stdout."""
     (tmp_path / "p.csv").write_bytes(b"old")
     (tmp_path / "link.csv").symlink_to("p.csv")
@@ -162,7 +160,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, reason
     tool = f'"{sys.executable}" "{ROOT}/tools/export_poses.py" --scenes r --format csv'
     command = f"(ulimit -f {1 if out == '-' else 0}; {tool} --out {out} > /dev/full)"
     done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
-    line = f"export_poses.py: {out}: cannot be used ({reason})\n"
+    line = f"export_poses.py: {out}: cannot be used ({why})\n"
     assert (done.returncode, done.stderr) == (3, line)
     assert (tmp_path / "p.csv").read_bytes() == b"old"
     assert names(tmp_path) == ["link.csv", "p.csv", "r"]

@@ -70,9 +70,8 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     assert narrow.pose.distance(near) < 0.05
     localizer = Localizer((Path("room"),), rooms.AUTO, CloudSettings(), Photo("", camera=cameras), None)
     look = Look(0, before.status, narrow.pano, before.to_json(), (narrow.to_json(),), "1")
-    again = localizer.answer_in(rooms.scan(SEED)._opened)(
-        localizer.task(photos / "narrow.png")._replace(look=look)
-    )
+    task = localizer.task(photos / "narrow.png")
+    again = localizer.answer_in(rooms.scan(SEED)._opened)(task._replace(look=look))
     assert again.result == replace(before, beside=Beside((), "1"))
 
 

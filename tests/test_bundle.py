@@ -144,9 +144,7 @@ def test_the_common_frame_is_moved_near():
     assert np.linalg.norm(np.mean([pose.center_world for pose in moved], axis=0)) < 1e-9
     there = moved[1].center_world - moved[0].center_world
     np.testing.assert_allclose(there, cams[1].center_world - cams[0].center_world, atol=1e-9)
-    assert all(
-        np.array_equal(a.R_cam_from_world, b.R_cam_from_world) for a, b in zip(cams, moved, strict=True)
-    )
+    assert all((a.R_cam_from_world == b.R_cam_from_world).all() for a, b in zip(cams, moved, strict=True))
 
 
 @pytest.mark.parametrize("free", [False, True])

@@ -150,9 +150,8 @@ def test_scaled_keeps_rays():
         this = camera(model)
         half = this.scale_to_size(500, 400)
         rays, is_seen = this.rays(points())
-        np.testing.assert_allclose(
-            half.pixels(rays)[0][is_seen], this.pixels(rays)[0][is_seen] / 2.0, atol=1e-9
-        )
+        halved = half.pixels(rays)[0][is_seen]
+        np.testing.assert_allclose(halved, this.pixels(rays)[0][is_seen] / 2.0, atol=1e-9)
     with pytest.raises(InputError, match="found a picture of 500 x 300 and a calibration for 1000 x 800"):
         camera("PINHOLE").scale_to_size(500, 300)
 

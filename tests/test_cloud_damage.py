@@ -123,9 +123,8 @@ def test_a_texture_that_says_it_is_huge_is_refused(tmp_path):
     texture = bytearray(made.png())
     texture[16:24] = struct.pack(">II", 40_000, 40_000)
     texture[29:33] = struct.pack(">I", zlib.crc32(texture[12:29]))
-    ply = made.write_ply(
-        tmp_path / "a.ply", uv=made.UV_FROM_BELOW, options={"comments": ["TextureFile wall.png"]}
-    )
+    options = {"comments": ["TextureFile wall.png"]}
+    ply = made.write_ply(tmp_path / "a.ply", uv=made.UV_FROM_BELOW, options=options)
     glb = made.textured_gltf(bytes(texture)).glb(tmp_path / "a.glb")
     for mesh in (made.write_obj(tmp_path, texture=texture), ply, glb):
         assert "a texture of 40000 x 40000 texels, wanted at most 268435456" in refusal(mesh)

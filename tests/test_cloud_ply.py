@@ -189,10 +189,7 @@ def test_chunks_make_the_same_bytes_as_all_at_once(tmp_path):
 
 def test_an_error_leaves_nothing(tmp_path):
     rows = vertex_rows(*_cloud(10, np.float32)[:2])
-    with (
-        pytest.raises(AttributeError, match="dtype"),
-        writing_ply(tmp_path / "a.ply") as writer,
-    ):
+    with pytest.raises(AttributeError, match="dtype"), writing_ply(tmp_path / "a.ply") as writer:
         writer.add(rows.tolist())
     assert list(tmp_path.iterdir()) == []
 

@@ -164,10 +164,7 @@ def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (
-            ["1200", *["1 2 3 4"] * 1200],
-            r"line 2 has 4 columns, no colours: .*, wanted lines x y z intensity",
-        ),
+        (["1200", *["1 2 3 4"] * 1200], r"line 2 has 4 columns, no colours: .*, wanted lines x y z inten"),
         (["1 2 3"] * 1200, r"line 1 has 3 columns, no colours"),
         (["400", *pts()[:400], "800", *pts("")[400:]], r"line 403: 6 instead of 7 columns"),
         ([*pts()[:900], "12.5", *pts()[900:]], r"line 901: 1 instead of 7 columns"),

@@ -326,13 +326,8 @@ def test_a_colouring_that_was_stopped_goes_on_with_the_same_bits(files, tmp_path
             steps.append(step)
             append(self, step, text)
 
-        words = [
-            *given,
-            "--color-scan",
-            str(tmp_path / f"{name}.ply"),
-            "--out",
-            str(tmp_path / f"{name}.jsonl"),
-        ]
+        out = str(tmp_path / name)
+        words = [*given, "--color-scan", f"{out}.ply", "--out", f"{out}.jsonl"]
         with monkeypatch.context() as patched:
             patched.setattr(Journal, "append", count)
             assert command_line.main(words) == (0 if limit == 99 else 3)

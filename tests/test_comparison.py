@@ -114,9 +114,8 @@ def test_the_true_pose_explains_more_than_others():
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
     query = _query(rooms.query(1).rgb)
     turned = compare(query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world))
-    moved = compare(
-        query, Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.3, 0.0, 0.0]))
-    )
+    beside = true_pose.center_world + np.array([0.3, 0.0, 0.0])
+    moved = compare(query, Pose(true_pose.R_cam_from_world, beside))
     for wrong in (turned, moved):
         assert wrong.score < 0.5 * seen.score
         assert wrong.compute_ratio(seen) < 0.5
@@ -179,9 +178,8 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     after = compare(shown, true_pose)
     seen = compare(query, true_pose)
     assert after.score > seen.score
-    assert after.valid_area == pytest.approx(
-        1.0 - (AREAS * ~shown.photo.panorama.is_valid[::2, ::2]).sum(), abs=0.02
-    )
+    left = 1.0 - (AREAS * ~shown.photo.panorama.is_valid[::2, ::2]).sum()
+    assert after.valid_area == pytest.approx(left, abs=0.02)
     clean = _query(rooms.query(1).rgb)
     fits = (compare(clean, true_pose).correlation >= CONTRADICTS).all()
     assert (mask_occluders(clean, compare(clean, true_pose)) is clean) == fits

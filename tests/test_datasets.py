@@ -237,9 +237,7 @@ FILES = {
         ("a_pano/b_hall_1_scene_1/c.jpg", "pcd/hall_1.txt"),
     ),
     "360loc": (
-        "hall/query_360/s/camera_pose.json",
-        json.dumps({"a.jpg": TRANSFORM.tolist()}),
-        ["hall/cloud.xyz"],
+        "hall/query_360/s/camera_pose.json", json.dumps({"a.jpg": TRANSFORM.tolist()}), ["hall/cloud.xyz"]
     ),
     "matterport3d": (
         "house/matterport_camera_poses/ab_pose_1_5.txt",

@@ -60,13 +60,10 @@ def test_readme_python_prints_what_it_says():
 
 def test_readme_command_prints_and_writes_what_it_says(tmp_path, monkeypatch, capsys):
     (command,) = re.findall(r"^    (python localize.py .*) > pose.json$", README, flags=re.MULTILINE)
-    out = _run_all(
-        [command.replace("examples/", f"{shlex.quote(str(ROOT))}/examples/")], tmp_path, monkeypatch, capsys
-    )
+    command = command.replace("examples/", f"{shlex.quote(str(ROOT))}/examples/")
+    out = _run_all([command], tmp_path, monkeypatch, capsys)
     result = json.loads(out)
-    shown = "".join(
-        re.search(r"^    {\"status\".*\n(?:     .*\n)+", README, flags=re.MULTILINE)[0].split("\n")
-    )
+    shown = re.search(r"^    {\"status\".*\n(?:     .*\n)+", README, flags=re.MULTILINE)[0].replace("\n", "")
     for name, value in json.loads(shown).items():
         if name == "alternatives":
             assert value[0]["center_world"] == pytest.approx(result[name][0]["center_world"], abs=1e-4)

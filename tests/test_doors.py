@@ -75,10 +75,10 @@ def test_what_is_no_pose_is_refused_at_every_door(scan, name):
     assert not walk.blanks
 
 
-@given(
-    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
-    st.lists(st.floats(-9e7, 9e7), min_size=3, max_size=3),
-)
+THREE = {"min_size": 3, "max_size": 3}
+
+
+@given(st.lists(st.floats(-3.0, 3.0), **THREE), st.lists(st.floats(-9e7, 9e7), **THREE))
 def test_a_pose_passes_with_every_bit_and_is_a_copy(w, center):
     pose = Pose(exp_so3(np.array(w)), np.array(center))
     passed = check_pose(pose, "it")
@@ -165,9 +165,8 @@ def test_a_heading_has_a_tolerance():
 def test_times_are_given_for_all_frames_or_for_none(scan, times):
     walk = scan.track()
     walk.add("missing.jpg", times[0])
-    _assert_refused(
-        rf"^`time`: found {times[1]} at frame 1, wanted it of all frames", walk.add, "b.jpg", times[1]
-    )
+    message = rf"^`time`: found {times[1]} at frame 1, wanted it of all frames"
+    _assert_refused(message, walk.add, "b.jpg", times[1])
     assert len(walk.blanks) == len(walk.tracker.frames) == 1
     walk.add("c.jpg", None if times[0] is None else 1.0)
 

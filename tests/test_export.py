@@ -104,10 +104,7 @@ def test_colmap_has_the_camera_of_a_photo_and_of_each_picture_of_a_rig(tmp_path)
     (tmp_path / "rig").mkdir()
     for name in ("left.jpg", "right.jpg"):
         jpeg(tmp_path / "rig" / name)
-    rig = (
-        Mount(CAMERA, image="left.*"),
-        Mount(pinhole(640, 480, 400.0), TILTED, (0.1, 0.2, 0.3), image="r*"),
-    )
+    rig = Mount(CAMERA, image="l*"), Mount(pinhole(640, 480, 400.0), TILTED, (0.1, 0.2, 0.3), image="r*")
     results = [
         result(tmp_path / "a.jpg", POSES[0], cameras=(Mount(CAMERA),)),
         result(tmp_path / "rig", POSES[1], cameras=rig),

@@ -257,9 +257,8 @@ def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_li
 
 def test_the_first_sure_guess_ends_the_search(monkeypatch):
     statuses = iter(["not_localized", "localized"])
-    monkeypatch.setattr(
-        module, "localize", lambda *args: Localization(next(statuses), pose=Pose(np.eye(3), np.zeros(3)))
-    )
+    here = Pose(np.eye(3), np.zeros(3))
+    monkeypatch.setattr(module, "localize", lambda *_: Localization(next(statuses), pose=here))
     panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE, refine_focal=True)
     module.localize_guessed(rooms.scan_map(SEED), panorama, rooms.AUTO, Workers(1), Stopwatch())
     assert not list(statuses)

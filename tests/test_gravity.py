@@ -123,9 +123,8 @@ def two_rooms(door_height):
 @pytest.mark.parametrize(("door_height", "least"), [(2.0, 0.4), (2.6, -0.1), (0.0, -0.1)])
 def test_people_walk_through_doors_and_below_lintels_only(door_height, least):
     points = two_rooms(door_height)
-    cue = passage_cue(
-        points[:, 2], np.isin(points[:, 2], [0.0, 2.6]), np.array([0.0, 2.6]), points[:, :2].copy()
-    )
+    is_level = np.isin(points[:, 2], [0.0, 2.6])
+    cue = passage_cue(points[:, 2], is_level, np.array([0.0, 2.6]), points[:, :2].copy())
     assert least < cue < least + 0.4
 
 

@@ -64,9 +64,8 @@ def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin(pose, is_
     rough_poses(matches, columns, voters, *how, rotations, centers, votes)
     np.testing.assert_allclose(centers[:30], np.tile(pose.center_world, (30, 1)), atol=1e-4)
     np.testing.assert_allclose(rotations[:30], np.tile(pose.R_cam_from_world, (30, 1, 1)), atol=2e-3)
-    np.testing.assert_allclose(
-        votes, [naive.votes(matches, *rough) for rough in zip(rotations, centers, strict=True)]
-    )
+    expected = [naive.votes(matches, *rough) for rough in zip(rotations, centers, strict=True)]
+    np.testing.assert_allclose(votes, expected)
     assert votes[:30].min() > votes[30:].max()
 
 
@@ -129,10 +128,7 @@ def test_poses_that_contradict_a_prior_are_told():
     for prior, wrong in (
         (Prior(), ""),
         (Prior(near=(x + 0.55, y, z), radius=0.5), ""),
-        (
-            Prior(near=(x + 1.4, y, None), radius=0.5),
-            "is 1.40 m from the place given, not within 0.5 m",
-        ),
+        (Prior(near=(x + 1.4, y, None), radius=0.5), "is 1.40 m from the place given, not within 0.5 m"),
         (Prior(height=(z - 0.3, z + 0.3)), ""),
         (Prior(height=(z + 1.0, z + 1.2)), "m above the floor, not"),
         (Prior(heading_deg=heading + 24.0), ""),

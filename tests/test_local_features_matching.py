@@ -86,9 +86,8 @@ def test_components_keep_distances_and_middles_are_of_clusters(monkeypatch):
     is_unclipped = np.abs(projected).max(axis=1) < 127
     both = is_unclipped[:-1] & is_unclipped[1:]
     assert both.sum() > 200
-    np.testing.assert_allclose(
-        np.linalg.norm(projected[:-1] - projected[1:], axis=1)[both], gaps[both], rtol=0.05
-    )
+    found = np.linalg.norm(projected[:-1] - projected[1:], axis=1)
+    np.testing.assert_allclose(found[both], gaps[both], rtol=0.05)
     clusters = np.repeat(_descriptors(rng, 3) // 2, 50, axis=0)
     noisy = (clusters + rng.integers(-2, 3, clusters.shape)).astype(np.int8)
     middles = list_middles(noisy, 3)

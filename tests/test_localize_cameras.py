@@ -102,9 +102,8 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     rgb = render_picture(Mount(camera), this, pose, Workers(2))
     down = tuple((pose.R_cam_from_world @ [0.0, 0.0, -9.81]).tolist())
     fov_deg = float(np.degrees(800 / 230.0))
-    result = scan().localize(
-        Photo(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down), gravity="known"
-    )
+    photo = Photo(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down)
+    result = scan().localize(photo, gravity="known")
     distance, angle = pose_errors(result.best_pose, pose)
     assert distance < 0.02
     assert np.degrees(angle) < 0.5
@@ -184,9 +183,8 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
         write(photos / f"{name}.jpg", encoded(rgb, ".jpg"))
     write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(480, 360, 150.0)),))).encode())
     write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(480, 360, 160.0)),))).encode())
-    results = list(
-        scan().localize_many([Photo(p, camera=cameras) for p in sorted(photos.iterdir())], gravity="known")
-    )
+    given = [Photo(path, camera=cameras) for path in sorted(photos.iterdir())]
+    results = list(scan().localize_many(given, gravity="known"))
     assert [result.focal_length.given_px for result in results[:2]] == [150.0, 160.0]
     assert results[0].status == "localized"
     assert results[0].settings["panorama"]["camera"] == str(cameras)

@@ -42,9 +42,8 @@ def _occluded(panorama, number, rng, contrast):
     rgb, (height, width) = panorama.rgb.copy(), number.shape
     for n in range(1, number.max() + 1):
         pattern = rng.integers(30, 226, 3) + rng.normal(0.0, contrast, (12, 24, 3))
-        image = cv2.resize(
-            pattern.clip(0, 255).astype(np.uint8), (width, height), interpolation=cv2.INTER_CUBIC
-        )
+        texture = pattern.clip(0, 255).astype(np.uint8)
+        image = cv2.resize(texture, (width, height), interpolation=cv2.INTER_CUBIC)
         rgb[number == n] = image[number == n]
     return rooms.as_panorama(rgb)
 

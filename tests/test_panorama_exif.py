@@ -178,14 +178,8 @@ def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
     ("options", "message"),
     [
         ({"focal_px": 0.0}, "`focal_px`: found 0.0, wanted above 0"),
-        (
-            {"focal_px": 500.0, "fov_deg": 60.0},
-            "`focal_px`, `fov_deg` or `projection`: wanted only one of them",
-        ),
-        (
-            {"projection": "cylinder"},
-            "`projection`: found 'cylinder', wanted one of equirectangular, pinhole",
-        ),
+        ({"focal_px": 500.0, "fov_deg": 60.0}, "`focal_px`, `fov_deg` or `projection`: wanted only one"),
+        ({"projection": "cylinder"}, "`projection`: found 'cylinder', wanted one of equirectangular, pin"),
         ({"projection": "fisheye"}, "`projection` fisheye: found no `fov_deg`"),
     ],
 )

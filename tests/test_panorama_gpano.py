@@ -100,9 +100,7 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
     np.testing.assert_array_equal(panorama.rgb, RGB)
     assert panorama.is_valid.all()
     assert "the crop in the metadata is invalid" in panorama.warnings[0]
-    with pytest.raises(
-        InputError, match=r"found a picture of 300 x 200, .* and a crop in the metadata that does"
-    ):
+    with pytest.raises(InputError, match=r"found a picture of 300 x 200, .* and a crop in the metadata"):
         read_panorama(write(tmp_path / "b", file_of(RGB[:, :300], fields)))
 
 

@@ -124,12 +124,8 @@ def test_kept_poses_are_the_first_of_their_neighbourhood():
     rotations = np.stack([uniform_yaws(36)[k] for k in (0, 1, 0, 9)])
     assert non_maximum_suppression(rotations, centers, 9, Nearness(0.5, np.radians(20))).tolist() == [0, 2, 3]
     assert non_maximum_suppression(rotations, centers, 2, Nearness(0.5, np.radians(20))).tolist() == [0, 2]
-    assert non_maximum_suppression(rotations, centers, 9, Nearness(0.5, np.radians(5))).tolist() == [
-        0,
-        1,
-        2,
-        3,
-    ]
+    found = non_maximum_suppression(rotations, centers, 9, Nearness(0.5, np.radians(5)))
+    assert found.tolist() == [0, 1, 2, 3]
 
 
 def test_poses_are_a_group_and_act_on_points():

@@ -63,9 +63,8 @@ def test_a_table_gives_each_photo_its_gravity(tmp_path):
     table = tmp_path / "priors.csv"
     table.write_text("name,gravity_x,gravity_y,gravity_z,height\na.jpg,-4,0,-9,\nb.jpg,,,,1.5\n")
     priors = read_priors(table, Prior())
-    found = [
-        priors.apply(Photo(name, gravity_vector=(0.0, 0.0, -1.0)), Prior()) for name in ("a.jpg", "b.jpg")
-    ]
+    photos = [Photo(name, gravity_vector=(0.0, 0.0, -1.0)) for name in ("a.jpg", "b.jpg")]
+    found = [priors.apply(photo, Prior()) for photo in photos]
     assert [photo.gravity_vector for photo, _ in found] == [(-4.0, 0.0, -9.0), (0.0, 0.0, -1.0)]
     assert [prior.height for _, prior in found] == [None, (1.2, 1.8)]
 

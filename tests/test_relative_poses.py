@@ -102,10 +102,7 @@ def test_a_photo_without_a_pose_is_refused(tmp_path, form, out, file, options, n
         ("1 0 0 0 0 0 0 1e200\n", "found a quaternion without a length, wanted"),
         ("1 0 0 0 0 0 0 nan\n", "found a quaternion without a length, wanted"),
         ("1 inf 0 0 0 0 0 1\n", r"poses.txt, 1: found a position \[inf, 0.0, 0.0\], wanted finite numbers"),
-        (
-            "1 1e30 0 0 0 0 0 1\n",
-            r"1: found a position \[1e\+30, 0.0, 0.0\], wanted",
-        ),
+        ("1 1e30 0 0 0 0 0 1\n", r"1: found a position \[1e\+30, 0.0, 0.0\], wanted"),
         ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "found 2 poses of 1.jpg, wanted one of each photo"),
         (_colmap_row("1.jpg", "0 0 0 0 1 2 3"), "found a quaternion without a length, wanted"),
         (_colmap_row("1.jpg", "1 0 0 0 1 inf 3"), "1.jpg: found a position .*inf.*, wanted finite numbers"),

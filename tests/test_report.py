@@ -85,9 +85,8 @@ def test_photos_know_their_storey_height_and_place_on_the_plan(house, made):
         np.testing.assert_allclose(photo["pose"]["rotation"], pose.R_cam_from_world.ravel(), atol=1e-6)
         center = photo["pose"]["center"] + np.array(document["origin"])
         np.testing.assert_allclose(center, world, atol=1e-6)
-    assert _photo(document, "000.jpg")["spread"]["ellipse"] == pytest.approx(
-        [0.004895, 0.002448, 0], abs=2e-5
-    )
+    spread = _photo(document, "000.jpg")["spread"]
+    assert spread["ellipse"] == pytest.approx([0.004895, 0.002448, 0], abs=2e-5)
 
 
 def test_every_status_is_there_with_what_it_has(made):

@@ -144,9 +144,7 @@ def test_several_files_of_a_cloud_are_a_list():
             Result.from_json(json.dumps(document))
 
 
-@pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/10"}']
-)
+@pytest.mark.parametrize("text", ["{", "[]", "{}", *(f'{{"format": "piccolo-pose/{k}"}}' for k in (3, 10))])
 def test_other_text_is_refused(text):
     with pytest.raises(InputError, match="piccolo-pose/10"):
         Result.from_json(text)

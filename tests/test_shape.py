@@ -262,9 +262,8 @@ def test_files_of_points_alone_are_read_and_others_say_how(tmp_path):
     points = np.round(np.asarray(rooms.room(1)[1].points[:1500], np.float64), 4)
     for name in _bare_files(tmp_path, points):
         cloud = read_cloud(tmp_path / name, CloudSettings(channels=WITHOUT_COLORS))
-        found = (
-            np.asarray(cloud.points, np.float64) + cloud.origin_world - (OFFSETS if "las" in name else 0.0)
-        )
+        shift = OFFSETS if "las" in name else 0.0
+        found = np.asarray(cloud.points, np.float64) + cloud.origin_world - shift
         np.testing.assert_allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=2e-3)
         with pytest.raises(InputError, match="wanted"):
             read_cloud(tmp_path / name, IN_COLORS)

@@ -85,9 +85,8 @@ def test_same_seed_same_bits_at_any_number_of_threads():
 def test_panorama_shows_the_scans_colours_where_the_convention_puts_them(variant):
     """A wrong frame, a mirrored axis or a seam half a turn off would make the colours disagree."""
     cloud, taken = rooms.room(1)[1], rooms.query(1, variant)
-    difference = naive.color_differences(
-        rooms.points_world(1), cloud.colors, taken.pose, taken.rgb, 180, 0.05
-    )
+    shown = taken.pose, taken.rgb, 180, 0.05
+    difference = naive.color_differences(rooms.points_world(1), cloud.colors, *shown)
     assert len(difference) > 0.3 * len(cloud.points)
     assert np.median(difference) < 4.0
 
@@ -274,10 +273,8 @@ def test_photos_of_a_walk_have_one_light_and_their_own_noise():
     clean, photos = (
         np.array([frame.rgb for frame in frames(rate=0.2, variant=v)], float) for v in ("clean", "photo")
     )
-    colors = [
-        photo.mean(axis=(0, 1)) / picture.mean(axis=(0, 1))
-        for photo, picture in zip(photos, clean, strict=True)
-    ]
+    both = zip(photos, clean, strict=True)
+    colors = [photo.mean(axis=(0, 1)) / picture.mean(axis=(0, 1)) for photo, picture in both]
     assert np.ptp(colors, axis=0).max() < 0.1 * np.mean(colors)
     fine = np.diff(photos, axis=2) - np.diff(clean, axis=2)
     alike = np.corrcoef(fine.reshape(len(fine), -1))[np.triu_indices(len(fine), 1)]
@@ -305,9 +302,8 @@ def test_command_line_writes_walks_that_read_back(tmp_path, capsys):
     for query, (time, *center, x, y, z, w) in zip(first, rows.tolist(), strict=True):
         assert (query.time, query.pose.center_world.tolist()) == (time, center)
         R_world_from_optical = rotation_from_quaternion_wxyz(np.array([w, x, y, z]))
-        np.testing.assert_allclose(
-            R_world_from_optical, (OPTICAL_FROM_CAM @ query.pose.R_cam_from_world).T, atol=1e-9
-        )
+        expected = (OPTICAL_FROM_CAM @ query.pose.R_cam_from_world).T
+        np.testing.assert_allclose(R_world_from_optical, expected, atol=1e-9)
     with av.open(folder / "clean_walk_0.mp4") as video:
         shown = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
         assert video.streams.video[0].average_rate == 1

@@ -174,10 +174,8 @@ def test_a_pose_is_refined_towards_the_truth():
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():
     poses = [_true_pose(), step(_true_pose(), SMALL), _moved((1.0, -0.8, 0.0))]
-    one, two = (
-        query.workers.map(functools.partial(verify, query), poses, "verify")
-        for query in (_asked(1), _asked(2))
-    )
+    queries = _asked(1), _asked(2)
+    one, two = (q.workers.map(functools.partial(verify, q), poses, "verify") for q in queries)
     for a, b in zip(one, two, strict=True):
         assert a.num_matches == b.num_matches
         assert a.pose.key == b.pose.key

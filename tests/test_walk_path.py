@@ -72,13 +72,11 @@ def _naive(frames, share):
             log += emitted[k][0][j]
             if before is not None:
                 m, i = before
-                gap = np.linalg.norm(
-                    frames[k].states[j].pose.center_world - frames[m].states[i].pose.center_world
-                )
+                here, there = (frames[f].states[s].pose.center_world for f, s in ((k, j), (m, i)))
+                gap = np.linalg.norm(here - there)
                 expected = min(-math.log(share), MOST_EXPECTED + emitted[k][1])
-                log += float(
-                    log_transition(np.array([gap]), frames[k].time - frames[m].time, MOTION, expected)[0]
-                )
+                passed = frames[k].time - frames[m].time
+                log += float(log_transition(np.array([gap]), passed, MOTION, expected)[0])
             before = k, j
         ways[way] = log
     total = sum(math.exp(log) for log in ways.values())
@@ -174,10 +172,7 @@ def test_known_motions_have_the_error_of_their_length():
 
 
 def test_a_jump_has_a_price_and_is_reported():
-    frames = [
-        *(_key(k, ((k, 0, 0), 5.0)) for k in range(4)),
-        *(_key(k, ((k + 50, 0, 0), 5.0)) for k in range(4, 8)),
-    ]
+    frames = [_key(k, ((k + 50 * (k > 3), 0, 0), 5.0)) for k in range(8)]
     path = build_lattice(frames, Open(), MOTION).smooth()
     assert _chosen(path) == [0] * 8
     assert path.gaps == [None] * 4 + [Gap(51.0, 1.0)] + [None] * 3
@@ -189,11 +184,8 @@ def test_a_jump_has_a_price_and_is_reported():
 
 
 def test_frames_without_times_may_be_anywhere_and_report_no_gap():
-    assert (Motion().speed, Motion(is_timed=False).speed, Motion(max_speed=3.0, is_timed=False).speed) == (
-        2.0,
-        5.0,
-        3.0,
-    )
+    motions = Motion(), Motion(is_timed=False), Motion(max_speed=3.0, is_timed=False)
+    assert [motion.speed for motion in motions] == [2.0, 5.0, 3.0]
     frames = [_key(k, ((50.0 * k, 0, 0), 1.0)) for k in range(4)]
     path = build_lattice(frames, Open(), Motion(is_timed=False)).smooth()
     assert _chosen(path) == [0] * 4
@@ -301,10 +293,8 @@ def _at(x):
 def walk():
     """Key frames along a line at 1 m/s, of which one is lost; and what is believed of each."""
     sure = [State(_at(time), 8.0, 0.5) for time in TIMES]
-    frames = [
-        Frame(time, [state], is_key=True, departed=state.pose)
-        for time, state in zip(TIMES, sure, strict=True)
-    ]
+    both = zip(TIMES, sure, strict=True)
+    frames = [Frame(time, [state], is_key=True, departed=state.pose) for time, state in both]
     frames[LOST] = Frame(TIMES[LOST])
     beliefs = [Belief([state], np.array([0.99])) for state in sure]
     beliefs[LOST] = NOTHING

@@ -225,9 +225,7 @@ def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, 
     query, true = seen
     probability = 1.0 / (1.0 + np.exp(-odds))
     seen_there = Comparison(np.array([CHANCE + (1.0 - CHANCE) * score]), np.ones(1), np.ones(1), 1.0)
-    monkeypatch.setattr(
-        tracker, "refine_near", lambda query, start: Near(start, seen_there, None, probability)
-    )
+    monkeypatch.setattr(tracker, "refine_near", lambda _, start: Near(start, seen_there, None, probability))
     assert (track(query, true) is not None) == is_found
 
 
