@@ -1,7 +1,11 @@
 """Seeded synthetic rooms, small and quick, kept for all tests of a run."""
 
+import contextlib
+import fcntl
 import functools
+import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -18,6 +22,7 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
 from piccolo.scan import Scan
+from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import average_view, normalize_view
 from research.synthetic import make_room
@@ -26,6 +31,7 @@ from research.synthetic.world import make_query, make_world, scan_world
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000
 WIDTH = 512
+SHARED = []  # the folder that all workers of a run have in common; conftest.py puts it in
 AUTO, KNOWN, UNKNOWN = (CoarseToFineSettings(gravity=gravity) for gravity in ("auto", "known", "unknown"))
 
 
@@ -40,9 +46,30 @@ def room(seed, num_points=NUM_POINTS):
     return world, Cloud(points[order], colors[order], origin_world)
 
 
+def make_once(name, make):
+    """A file or folder in the folder of all workers, made by the first that asks for it; returns its path."""
+    path = SHARED[0] / name
+    with Path(f"{path}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            make(path)
+    return path
+
+
+def make_map(seed, num_points=NUM_POINTS):
+    """The map of a room, prepared anew."""
+    return replace(prepare_map(room(seed, num_points)[1], Workers(2)), scan_sha256=64 * "0")
+
+
+def map_path(seed, num_points=NUM_POINTS):
+    """The file of a room's map."""
+    return make_once(f"{seed}-{num_points}.map", lambda path: save_map(make_map(seed, num_points), path))
+
+
 @functools.lru_cache
 def scan_map(seed, num_points=NUM_POINTS):
-    return replace(prepare_map(room(seed, num_points)[1], Workers(2)), scan_sha256=64 * "0")
+    """The map of a room, which one worker prepares for all."""
+    return load_map(map_path(seed, num_points))
 
 
 @functools.lru_cache
@@ -115,5 +142,6 @@ def write_cloud(path, seed, num_points=NUM_POINTS, flip=(1.0, 1.0, 1.0)):
 def write_room(folder, words):
     """A room's files by tools/make_room.py with its options in one string; returns the folder."""
     size = ["--size", *map(str, SIZE)]
-    assert make_room.main(["--out", str(folder), *size, "--quiet", *words.split()]) == 0
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert make_room.main(["--out", str(folder), *size, "--quiet", *words.split()]) == 0
     return folder

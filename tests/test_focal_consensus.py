@@ -125,8 +125,7 @@ def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
         poses.append(Pose(turned, pose.center_world + np.array([0.05 * k, 0.03, 0.0])))
         picture = render_picture(Mount(pinhole(320, 240, 0.5 * TRUE)), room, poses[k], Workers(2))
         write(photos / f"{k}.png", encoded(picture, ".png"))
-    cloud = rooms.write_cloud(tmp_path / "scan.ply", SEED)
-    words = ["--cloud", cloud, "--pano", str(photos), "--focal", str(0.515 * TRUE)]
+    words = ["--cloud", str(rooms.map_path(SEED)), "--pano", str(photos), "--focal", str(0.515 * TRUE)]
     out = tmp_path / "poses.jsonl"
     main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
     results = read_results([out])

@@ -141,8 +141,7 @@ def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):
 
 def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     """A folder of instants, and a photo with nothing but EXIF; each line names its camera."""
-    scan = rooms.write_cloud(tmp_path / "cloud.ply", SEED)
-    cloud = ["--cloud", scan, "--cache", "none", "--gravity", "known"]
+    cloud = ["--cloud", str(rooms.map_path(SEED)), "--gravity", "known"]
     this, pose = place()
     mounts = tuple(m.with_camera(pinhole(200, 200, 100.0)) for m in four_sides())
     rig = write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode())
