@@ -50,7 +50,8 @@ def counted(monkeypatch):
 
 def _run(scene, out, *more, pano=None):
     cloud, panos = str(scene / "cloud.ply"), pano or [str(scene / "images")]
-    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", "none", *more])
+    cache = str(scene.parent / "maps")
+    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", cache, *more])
 
 
 def _lines(out):

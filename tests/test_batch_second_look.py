@@ -164,7 +164,7 @@ def looked(monkeypatch):
 
 
 def _run(scene, photos, *more):
-    cloud, cache = str(scene / "cloud.ply"), scene.parent / "cache of second looks"
+    cloud, cache = str(scene / "cloud.ply"), scene.parent / "maps"
     return localize.main(["--cloud", cloud, "--pano", str(photos), "--cache", str(cache), *map(str, more)])
 
 

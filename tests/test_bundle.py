@@ -41,10 +41,9 @@ def _support(odds, elsewhere=0.0, is_found=True):
 def _alone(*probabilities):
     """A photo with poses of its own."""
     poses = [at(float(k), 0.5) for k in range(len(probabilities))]
-    alternatives = tuple(
-        Alternative(h.pose, h.score, None, p) for h, p in zip(poses, probabilities, strict=True)
-    )
-    alone = Localization(confidence=probabilities[0], alternatives=alternatives[1:])
+    likely = list(zip(poses, probabilities, strict=True))
+    alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
+    alone = Localization(confidence=probabilities[0], alternatives=alternatives)
     return Member(None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0])
 
 
@@ -58,9 +57,7 @@ def test_one_sure_photo_is_enough_beside_misses():
     probabilities = weigh_bundles(bundles, TEN[:3])
     assert probabilities[0] > 0.98
     assert probabilities.sum() == pytest.approx(1.0)
-    many = weigh_bundles(
-        [[*bundles[0], *[MISSES] * 20]], TEN[:3]
-    )  # bare walls lie together: they count as one
+    many = weigh_bundles([[*bundles[0], *[MISSES] * 20]], TEN[:3])  # bare walls: they count as one
     assert many[0] == pytest.approx(weigh_bundles(bundles[:1], TEN[:3])[0])
 
 
@@ -202,14 +199,17 @@ def _relative(poses, far=0.0):
     return [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in noisy]
 
 
+def _together(photos, poses, num_threads=2):
+    """Results in room SEED of photos with relative poses."""
+    how = rooms.KNOWN, Workers(num_threads), Stopwatch(), ERRORS
+    return localize_bundle(rooms.scan_map(SEED), photos, poses, *how)
+
+
 @functools.lru_cache
 def _localized(seed, num_threads=2, far=0.0, eighths=WHERE):
     """Results in room SEED of photos of a room."""
     photos, poses = zip(*_taken(seed, eighths), strict=True)
-    workers = Workers(num_threads)
-    return localize_bundle(
-        rooms.scan_map(SEED), photos, _relative(poses, far), rooms.KNOWN, workers, Stopwatch(), ERRORS
-    )
+    return _together(photos, _relative(poses, far), num_threads)
 
 
 def _bits(found):
@@ -233,17 +233,19 @@ def test_photos_are_localized_together_of_which_one_is_not_alone():
 
 
 def test_photos_of_another_room_are_not_localized():
-    for found in _localized(6):
+    for found in _localized(6, eighths=WHERE[:2]):
         assert found.status == "not_localized"
         assert found.confidence < 0.5
 
 
 def test_bundles_are_the_same_bits_at_any_number_of_threads():
-    assert _bits(_localized(SEED, 1)) == _bits(_localized(SEED, 2))
+    one, two = (_localized(SEED, num_threads, 0.0, WHERE[:2]) for num_threads in (1, 2))
+    assert _bits(one) == _bits(two)
 
 
 def test_it_does_not_matter_where_the_common_frame_begins():
-    for near, far in zip(_localized(SEED), _localized(SEED, far=1e6), strict=True):
+    both = (_localized(SEED, 2, far, WHERE[:2]) for far in (0.0, 1e6))
+    for near, far in zip(*both, strict=True):
         assert pose_errors(near.pose, far.pose)[0] < 1e-5
         assert near.confidence == pytest.approx(far.confidence, abs=1e-4)
 
@@ -255,17 +257,11 @@ def test_photos_that_fit_nowhere_have_no_pose():
     assert found.warnings == (NOT_FOUND,)
 
 
-def _together(photos, poses):
-    """Results in room SEED of photos with relative poses."""
-    scan_map = rooms.scan_map(SEED)
-    return localize_bundle(scan_map, photos, poses, rooms.KNOWN, Workers(2), Stopwatch(), ERRORS)
-
-
 def test_a_stranger_is_named_and_lowers_nobody():
     photos, poses = zip(*_taken(SEED), strict=True)
-    stranger = _taken(6)[2][0]
+    ((stranger, _),) = _taken(6, WHERE[2:])
     *right, other = _together([*photos[:2], stranger], _relative(poses))
-    pair = _together(photos[:2], _relative(poses)[:2])
+    pair = _localized(SEED, 2, 0.0, WHERE[:2])
     assert other.status == "not_localized"
     assert other.warnings in ((UNSEEN,), (CONTRADICTS,))
     for with_stranger, without in zip(right, pair, strict=True):
@@ -287,14 +283,6 @@ def test_a_photo_that_shows_nothing_is_not_localized():
     """The others are."""
     photos, poses = zip(*_taken(SEED), strict=True)
     nothing = Panorama(photos[0].rgb, np.zeros_like(photos[0].is_valid))
-    found = localize_bundle(
-        rooms.scan_map(SEED),
-        [nothing, *photos[1:]],
-        _relative(poses),
-        rooms.KNOWN,
-        Workers(2),
-        Stopwatch(),
-        ERRORS,
-    )
+    found = _together([nothing, *photos[1:]], _relative(poses))
     assert [f.status for f in found] == ["not_localized", "localized", "localized"]
     assert found[0].pose is None

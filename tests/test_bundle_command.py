@@ -33,7 +33,7 @@ def relative(scene, tmp_path_factory):
 
 def _command(scene, relative, *options):
     photos = [str(scene / "images" / name) for name in NAMES]
-    cloud = ["--cloud", str(scene / "cloud.ply"), "--cache", "none", "--gravity", "known", "--threads", "2"]
+    cloud = ["--cloud", str(scene / "cloud.ply"), "--cache", str(scene.parent / "maps"), "--gravity", "known"]
     return [*cloud, "--relative", str(relative), *map(str, options), "--pano", *photos]
 
 

@@ -29,7 +29,7 @@ PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_p
 
 def _arguments(scene, *more):
     pano = str(scene / "images" / "clean_0.jpg")
-    return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--cache", "none", *more]
+    return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--cache", str(scene.parent / "maps"), *more]
 
 
 def _truth(scene):
