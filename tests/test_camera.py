@@ -20,13 +20,7 @@ from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from research.synthetic.world import (
-    make_query,
-    photograph,
-    picture_of_all,
-    pose_of_query,
-    render_picture,
-)
+from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
 
 SIZE = (1000, 800)
 TOLERANCE = 1e-6  # px

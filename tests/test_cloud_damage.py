@@ -67,9 +67,14 @@ def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
     head = mutated(data.draw, st.integers, content[:cut])
     path = tmp_path_factory.getbasetemp() / f"mutated {name}"
     path.write_bytes(head + mutated(data.draw, st.integers, content[cut:]))
-    result, message = read_or_refused(lambda path: read(path) if path.stat().st_size > 8 else None, path)
-    assert result is None or result[0].shape == result[1].shape
-    assert message or result or path.stat().st_size <= 8
+    if path.stat().st_size <= 8:  # a text of one line, perhaps
+        return
+    result, message = read_or_refused(read, path)
+    assert (result is None) == bool(message)
+    if result is not None:
+        points, colors = result
+        assert points.shape == colors.shape
+        assert (points.dtype.kind, colors.dtype) == ("f", np.uint8)
 
 
 @pytest.mark.parametrize("name", ["a.las", "7.laz"])
@@ -221,14 +226,11 @@ BASE = ("materials", 0, "pbrMetallicRoughness")
 def test_broken_gltf_is_refused(tmp_path, path, value):
     gltf = made.textured_gltf()
     made.change(path, value)(gltf.tree)
-    refusal(gltf.glb(tmp_path / "a.glb"), open_mesh)
+    message = refusal(gltf.glb(tmp_path / "a.glb"), open_mesh)
+    assert path != ("extensionsRequired",) or f"requires the extensions {value[0]!r}, wanted" in message
 
 
-def test_gltf_with_extensions_or_with_wrong_indices_or_colors_says_so(tmp_path):
-    gltf = made.textured_gltf()
-    gltf.tree["extensionsRequired"] = ["KHR_draco_mesh_compression"]
-    message = refusal(gltf.glb(tmp_path / "a.glb"))
-    assert message.endswith("requires the extensions 'KHR_draco_mesh_compression', wanted a plain glTF mesh")
+def test_gltf_with_wrong_indices_or_colors_says_so(tmp_path):
     gltf = made.Gltf()
     gltf.node(mesh=gltf.mesh(triangles=made.TRIANGLES + 2, colors=made.CORNER_COLORS, uv=None))
     assert "a face names vertex 5 " in refusal(gltf.glb(tmp_path / "a.glb"))

@@ -185,8 +185,8 @@ def scene(tmp_path_factory):
 
 
 def _localized(scene, capsys, *options, pano="labels/clean_0.png"):
-    files = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / pano), "--cache", "none", "--quiet"]
-    code = localize.main([*files, *options])
+    files = ["--cloud", str(scene / "cloud.ply"), "--cache", str(scene.parent / "maps"), "--quiet"]
+    code = localize.main([*files, "--pano", str(scene / pano), *options])
     out, err = capsys.readouterr()
     return (Result.from_json(out) if out else None), code, err
 

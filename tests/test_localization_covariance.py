@@ -12,12 +12,11 @@ from rooms import as_panorama, errors, query
 from piccolo.cloud import stream_points
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.confidence.covariance import describe_errors
-from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
+from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.localization import covariance
 from piccolo.localization.comparison import compare
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
@@ -116,21 +115,6 @@ def test_covariance_is_in_the_worlds_axes(found):
     other = describe_errors(told.gaussian, R.T).matrix
     np.testing.assert_allclose(other[:3, :3], own[:3, :3], rtol=1e-6)
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
-
-
-def test_deviations_are_of_the_size_of_the_errors():
-    """Squared errors, weighed by their covariance: 5.3 in the median for six numbers if all is right."""
-    squares = []
-    for seed in (1, 2, 3):
-        scan_map = rooms.scan_map(seed)
-        for variant in ("clean", "tilt", "change"):
-            taken = query(seed, variant)
-            how = CoarseToFineSettings(gravity="unknown" if variant == "tilt" else "known")
-            result = rooms.locate(as_panorama(taken.rgb), scan_map, how)
-            turn = log_so3(taken.pose.R_cam_from_world @ result.pose.R_cam_from_world.T)
-            error = np.concatenate([turn, taken.pose.center_world - result.pose.center_world])
-            squares.append(error @ np.linalg.solve(result.covariance.matrix, error))
-    assert 2.5 < np.median(squares) < 10.5  # deviations right to a factor of 1.4
 
 
 @pytest.mark.parametrize("num_rough", [1, 2, 3])

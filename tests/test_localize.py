@@ -105,13 +105,6 @@ def test_files_are_written_and_look_right(scene, tmp_path, capsys):
     assert (checkerboard[tile[1]] == cloud[tile[1]]).all()
 
 
-def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
-    elsewhere = tmp_path / "elsewhere.png"
-    cv2.imwrite(str(elsewhere), query(1).rgb)
-    assert localize.main(_arguments(scene, "--pano", str(elsewhere), *PAPER, "--quiet")) == 1
-    assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
-
-
 GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
 
 

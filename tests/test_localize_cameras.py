@@ -23,13 +23,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from piccolo.result import Result, read_results
-from research.synthetic.world import (
-    make_query,
-    photograph,
-    picture_of_all,
-    pose_of_query,
-    render_picture,
-)
+from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
 FISHEYE = Camera("OPENCV_FISHEYE", 512, 512, (150.0, 150.0, 256.0, 256.0, 0.01, -0.003, 0.0, 0.0), 95.0)

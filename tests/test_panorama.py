@@ -77,12 +77,7 @@ def test_alpha_is_turned_with_the_colors(tmp_path, orientation):
 
 @pytest.mark.parametrize(
     ("width", "height", "expected"),
-    [
-        (1000, 500, (500, 1000)),
-        (1001, 501, (500, 1000)),
-        (999, 501, (499, 998)),
-        (990, 500, (495, 990)),
-    ],
+    [(1000, 500, (500, 1000)), (1001, 501, (500, 1000)), (999, 501, (499, 998)), (990, 500, (495, 990))],
 )
 def test_nearly_two_to_one_is_shrunk(tmp_path, width, height, expected):
     stored = np.dstack([smooth_rgb(height, width), np.full((height, width), 255, dtype=np.uint8)])

@@ -206,6 +206,8 @@ def test_the_paper_refuses_what_it_would_ignore(option):
         paper.localize(rooms.query(1).rgb, prior=Prior())
     with pytest.raises(InputError, match="walks: not available with the preset paper"):
         paper.track()
+    with pytest.raises(InputError, match="`relative_poses`: not available with the preset paper"):
+        paper.localize_bundle(["a.jpg"], [rooms.query(1).pose])
 
 
 def test_a_photo_that_cannot_be_read_is_a_result_among_many(tmp_path, scan):

@@ -292,9 +292,12 @@ def test_files_with_and_without_colours_are_one_scan_by_shape_alone(tmp_path):
     assert [source.channel for source in mixed.sources] == ["shape", "shape"]
 
 
-def test_arrays_without_colours_are_a_scan(tmp_path):
-    scan = piccolo.open_scan(rooms.room(1)[1].points, cache=False)
-    assert SHAPE_ALONE in scan.warnings
+def test_arrays_and_files_without_colours_are_scans(tmp_path):
+    points = rooms.room(1)[1].points
+    np.save(tmp_path / "colored.npy", np.column_stack([points, np.full_like(points, 100.0)]))
+    ignoring = piccolo.Cloud(tmp_path / "colored.npy", ignore_colors=True)
+    for source in (points[::4], ignoring):
+        assert SHAPE_ALONE in piccolo.open_scan(source, cache=False).warnings
 
 
 def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
@@ -306,12 +309,11 @@ def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
 
 
 def test_the_command_localizes_in_a_scan_without_colours(tmp_path, capsys):
-    cloud = rooms.room(SEED, NUM_POINTS)[1]
-    np.save(tmp_path / "bare.npy", np.asarray(cloud.points, np.float64) + cloud.origin_world)
+    save_map(_shape_map(), tmp_path / "bare.map")
     taken = rooms.query(SEED, width=WIDTH)
     cv2.imwrite(str(tmp_path / "a photo.png"), taken.rgb[..., ::-1])
-    arguments = ["--cloud", str(tmp_path / "bare.npy"), "--pano", str(tmp_path / "a photo.png")]
-    code = command_line.main([*arguments, "--ignore-colors", "--cache", "none", "--quiet"])
+    arguments = ["--cloud", str(tmp_path / "bare.map"), "--pano", str(tmp_path / "a photo.png")]
+    code = command_line.main([*arguments, "--quiet"])
     out = json.loads(capsys.readouterr().out)
     found = out if out["center_world"] else out["best_guess"]
     assert np.linalg.norm(np.array(found["center_world"]) - taken.pose.center_world) < 0.1
