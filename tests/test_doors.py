@@ -47,7 +47,10 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
+REFINED = piccolo.Photo(np.zeros((64, 128, 3), np.uint8), refine_focal=True)
+
+
+@pytest.fixture
 def scan():
     return rooms.scan(1)
 
@@ -141,6 +144,11 @@ def test_the_whole_part_of_a_pixel_is_as_before(u):
         (lambda s: piccolo.open_scan(np.full((2000, 3), "x")), "^points: found <U1, wanted numbers"),
         (lambda s: piccolo.open_scan(np.full((2000, 3), None)), "^points: found object, wanted numbers"),
         (lambda s: s.localize(None), "^`picture`: found None, wanted a path or an array"),
+        (
+            lambda s: s.localize(np.zeros((300, 400, 3), np.uint8)),
+            "found uint8 of shape .300, 400, 3., wanted",
+        ),
+        (lambda s: s.localize(REFINED), "found a sphere or a part of one, wanted the photo of one"),
         (lambda s: s.localize_many(None), "^`photos`: found None, wanted a list"),
         (lambda s: piccolo.Motion(max_acceleration=None), "^`max_acceleration`: found None"),
         (lambda s: s.track().add(None), "^`picture`: found None, wanted a path or an array"),

@@ -281,11 +281,6 @@ def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask(tmp_
     np.testing.assert_array_equal(found.rgb, wanted)
 
 
-def test_only_the_photo_of_one_camera_has_a_focal_length_to_refine():
-    with pytest.raises(piccolo.InputError, match="found a sphere or a part of one, wanted the photo of one"):
-        scan().localize(Photo(np.zeros((64, 128, 3), np.uint8), refine_focal=True))
-
-
 def test_pictures_of_a_result_are_made_with_the_camera_found():
     found = (Mount(pinhole(320, 240, 321.5)),)
     options = Photo("a.jpg", focal_px=300.0, refine_focal=True).with_refined_camera(found)

@@ -13,7 +13,6 @@ from pictures import encoded, write
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 
-import piccolo
 from piccolo.camera import Mount
 from piccolo.camera.files import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
@@ -103,14 +102,6 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     assert np.degrees(angle) < 0.5
     (mount,) = result.cameras
     assert mount.camera.params == pytest.approx(camera.params, rel=0.01)  # its focal length is fitted
-
-
-def test_arrays_of_photos_need_a_camera():
-    rgb = np.zeros((300, 400, 3), np.uint8)
-    with pytest.raises(piccolo.InputError, match=r"found uint8 of shape .300, 400, 3., wanted RGB"):
-        scan().localize(rgb)
-    with pytest.raises(piccolo.InputError, match="`camera`, `rig`: found both, wanted one of them"):
-        Photo(rgb, camera="a.json", rig="b.json")
 
 
 def test_spheres_masks_of_each_picture_of_a_rig_count_together(tmp_path):

@@ -193,6 +193,21 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
     assert asked == [0.0]
 
 
+@pytest.mark.parametrize(("is_copy", "order"), [(True, [3.0, 0.0, 6.0]), (False, [0.0, 3.0, 6.0])])
+def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(monkeypatch, is_copy, order):
+    query = compared(monkeypatch, {0.0: 0.3, 3.0: 0.5, 6.0: 0.1}, {0.0: 20, 3.0: 20})
+    monkeypatch.setattr(judging, "find_copies", lambda *_: [is_copy, False])
+    monkeypatch.setattr(judging, "settle", lambda _, h: h)
+    monkeypatch.setattr(
+        judging, "measure", lambda _, found, fit: judging.Measured(found.best.pose, *[None] * 4)
+    )
+    monkeypatch.setattr(judging, "conclude", lambda _, found, *more: found)
+    found = Selection(at(0.0, 0.3), (at(3.0, 0.5), at(6.0, 0.1)))
+    judged = judging.judge(replace(query, evidence="drawn scan"), found)
+    assert places([judged.best, *judged.alternatives]) == order
+    assert judging.judge(query, found).best is found.best  # matched with features of the map: no copies
+
+
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     """Of a photo at its true pose, beside two others in the room; far outside, no point is seen."""
     _, panorama, true = rooms.scene(1)

@@ -3,6 +3,7 @@
 import functools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import e57_files
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import rooms
 from las_files import OFFSETS, las_bytes
+from made_up import at
 from meshes import SQUARE, write_obj
 
 import piccolo
@@ -24,8 +26,9 @@ from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
-from piccolo.jobs.threads import Workers
-from piccolo.localization.selection import assess_alone
+from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.localization import localize as method
+from piccolo.localization.selection import Selection, assess_alone
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
@@ -207,6 +210,40 @@ def test_softer_images_are_whole_across_the_seam():
     soft = soften(Panorama(rgb, np.ones((32, 64), bool)), 1.7).rgb
     assert (soft[:, 1] == soft[:, -1]).all()
     assert soft[16].sum() == pytest.approx(600, abs=10)
+
+
+@pytest.mark.parametrize(
+    ("clear", "is_known", "searched"),
+    [
+        ("level", False, ["level"]),
+        ("tilt 1", False, ["level", "tilt 0", "tilt 1"]),
+        ("any heading", True, ["level", "any heading"]),
+        ("any heading", False, ["level", "tilt 0", "tilt 1", "any heading"]),
+    ],
+)
+def test_tilts_and_headings_are_searched_until_a_pose_explains_the_edges(
+    monkeypatch, clear, is_known, searched
+):
+    asked = []
+
+    def at_tilt(name):
+        return SimpleNamespace(name=name, rotations=name, with_rotations=lambda _: at_tilt("any heading"))
+
+    def find(query, *_):
+        asked.append(query.name)
+        return method.Found(query, Selection(at(0.0, 0.9 if query.name == clear else 0.01), ()), None)
+
+    for name, made in {
+        "find": find,
+        "find_axes": lambda _: [],
+        "align_level": lambda *_: at_tilt("level"),
+        "is_tilt_known": lambda _: is_known,
+        "find_tilts": lambda *_: [at_tilt("tilt 0"), at_tilt("tilt 1")],
+    }.items():
+        monkeypatch.setattr(method, name, made)
+    scan_map = SimpleNamespace(yaw_of_walls=0.0)
+    found = method.find_by_edges(SimpleNamespace(source=None), scan_map, Stopwatch())
+    assert (found.query.name, asked) == (clear, searched)
 
 
 def test_a_photo_of_another_room_is_not_localized():
