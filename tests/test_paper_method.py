@@ -78,11 +78,11 @@ def test_panorama_of_which_nothing_counts_has_no_pose():
 def test_golden_poses():
     """Where the descent has ended: before, processors differ by a centimetre."""
     settled = dataclasses.replace(QUICK, num_iterations=300)
-    check_golden_poses(
-        "paper.json",
-        lambda seed: [prepare(room(seed)[1], QUICK).positions],
-        lambda seed, variant: _localize(seed, variant, settled)[0],
-    )
+
+    def arrays(seed):
+        return [prepare(room(seed)[1], QUICK).positions]
+
+    check_golden_poses("paper.json", arrays, lambda *taken: _localize(*taken, settled)[0])
 
 
 @pytest.mark.parametrize(
@@ -95,14 +95,11 @@ def test_golden_poses():
         ({"patience": 0}, "patience: found 0"),
     ],
 )
-def test_settings_that_mean_nothing_are_refused(change, message):
-    with pytest.raises(InputError, match=message):
-        dataclasses.replace(PaperSettings(), **change)
-
-
-def test_rotations_default_to_the_papers():
+def test_settings_that_mean_nothing_are_refused_and_rotations_default_to_the_papers(change, message):
     assert PaperSettings().effective_num_rotations == 8
     assert PaperSettings(gravity="unknown").to_json()["num_rotations"] == 32
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(PaperSettings(), **change)
 
 
 def test_the_preset_paper_goes_by_margin_and_agreement():

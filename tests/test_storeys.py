@@ -142,17 +142,12 @@ def test_nobody_walks_through_a_wall(two_rooms):
     assert np.isinf(space.distances(start[None], second, 2.3)).all()
 
 
-def test_far_places_are_beyond_the_limit(two_rooms):
+def test_far_places_are_beyond_the_limit_and_distances_the_same_one_by_one_and_together(two_rooms):
     centers = two_rooms[1].centers
     space = FreeSpace(two_rooms[1], Workers(1))
     distance = space.distances(centers[:1], centers, 1.0)[0]
     assert np.isinf(distance[np.linalg.norm(centers - centers[0], axis=1) > 1.0]).all()
     assert distance[0] == 0.0
-
-
-def test_distances_are_the_same_one_by_one_and_together(two_rooms):
-    centers = two_rooms[1].centers
-    space = FreeSpace(two_rooms[1], Workers(1))
     together = space.distances(centers[:9], centers[::7], 4.0)
     alone = [space.distances(start[None], centers[::7], 4.0)[0] for start in centers[:9]]
     assert together.tobytes() == np.array(alone).tobytes()
