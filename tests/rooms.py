@@ -105,6 +105,13 @@ def errors(pose, true_pose):
     return distance, np.degrees(angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world))
 
 
+def assert_near(pose, true_pose, most, most_deg):
+    """A pose is less than so far [m, deg] from another."""
+    distance, angle_deg = errors(pose, true_pose)
+    assert distance < most, f"{1000.0 * distance:.1f} mm"
+    assert angle_deg < most_deg, f"{angle_deg:.2f} deg"
+
+
 def local(seed, pose, num_points=NUM_POINTS):
     """A pose of the world near a room's local origin."""
     return Pose(pose.R_cam_from_world, pose.center_world - room(seed, num_points)[1].origin_world)

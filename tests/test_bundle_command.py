@@ -4,8 +4,8 @@ import json
 
 import numpy as np
 import pytest
+import rooms
 from poses import SIZE, result
-from rooms import errors
 from rooms import scan as scan_of_room
 
 import piccolo
@@ -40,9 +40,7 @@ def _assert_right(scene, results):
     truth = read_scene(scene).by_name
     assert [r.status for r in results] == ["localized"] * 3
     for found, name in zip(results, NAMES, strict=True):
-        distance, angle_deg = errors(found.pose, truth[name].pose)
-        assert distance < 0.02
-        assert angle_deg < 0.5
+        rooms.assert_near(found.pose, truth[name].pose, 0.02, 0.5)
 
 
 def test_results_are_written_in_order(scene, relative, tmp_path, capsys):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import rooms
 from plyfile import PlyData, PlyElement
-from rooms import as_panorama, errors, query, room
+from rooms import as_panorama, query, room
 from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud import CloudStream, open_cloud
@@ -202,9 +202,7 @@ def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
     assert scan_map.warnings == ()
     panorama = as_panorama(query(1).rgb)
     found = rooms.locate(panorama, scan_map, rooms.KNOWN)
-    distance, angle_deg = errors(found.pose, truth)
-    assert distance < 0.01
-    assert angle_deg < 0.2
+    rooms.assert_near(found.pose, truth, 0.01, 0.2)
 
 
 @pytest.mark.parametrize("up", ["auto", "z", "-y"])

@@ -5,6 +5,7 @@ import re
 import cv2
 import numpy as np
 import pytest
+import rooms
 from las_files import OFFSETS, las_bytes, laz_bytes
 from pictures import write
 from plyfile import PlyData, PlyElement
@@ -210,9 +211,7 @@ def test_room_maker_labels_points_and_pixels_alike(scene):
 @pytest.mark.parametrize("preset", [[], PAPER])
 def test_camera_is_found_by_labels(scene, capsys, preset):
     result, code, _ = _localized(scene, capsys, "--labels", *preset)
-    distance, angle_deg = errors(result.pose, read_scene(scene).queries[0].pose)
-    assert distance < 0.05
-    assert angle_deg < 1.0
+    rooms.assert_near(result.pose, read_scene(scene).queries[0].pose, 0.05, 1.0)
     assert code == (0 if result.status == "localized" else 1)
     assert result.settings["cloud"]["labels"] == result.settings["panorama"]["labels"] == {"ignored": []}
 

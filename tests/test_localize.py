@@ -13,6 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import rooms
 from batches import command_of, start_localize
 from rooms import errors, query
 from test_result import RESULT
@@ -40,9 +41,7 @@ def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     assert localize.main(_arguments(scene)) == 0
     out, err = capsys.readouterr()
     result = Result.from_json(out)
-    distance, angle_deg = errors(result.pose, _truth(scene))
-    assert distance < 0.03
-    assert angle_deg < 0.5
+    rooms.assert_near(result.pose, _truth(scene), 0.03, 0.5)
     assert set(result.seconds) == {"read", "search", "refine"}  # a clear photo: no features are matched
     assert "localized at" in err
     assert out.count("\n") == 1

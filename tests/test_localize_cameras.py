@@ -65,9 +65,7 @@ def test_a_rig_of_four_photos_equals_the_sphere_that_they_were_cut_from(tmp_path
     rig = write(tmp_path / "rig.json", json.dumps(document_of(mounts)).encode())
     sphere = scan().localize(write(tmp_path / "full.png", encoded(full, ".png")), gravity="known")
     result = scan().localize(Photo(folder, rig=rig), gravity="known")
-    distance, angle = pose_errors(result.best_pose, sphere.best_pose)
-    assert distance < 0.002
-    assert np.degrees(angle) < 0.1
+    rooms.assert_near(result.best_pose, sphere.best_pose, 0.002, 0.1)
     assert result.cameras == mounts
     assert Result.from_json(result.to_json()).cameras == mounts
     assert sphere.cameras == ()
@@ -80,9 +78,7 @@ def test_a_dual_fisheye_is_localized(tmp_path):
     calibration = write(tmp_path / "dual.json", json.dumps(document_of(DUAL)).encode())
     photo = write(tmp_path / "a.png", encoded(rgb, ".png"))
     result = scan().localize(Photo(photo, camera=calibration), gravity="unknown")
-    distance, angle = pose_errors(result.best_pose, pose)
-    assert distance < 0.01
-    assert np.degrees(angle) < 0.2
+    rooms.assert_near(result.best_pose, pose, 0.01, 0.2)
     assert json.loads(result.to_json())["camera"]["cameras"][1]["offset"] == [512, 0]
 
 
@@ -97,9 +93,7 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     fov_deg = float(np.degrees(800 / 230.0))
     photo = Photo(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down)
     result = scan().localize(photo, gravity="known")
-    distance, angle = pose_errors(result.best_pose, pose)
-    assert distance < 0.02
-    assert np.degrees(angle) < 0.5
+    rooms.assert_near(result.best_pose, pose, 0.02, 0.5)
     (mount,) = result.cameras
     assert mount.camera.params == pytest.approx(camera.params, rel=0.01)  # its focal length is fitted
 

@@ -122,9 +122,7 @@ def test_descent_recovers_the_true_pose(solver):
     settings = dataclasses.replace(PaperSettings(), loss="photometric", photometric_width=128, solver=solver)
     start = step(true_pose, np.array([0.06, -0.04, 0.08, 0.1, -0.12, 0.05]))
     refined = refine(points, make_loss(panorama, settings), start, settings)
-    distance, angle_deg = errors(refined.pose, true_pose)
-    assert distance < 0.03
-    assert angle_deg < 0.5
+    rooms.assert_near(refined.pose, true_pose, 0.03, 0.5)
     assert refined.loss < photometric_loss(points, shrink(panorama, settings.photometric_width), start)
 
 

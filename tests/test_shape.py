@@ -170,9 +170,7 @@ def test_a_photo_is_found_by_shape(gravity, R):
     settings = CoarseToFineSettings(gravity=gravity)
     found = rooms.locate(_turned(taken.rgb, R), _shape_map(), settings)
     true_pose = replace(taken.pose, R_cam_from_world=R @ taken.pose.R_cam_from_world)
-    distance, angle_deg = rooms.errors(found.pose, true_pose)
-    assert distance < 0.1
-    assert angle_deg < 4.0
+    rooms.assert_near(found.pose, true_pose, 0.1, 4.0)
     assert found.evidence.num_matches is None
     assert all(standing.evidence == "shape" for standing in found.standings)
 
