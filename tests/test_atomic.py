@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_input_error
 
 from piccolo.cli.command import command
 from piccolo.cli.errors import UsageError
@@ -194,17 +195,14 @@ def test_outputs_that_can_not_be_are_refused(tmp_path, monkeypatch):
         (tmp_path, "found a folder"),
         (loop, "found a link that leads to itself"),
     ):
-        with pytest.raises(InputError, match=message):
-            check_output(path)
+        assert_input_error(message, check_output, path)
     with pytest.raises(InputError, match="found stdout or a device, wanted a folder"):
         check_output_folder(Path("/dev/null"))
-    with pytest.raises(InputError, match="that leads to itself"):
-        write_atomically(loop, b"")
+    assert_input_error("that leads to itself", write_atomically, loop, b"")
     check_output(tmp_path / "new.json")
     monkeypatch.setattr(atomic.os, "access", lambda path, mode: path not in (source, Path("/dev/full")))
     for path in (source, Path("/dev/full")):
-        with pytest.raises(InputError, match="write permission"):
-            check_output(path)
+        assert_input_error("write permission", check_output, path)
     assert names(tmp_path) == ["dangling", "in.jpg", "loop"]
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import rooms
 from poses import SIZE, result
+from refusals import assert_input_error
 from rooms import scan as scan_of_room
 
 import piccolo
@@ -134,11 +135,9 @@ def test_relative_poses_that_are_none_are_refused(scene, tmp_path):
         (3, "`relative_poses`: found 3, wanted a list, each Pose"),
         ([None] * 3, "`relative_poses`: found .*, wanted a list, each Pose"),
     ):
-        with pytest.raises(piccolo.InputError, match=text):
-            scan.localize_bundle(photos, given)
+        assert_input_error(text, scan.localize_bundle, photos, given)
     (tmp_path / "bad.jpg").write_bytes(b"no picture")
-    with pytest.raises(piccolo.InputError, match=r"bad\.jpg"):
-        scan.localize_bundle([tmp_path / "bad.jpg"], poses[:1])
+    assert_input_error(r"bad\.jpg", scan.localize_bundle, [tmp_path / "bad.jpg"], poses[:1])
     guesses = [Photo(p, fov_deg=60.0, projection="pinhole", refine_focal=True) for p in photos]
     with pytest.raises(piccolo.InputError, match="found a focal length that is a guess, wanted a known one"):
         scan.localize_bundle(guesses, poses)

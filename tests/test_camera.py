@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from cameras import calibrated, four_sides
 from pictures import encoded, write
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 from rooms import room
 
 from piccolo.camera import Camera, Mount
@@ -175,8 +175,7 @@ def test_resolution_is_the_focal_length():
     ],
 )
 def test_what_is_no_camera_is_refused(values, message):
-    with pytest.raises(InputError, match=message):
-        Camera(*values)
+    assert_input_error(message, Camera, *values)
 
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))

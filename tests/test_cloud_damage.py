@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from las_files import las_bytes, laz_bytes
 from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf, write_obj, write_ply
 from plyfile import PlyData
-from refusals import assert_refused, mutated, read_or_refused
+from refusals import assert_input_error, assert_refused, mutated, read_or_refused
 from test_cloud_las import RAW
 from test_cloud_morton import read
 from test_cloud_npz import PAIR, WHOLE
@@ -27,7 +27,6 @@ from piccolo.cloud import open_cloud, open_source, read_cloud
 from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.reader import RawCloud
-from piccolo.errors import InputError
 
 SMALL = RawCloud(RAW.points_world[:60], RAW.colors[:60])
 
@@ -147,8 +146,7 @@ def test_broken_textures_are_refused(tmp_path, cut):
 def test_a_missing_library_is_named(tmp_path, monkeypatch):
     path = made.textured_gltf().glb(tmp_path / "a.glb")
     monkeypatch.setitem(sys.modules, "trimesh", None)
-    with pytest.raises(InputError, match=r"needs trimesh.*-r requirements-formats\.txt"):
-        open_cloud([path])
+    assert_input_error(r"needs trimesh.*-r requirements-formats\.txt", open_cloud, [path])
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
@@ -151,8 +151,7 @@ def test_paths_that_are_no_cloud_and_unreadable_files_are_refused(tmp_path, monk
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_scales_are_above_zero(scale):
-    with pytest.raises(InputError, match=r"`units`: found .*, wanted a number above 0"):
-        CloudSettings(scale)
+    assert_input_error(r"`units`: found .*, wanted a number above 0", CloudSettings, scale)
 
 
 def _cloud(num_points, dtype):

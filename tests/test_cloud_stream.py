@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import rooms
 from plyfile import PlyData, PlyElement
+from refusals import assert_input_error
 from rooms import as_panorama, query, room
 from test_cloud_morton import seeded_cloud
 
@@ -177,8 +178,7 @@ def test_a_broken_disk_is_one_line():
         raise OSError(5, "Input/output error")
 
     cloud = CloudStream([PointSource(Path("a.xyz"), read_chunks)])
-    with pytest.raises(InputError, match=r"^a\.xyz: cannot be read \(Input/output error\), wanted"):
-        cloud.voxels(LEVEL)
+    assert_input_error(r"^a\.xyz: cannot be read \(Input/output error\), wanted", cloud.voxels, LEVEL)
 
 
 def _lying(turn):

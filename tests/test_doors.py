@@ -10,10 +10,11 @@ import pytest
 import rooms
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import assert_input_error
 from test_result import RESULT
 
 import piccolo
-from piccolo import InputError, Pose, Result
+from piccolo import Pose, Result
 from piccolo.cli import localize as localize_command
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
@@ -55,26 +56,20 @@ def scan():
     return rooms.scan(1)
 
 
-def _assert_refused(message, function, *arguments, **options):
-    with pytest.raises(InputError, match=message) as error:
-        function(*arguments, **options)
-    assert "\n" not in str(error.value)
-
-
 @pytest.mark.parametrize("name", BAD)
 def test_what_is_no_pose_is_refused_at_every_door(scan, name):
     """Before any work: there are no such pictures."""
     pose, message = BAD[name]
     good = Pose(I, HERE)
-    _assert_refused("^`pose`: ", scan.occlusion_mask, "none.jpg", pose)
-    _assert_refused("^`pose`: ", scan.from_world, pose)
-    _assert_refused("^`relative_poses`: ", scan.localize_bundle, ["a.jpg", "b.jpg"], [good, pose])
-    _assert_refused(f"^it: {message}", check_pose, pose, "it")
+    assert_input_error("^`pose`: ", scan.occlusion_mask, "none.jpg", pose)
+    assert_input_error("^`pose`: ", scan.from_world, pose)
+    assert_input_error("^`relative_poses`: ", scan.localize_bundle, ["a.jpg", "b.jpg"], [good, pose])
+    assert_input_error(f"^it: {message}", check_pose, pose, "it")
     if pose is None:  # a frame may be without one
         return
-    _assert_refused("^`odometry`: ", scan.localize_walk, ["a", "b"], odometry=[good, pose])
+    assert_input_error("^`odometry`: ", scan.localize_walk, ["a", "b"], odometry=[good, pose])
     walk = scan.track()
-    _assert_refused("^`odometry`: ", walk.add, "a.jpg", odometry=pose)
+    assert_input_error("^`odometry`: ", walk.add, "a.jpg", odometry=pose)
     assert not walk.blanks
 
 
@@ -161,7 +156,7 @@ def test_the_whole_part_of_a_pixel_is_as_before(u):
     ],
 )
 def test_other_input_is_refused_in_one_line(scan, call, message):
-    _assert_refused(message, call, scan)
+    assert_input_error(message, call, scan)
 
 
 def test_a_heading_has_a_tolerance():
@@ -174,7 +169,7 @@ def test_times_are_given_for_all_frames_or_for_none(scan, times):
     walk = scan.track()
     walk.add("missing.jpg", times[0])
     message = rf"^`time`: found {times[1]} at frame 1, wanted it of all frames"
-    _assert_refused(message, walk.add, "b.jpg", times[1])
+    assert_input_error(message, walk.add, "b.jpg", times[1])
     assert len(walk.blanks) == len(walk.tracker.frames) == 1
     walk.add("c.jpg", None if times[0] is None else 1.0)
 
@@ -249,4 +244,4 @@ def test_a_pose_in_a_file_of_results_is_checked(place, center):
     document = json.loads(_changed(status="ambiguous" if place == "best_guess" else "localized").to_json())
     part = document[place] if place else document
     (part[0] if place == "alternatives" else part)["center_world"] = center
-    _assert_refused("^result: found", Result.from_json, json.dumps(document))
+    assert_input_error("^result: found", Result.from_json, json.dumps(document))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 from poses import result
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, is_correct
@@ -80,8 +80,7 @@ def test_a_query_result_comes_back(row):
 
 @pytest.mark.parametrize("text", ["", "{}", "[]", '{"format": "piccolo-pose/2"}'])
 def test_what_is_no_query_result_is_refused(text):
-    with pytest.raises(InputError, match="evaluation: found"):
-        QueryResult.from_json(text)
+    assert_input_error("evaluation: found", QueryResult.from_json, text)
 
 
 def test_results_find_their_queries_by_path_then_by_name(tmp_path):

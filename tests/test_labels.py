@@ -9,7 +9,7 @@ import rooms
 from las_files import OFFSETS, las_bytes, laz_bytes
 from pictures import write
 from plyfile import PlyData, PlyElement
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 from rooms import errors, write_room
 from scans import write_scalars
 from scipy.spatial.distance import pdist
@@ -79,8 +79,7 @@ def test_ignored_labels_are_left_out(tmp_path):
 def test_labels_that_are_no_whole_numbers_are_refused(tmp_path, wrong):
     path = _ply(tmp_path / "a.ply", kind="f8", values=np.where(np.arange(3000) == 1700, wrong, LABELS))
     message = f"a.ply: found the label {wrong:g}, wanted whole numbers"
-    with pytest.raises(InputError, match=re.escape(message)):
-        whole(open_source, path, READ)
+    assert_input_error(re.escape(message), whole, open_source, path, READ)
 
 
 def test_points_without_a_position_need_no_label(tmp_path):

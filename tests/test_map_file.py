@@ -7,6 +7,7 @@ import zipfile
 import naive
 import numpy as np
 import pytest
+from refusals import assert_input_error
 from rooms import make_map, map_path, scan_map
 
 from piccolo.cloud.octree import build_octree
@@ -58,8 +59,7 @@ def test_round_trip_and_a_file_cut_short(tmp_path):
     assert back.has_labels is False
     np.testing.assert_array_equal(back.octree.nodes, made.octree.nodes)
     (tmp_path / "b.map").write_bytes(built.read_bytes()[:-1000])
-    with pytest.raises(InputError, match=r"b\.map: "):
-        load_map(tmp_path / "b.map")
+    assert_input_error(r"b\.map: ", load_map, tmp_path / "b.map")
 
 
 def test_a_file_outlives_other_sources_but_the_cache_does_not(built, monkeypatch):
@@ -154,22 +154,17 @@ def test_members_are_those_of_a_map_and_not_compressed(arrays, tmp_path):
     np.savez_compressed(path.with_suffix(".npz"), **arrays)
     packed = path.with_suffix(".npz").read_bytes()
     path.write_bytes(packed)
-    with pytest.raises(InputError, match=r"damaged .'arrays of \d+ bytes'"):
-        load_map(path)
+    assert_input_error(r"damaged .'arrays of \d+ bytes'", load_map, path)
     path.write_bytes(bytes(10**7) + packed)  # what comes before an archive is no part of it
-    with pytest.raises(InputError, match=r"format.npy in another way than a prepared map has it"):
-        load_map(path)
+    assert_input_error(r"format.npy in another way than a prepared map has it", load_map, path)
     np.savez(path.with_suffix(".npz"), **arrays)
     path.write_bytes(path.with_suffix(".npz").read_bytes())
-    with pytest.raises(InputError, match=r"format.npy at byte \d+, no multiple of 64"):
-        load_map(path)
+    assert_input_error(r"format.npy at byte \d+, no multiple of 64", load_map, path)
     _save(path, {**arrays, "more": np.zeros(3)})
-    with pytest.raises(InputError, match=r"damaged .*'more'"):
-        load_map(path)
+    assert_input_error(r"damaged .*'more'", load_map, path)
     del arrays["sparse"]
     _save(path, arrays)
-    with pytest.raises(InputError, match=r"damaged .*sparse"):
-        load_map(path)
+    assert_input_error(r"damaged .*sparse", load_map, path)
 
 
 def test_no_objects_are_unpickled(arrays, tmp_path):
@@ -178,8 +173,7 @@ def test_no_objects_are_unpickled(arrays, tmp_path):
     content = path.read_bytes()
     assert content.count(b"'<u8'") == 1
     path.write_bytes(content.replace(b"'<u8'", b"'|O' "))
-    with pytest.raises(InputError, match=r"warnings.npy of 8 bytes, which promises object of shape \(1,\)"):
-        load_map(path)
+    assert_input_error(r"warnings.npy of 8 bytes, which promises object of shape \(1,\)", load_map, path)
 
 
 def test_warnings_are_lines_that_can_be_printed(arrays, tmp_path):

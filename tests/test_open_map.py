@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from refusals import assert_input_error
 from rooms import scan_map
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.errors import InputError
 from piccolo.files import cache
 from piccolo.jobs.threads import Once, Stopwatch, Workers
 from piccolo.opening import Cloud, open_scan
@@ -196,8 +196,7 @@ def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch)
     content = bytearray(path.read_bytes())
     content[-5000] ^= 1
     path.write_bytes(content)
-    with pytest.raises(InputError, match="damaged"):
-        map_file.load_map(path, remembers=True)
+    assert_input_error("damaged", map_file.load_map, path, remembers=True)
 
 
 @pytest.mark.parametrize("how", ["cut off", "overwritten", "removed"])
@@ -222,8 +221,7 @@ def test_a_damaged_map_leaves_no_copy(facts, tmp_path):
     path = tmp_path / "a.map"
     save_map(scan_map(1), path)
     os.truncate(path, path.stat().st_size - 1)
-    with pytest.raises(InputError, match="damaged"):
-        map_file.load_map(path, remembers=True)
+    assert_input_error("damaged", map_file.load_map, path, remembers=True)
     assert not list((facts.parent / "maps").glob("*.piccolo-map"))
 
 

@@ -7,11 +7,10 @@ from cameras import calibrated
 from pictures import encoded, smooth_rgb, with_metadata, write, xmp_packet
 from PIL import Image
 from PIL.ExifTags import IFD, Base
-from refusals import assert_refused, read_or_refused
+from refusals import assert_input_error, assert_refused, read_or_refused
 
 from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
-from piccolo.errors import InputError
 from piccolo.panorama import GPano, read_panorama
 from piccolo.panorama.gpano import attitude_of_gravity, rotation_to_level
 from piccolo.panorama.photo import read_focal_length
@@ -184,14 +183,12 @@ def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
     ],
 )
 def test_options_that_mean_nothing_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        Photo("a.jpg", **options)
+    assert_input_error(message, Photo, "a.jpg", **options)
 
 
 def test_no_plane_shows_half_a_sphere():
     wide = Photo(PHOTO, fov_deg=179.5, projection="pinhole")
-    with pytest.raises(InputError, match=r"`fov_deg`: found 179.5 of a pinhole, wanted less than 178"):
-        read_panorama(wide)
+    assert_input_error(r"`fov_deg`: found 179.5 of a pinhole, wanted less than 178", read_panorama, wide)
 
 
 def test_a_mask_of_the_photo_goes_along(tmp_path):

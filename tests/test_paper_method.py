@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import rooms
 from golden_poses import check_golden_poses
+from refusals import assert_input_error
 from rooms import as_panorama, errors, query, room
 
 from piccolo.cloud.soa import pack_points
 from piccolo.confidence.localization import Evidence
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations
 from piccolo.jobs.threads import Stopwatch, Workers
@@ -95,8 +95,7 @@ def test_golden_poses():
 def test_settings_that_mean_nothing_are_refused_and_rotations_default_to_the_papers(change, message):
     assert PaperSettings().effective_num_rotations == 8
     assert PaperSettings(gravity="unknown").to_json()["num_rotations"] == 32
-    with pytest.raises(InputError, match=message):
-        dataclasses.replace(PaperSettings(), **change)
+    assert_input_error(message, lambda: dataclasses.replace(PaperSettings(), **change))
 
 
 def test_the_preset_paper_goes_by_margin_and_agreement():

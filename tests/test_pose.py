@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from poses import tilted_poses
+from refusals import assert_input_error
 
-from piccolo.errors import InputError
 from piccolo.geometry import pose as poses
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose_gaussian import (
@@ -95,8 +95,7 @@ def test_rotations_are_checked_to_a_tolerance():
     poses.check_rotation(R + 4e-4, 1e-2, "R")
     assert poses.check_rotation(R, 1e-12, "R") is R
     for wrong in (R + 4e-4, R[::-1], np.full((3, 3), np.nan), R * 1e300, R[0], np.eye(4)):
-        with pytest.raises(InputError, match="file: R is no rotation"):
-            poses.check_rotation(wrong, 1e-4, "file: R")
+        assert_input_error("file: R is no rotation", poses.check_rotation, wrong, 1e-4, "file: R")
 
 
 @given(DIRECTIONS)

@@ -11,7 +11,7 @@ from las_files import las_bytes
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from pyproj import Transformer
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 from test_cloud_las import RAW
 
 import piccolo
@@ -154,10 +154,8 @@ def test_a_position_becomes_a_prior_of_any_height():
     assert near.near == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)
     assert from_wgs84("EPSG:4326", latitude, longitude) is None
-    with pytest.raises(piccolo.InputError, match="`crs`: found 'EPSG:0'"):
-        from_wgs84("EPSG:0", latitude, longitude)
-    with pytest.raises(piccolo.InputError, match="`crs`: found 'EPSG:0'"):
-        piccolo.Cloud("no_such_scan.ply", crs="EPSG:0")
+    assert_input_error("`crs`: found 'EPSG:0'", from_wgs84, "EPSG:0", latitude, longitude)
+    assert_input_error("`crs`: found 'EPSG:0'", piccolo.Cloud, "no_such_scan.ply", crs="EPSG:0")
 
 
 def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):

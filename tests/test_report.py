@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from refusals import assert_input_error
 from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 
 import piccolo
@@ -274,8 +275,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     assert f"warning: {note}" in capsys.readouterr().err
     assert _document(tmp_path / "r")["note"] == note
     scan = piccolo.open_scan(scene.cloud)
-    with pytest.raises(InputError, match="results of another scan"):
-        piccolo.write_report(lines, scan, tmp_path / "r")
+    assert_input_error("results of another scan", piccolo.write_report, lines, scan, tmp_path / "r")
     piccolo.write_report(lines, scan, tmp_path / "r", piccolo.ReportSettings(force=True))
 
 
@@ -301,8 +301,7 @@ def test_in_python(house, tmp_path):
     assert page == tmp_path / "r" / "index.html"
     assert _document(tmp_path / "r")["title"] == "A walk"
     assert ("photos", 6, 6) in told
-    with pytest.raises(InputError, match="`title`: found 1, wanted a text"):
-        piccolo.ReportSettings(title=1)
+    assert_input_error("`title`: found 1, wanted a text", piccolo.ReportSettings, title=1)
     with pytest.raises(InputError, match=r"`scan`: found .*, wanted Scan"):
         piccolo.write_report(results, str(scene.cloud), tmp_path / "r")
     with pytest.raises(InputError, match="found 1 names, wanted 2"):

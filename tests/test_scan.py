@@ -8,6 +8,7 @@ import re
 import numpy as np
 import pytest
 import rooms
+from refusals import assert_input_error
 
 import piccolo
 from piccolo.errors import InputError
@@ -25,8 +26,7 @@ def scan():
 
 
 def test_options_that_are_none_are_named(scan):
-    with pytest.raises(piccolo.InputError, match="`num_threads`: found 0"):
-        piccolo.open_scan(np.zeros((2, 3)), num_threads=0)
+    assert_input_error("`num_threads`: found 0", lambda: piccolo.open_scan(np.zeros((2, 3)), num_threads=0))
     for call, error, text in (
         (lambda: piccolo.open_scan("a.ply", foo=3), TypeError, "unexpected keyword argument 'foo'"),
         (lambda: scan.localize("a.jpg", near=3), TypeError, "unexpected keyword argument 'near'"),
@@ -154,8 +154,7 @@ def test_an_option_of_a_scan_of_another_type_is_refused(options, text):
     arrays = {"source": np.zeros((2, 3)), "colors": np.zeros((2, 3))}
     of_cloud = arrays | {name: value for name, value in options.items() if name in known}
     others = {name: value for name, value in options.items() if name not in known}
-    with pytest.raises(piccolo.InputError, match=text):
-        piccolo.open_scan(piccolo.Cloud(**of_cloud), **others)
+    assert_input_error(text, lambda: piccolo.open_scan(piccolo.Cloud(**of_cloud), **others))
 
 
 def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
@@ -168,12 +167,10 @@ def test_a_saved_scan_gives_the_same_bits(tmp_path, scan):
     assert np.array_equal(again.covariance.matrix, result.covariance.matrix)
     partial_map = dataclasses.replace(scan._opened.prepared, is_partial=True)
     partial = piccolo.Scan(dataclasses.replace(scan._opened, prepared=partial_map))
-    with pytest.raises(piccolo.InputError, match="prepared within `near` only"):
-        partial.save(tmp_path / "part.map")
+    assert_input_error("prepared within `near` only", partial.save, tmp_path / "part.map")
     cloud = rooms.room(1)[1]
     paper = piccolo.open_scan(piccolo.Cloud(cloud.points, colors=cloud.colors), settings=PaperSettings())
-    with pytest.raises(piccolo.InputError, match="found a scan of the preset paper"):
-        paper.save(tmp_path / "paper.map")
+    assert_input_error("found a scan of the preset paper", paper.save, tmp_path / "paper.map")
     assert [path.name for path in tmp_path.iterdir()] == ["room.map"]
 
 
@@ -204,8 +201,7 @@ def test_the_paper_refuses_what_it_would_ignore(option):
         paper.localize(piccolo.Photo(rooms.query(1).rgb, **option))
     with pytest.raises(InputError, match="`prior`: not an option of the preset paper"):
         paper.localize(rooms.query(1).rgb, prior=Prior())
-    with pytest.raises(InputError, match="walks: not available with the preset paper"):
-        paper.track()
+    assert_input_error("walks: not available with the preset paper", paper.track)
     with pytest.raises(InputError, match="`relative_poses`: not available with the preset paper"):
         paper.localize_bundle(["a.jpg"], [rooms.query(1).pose])
 

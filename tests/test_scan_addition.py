@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from refusals import assert_input_error
 from scipy.spatial import cKDTree
 
 from piccolo.cli import localize as localize_command
@@ -196,8 +197,7 @@ def test_what_can_not_be_added_is_refused():
         _added(replace(first(), octree=octree), cloud, "B")
     scan_map = _added(first(), _shifted(cloud, np.array([2000.0, 0.0, 0.0])), "B")
     assert "both need one coordinate system" in scan_map.warnings[-1]
-    with pytest.raises(InputError, match=r"^`name`: found a map of several scans: 'A', 'B'$"):
-        name_scan(scan_map, "C")
+    assert_input_error(r"^`name`: found a map of several scans: 'A', 'B'$", name_scan, scan_map, "C")
 
 
 def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):

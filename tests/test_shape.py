@@ -13,6 +13,7 @@ import rooms
 from las_files import OFFSETS, las_bytes
 from made_up import at
 from meshes import SQUARE, write_obj
+from refusals import assert_input_error
 
 import piccolo
 from piccolo.cli import localize as command_line
@@ -300,8 +301,7 @@ def test_files_of_points_alone_are_read_and_others_say_how(tmp_path):
         shift = OFFSETS if "las" in name else 0.0
         found = np.asarray(cloud.points, np.float64) + cloud.origin_world - shift
         np.testing.assert_allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=2e-3)
-        with pytest.raises(InputError, match="wanted"):
-            read_cloud(tmp_path / name, IN_COLORS)
+        assert_input_error("wanted", read_cloud, tmp_path / name, IN_COLORS)
         assert not open_cloud([tmp_path / name]).has_colors
     mesh = write_obj(tmp_path, mtl="", uv=None, library="", material="", vertices=3.0 * SQUARE)
     cloud = read_cloud(mesh, CloudSettings(channels=WITHOUT_COLORS))
@@ -320,8 +320,7 @@ def test_files_with_and_without_colours_are_one_scan_by_shape_alone(tmp_path):
     np.savetxt(tmp_path / "gray.txt", np.column_stack([points, np.arange(1500.0)]))
     both = [tmp_path / "bare.npy", tmp_path / "colored.npy"]
     message = "bare.npy: found no colours, though .*colored.npy has them, wanted them in all"
-    with pytest.raises(InputError, match=message):
-        open_cloud(both)
+    assert_input_error(message, open_cloud, both)
     assert open_cloud(both, CloudSettings(channels=WITHOUT_COLORS)).sources[1].channel == "shape"
     mixed = open_cloud([both[0], tmp_path / "gray.txt"])
     assert [source.channel for source in mixed.sources] == ["shape", "shape"]
@@ -336,8 +335,7 @@ def test_arrays_and_files_without_colours_are_scans(tmp_path):
 
 
 def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
-    with pytest.raises(InputError, match="`ignore_colors`"):
-        piccolo.Cloud(tmp_path / "a.ply", ignore_colors=True, labels=True)
+    assert_input_error("`ignore_colors`", piccolo.Cloud, tmp_path / "a.ply", ignore_colors=True, labels=True)
     bare = piccolo.Cloud(rooms.room(1)[1].points, ignore_colors=True)
     with pytest.raises(InputError, match="found no colours to be used, wanted some for the preset paper"):
         piccolo.open_scan(bare, settings=piccolo.PaperSettings())

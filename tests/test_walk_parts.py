@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import rooms
 from pictures import encoded, write
+from refusals import assert_input_error
 from test_priors import write_photo
 
 from piccolo.batch.frame_times import times_of
@@ -138,12 +139,10 @@ def test_times_by_names_tables_and_exif(tmp_path):
     (tmp_path / "t.csv").write_text("name,when\na,3\n")
     with pytest.raises(InputError, match=r"t\.csv: found KeyError 'time', wanted a CSV file"):
         times_of(frames, str(tmp_path / "t.csv"))
-    with pytest.raises(InputError, match="wanted them to rise"):
-        times_of(frames[::-1], "names")
+    assert_input_error("wanted them to rise", times_of, frames[::-1], "names")
     with pytest.raises(InputError, match=r"^`times` names: found no number in walk\.jpg"):
         times_of([tmp_path / "walk.jpg"], "names")
-    with pytest.raises(InputError, match=r"^`times` exif: found a frame without a time in EXIF"):
-        times_of(frames, "exif")
+    assert_input_error(r"^`times` exif: found a frame without a time in EXIF", times_of, frames, "exif")
 
 
 @pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/New_York"])

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
@@ -277,8 +278,7 @@ def test_refusals():
         check_times([0.0, 2.0, 1.0])
     with pytest.raises(InputError, match=r"^times: found one that is no finite number, wanted seconds$"):
         check_times([0.0, np.nan])
-    with pytest.raises(InputError, match=r"^`max_speed`: found -1.0, wanted a number above 0$"):
-        Motion(max_speed=-1.0)
+    assert_input_error(r"^`max_speed`: found -1.0, wanted a number above 0$", Motion, max_speed=-1.0)
 
 
 TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
