@@ -221,9 +221,8 @@ def test_two_outputs_that_are_one_and_inputs_are_refused(tmp_path):
         with pytest.raises(UsageError, match="found an input as the output, wanted another name"):
             check_outputs({"--out": new, "--depth": output}, [tmp_path / "none", source])
     nothing = Path("/dev/null")
-    check_outputs(
-        {"a": new, "b": folder / "poses.jsonl", "c": nothing, "d": nothing, "e": None}, [folder, there]
-    )
+    outputs = {"a": new, "b": folder / "poses.jsonl", "c": nothing, "d": nothing, "e": None}
+    check_outputs(outputs, [folder, there])
     check_suffix("--overlay", nothing, (".png",))
     check_suffix("--overlay", Path("A.PNG"), (".png",))
     for name in ("x.jpg", "x", ".png"):

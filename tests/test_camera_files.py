@@ -115,9 +115,8 @@ def test_rig_config_of_colmap(tmp_path):
             "cam_from_rig_translation": t.tolist(),
         },
     ]
-    cameras = [
-        {**c, "camera_model_name": "SIMPLE_PINHOLE", "camera_params": [400, 320, 240]} for c in cameras
-    ]
+    lens = {"camera_model_name": "SIMPLE_PINHOLE", "camera_params": [400, 320, 240]}
+    cameras = [camera | lens for camera in cameras]
     rig = read_rig(write(tmp_path / "rig.json", [{"cameras": cameras}]))
     assert rig.is_rig
     assert not rig.has_sizes
@@ -227,9 +226,8 @@ def test_any_camera_that_is_taken_can_be_resampled(data):
     except InputError:
         return
     views = [View(Mount(camera), np.full((48, 64, 4), 255, np.uint8))]
-    rgb, is_valid = make_sphere(
-        views, sphere_width([view.mount for view in views]) if params[0] < 99 else 512
-    )
+    width = sphere_width([Mount(camera)]) if params[0] < 99 else 512
+    rgb, is_valid = make_sphere(views, width)
     assert rgb[is_valid].min(initial=255) == 255
     pixels = np.random.default_rng(0).uniform(0.0, 1.0, (200, 2)) * (64, 48)
     rays, is_seen = camera.rays(pixels)

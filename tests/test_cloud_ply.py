@@ -195,7 +195,6 @@ def test_an_error_leaves_nothing(tmp_path):
 
 def test_float32_is_kept_where_it_holds_a_tenth_of_a_millimetre():
     for size, is_double in ((500.0, False), (5000.0, True)):
-        assert (
-            coordinate_type(np.array([np.zeros(3), np.full(3, size)]), np.eye(4), 1.0) == np.float64
-        ) == is_double
+        box = np.array([np.zeros(3), np.full(3, size)])
+        assert (coordinate_type(box, np.eye(4), 1.0) == np.float64) == is_double
     assert coordinate_type(np.array([np.zeros(3), np.full(3, 500.0)]), np.eye(4), 0.001) == np.float32

@@ -104,9 +104,8 @@ def test_the_true_pose_explains_more_than_others():
     assert seen.compute_ratio(seen) == 1.0
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
     query = _query(rooms.query(1).rgb)
-    turned = comparison.compare(
-        query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world)
-    )
+    R = yaw_rotation(1.0) @ true_pose.R_cam_from_world
+    turned = comparison.compare(query, Pose(R, true_pose.center_world))
     beside = true_pose.center_world + np.array([0.3, 0.0, 0.0])
     moved = comparison.compare(query, Pose(true_pose.R_cam_from_world, beside))
     for wrong in (turned, moved):

@@ -57,9 +57,8 @@ def test_sums_of_a_search_are_exact():
     panorama = correlation.weigh_by_area(samples * validity[:, None], validity, AREA, 1)
     expected = correlation.masked_correlation(features.reshape(50, -1), seen, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = correlation.TurnedPanorama(
-        *(values[..., cells] for values in panorama[:4]), panorama.most_seen
-    )
+    parts = (values[..., cells] for values in panorama[:4])
+    shuffled = correlation.TurnedPanorama(*parts, panorama.most_seen)
     features = features[views][..., cells].reshape(50, -1)
     seen = seen[views][:, cells]
     found = correlation.masked_correlation(features, seen, shuffled, Workers(1))

@@ -155,9 +155,8 @@ def test_a_prior_that_excludes_the_place_makes_no_pose_sure():
 
 def test_without_features_the_search_finds_the_pose():
     scan_map = rooms.scan_map(1)
-    featureless = replace(
-        scan_map, local_features=make_feature_map(scan_map.octree, np.empty((0, 3)), Workers())
-    )
+    nothing = make_feature_map(scan_map.octree, np.empty((0, 3)), Workers())
+    featureless = replace(scan_map, local_features=nothing)
     settings = rooms.KNOWN
     result = rooms.locate(rooms.scene(1)[1], featureless, settings)
     assert rooms.errors(result.pose, rooms.query(1).pose)[0] < 0.02

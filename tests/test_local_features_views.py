@@ -52,9 +52,8 @@ def test_a_level_photo_is_not_turned_about_its_axis():
     np.testing.assert_allclose(view.R_sphere_from_view[:, 2], [0.0, 0.0, 1.0], atol=1e-3)
     height, width = view.is_own.shape
     assert width > 2 * height
-    np.testing.assert_allclose(
-        np.abs(np.diff(view.columns[height // 2])), SPHERE / (2.0 * np.pi * FOCAL), rtol=0.5
-    )
+    steps = np.abs(np.diff(view.columns[height // 2]))
+    np.testing.assert_allclose(steps, SPHERE / (2.0 * np.pi * FOCAL), rtol=0.5)
 
 
 def test_what_is_too_wide_for_one_picture_has_no_view_around_it():

@@ -70,9 +70,8 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
     points = _points(prepared, pose)
     image = prepared.photo.images.full()
     levels = covariance.to_levels(points.channels)
-    problem = ChannelProblem(
-        points.offsets, levels, points.weights, image.rgbx, image.width, covariance.SCALE
-    )
+    seen = points.offsets, levels, points.weights
+    problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.SCALE)
     hessian = covariance.compute_hessian(problem, pose, covariance.STEPS[0])
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
@@ -246,9 +245,8 @@ def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(fou
     shown = covariance.mask_occluders(hidden, seen)
     assert shown is not hidden
     masked = covariance.estimate_covariance(hidden, pose, seen)
-    monkeypatch.setattr(
-        covariance, "mask_occluders", lambda *_: replace(shown, photo=Photo(shown.photo.panorama))
-    )
+    unasked = replace(shown, photo=Photo(shown.photo.panorama))
+    monkeypatch.setattr(covariance, "mask_occluders", lambda *_: unasked)
     left_out = covariance.estimate_covariance(hidden, pose, seen, pose)  # by the images that are there
     variances = [np.diag(found.gaussian.covariance)[3:] for found in (left_out, masked)]
     np.testing.assert_allclose(*np.sqrt(variances), rtol=0.1)

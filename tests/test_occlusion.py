@@ -54,9 +54,8 @@ def test_occluders_are_where_the_mask_is_white(contrast):
             photo = _occluded(panorama, number, rng, contrast)
             mask = occlusion.occlusion_mask(points, photo, pose)
             was_scanned = mask != occlusion.NOT_SCANNED
-            overlaps.append(
-                _intersection_over_union(mask == occlusion.CONTRADICTED, (number > 0) & was_scanned)
-            )
+            is_contradicted = mask == occlusion.CONTRADICTED
+            overlaps.append(_intersection_over_union(is_contradicted, (number > 0) & was_scanned))
             explained, contradicted = occlusion.compare_occlusion(points, photo, pose).fractions()
             assert contradicted / (explained + contradicted) == pytest.approx(fraction, abs=0.15)
             assert explained + contradicted <= 1.0
@@ -110,9 +109,8 @@ def test_what_was_not_scanned_or_not_photographed_is_grey():
 
 def test_nothing_in_common_is_neither_explained_nor_contradicted():
     points, panorama, pose = rooms.scene(1)
-    nothing = occlusion.compare_occlusion(
-        points, Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool)), pose
-    )
+    hidden = Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool))
+    nothing = occlusion.compare_occlusion(points, hidden, pose)
     assert nothing.fractions() == (0.0, 0.0)
     assert not (nothing.coverage > occlusion.LEAST_COVERED).any()
 

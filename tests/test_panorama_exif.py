@@ -44,9 +44,8 @@ def test_a_phone_photo_is_read_with_no_option(tmp_path):
     np.testing.assert_allclose(mount.camera.params, [focal, 240.0, 180.0], rtol=1e-5)
     fov = 2 * np.degrees(np.arctan(240 / focal))
     (note,) = panorama.warnings
-    assert note.startswith(
-        f"read as a pinhole photo {fov:.1f} deg wide, focal length {focal:.0f} px from EXIF's 35"
-    )
+    words = f"pinhole photo {fov:.1f} deg wide, focal length {focal:.0f} px from EXIF's 35"
+    assert note.startswith(f"read as a {words}")
     columns = np.flatnonzero(panorama.is_valid[len(panorama.rgb) // 2])
     assert len(columns) / panorama.rgb.shape[1] * 360.0 == pytest.approx(fov, abs=0.5)
 

@@ -229,9 +229,7 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
     monkeypatch.setattr(query_module, "normalize_view", lambda sums, center, config, shown: shown)
-    views = SimpleNamespace(
-        averages=lambda *_: None, points=lambda place, config, shown, count: (shown, count)
-    )
+    views = SimpleNamespace(averages=lambda *_: None, points=lambda place, config, *shown: shown)
     asked = replace(narrow, cache=Cache(views))
     assert (asked.view_at(pose, "fine") == shown).all()
     assert asked.view_at(pose, "points") == (shown.tobytes(), 30_000)

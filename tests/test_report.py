@@ -10,6 +10,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from poses import write_results
 from refusals import assert_input_error
 from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 
@@ -147,9 +148,7 @@ def test_a_moved_folder_of_photos_and_one_that_is_gone(house, tmp_path, capsys):
     assert "no pictures of it" in capsys.readouterr().err
     assert {photo["hasPictures"] for photo in _document(tmp_path / "r")["photos"]} == {False}
     moved = tmp_path / "moved.jsonl"
-    moved.write_text(
-        "".join(replace(r, pano=f"gone/{k}.jpg").to_json() + "\n" for k, r in enumerate(scene.results))
-    )
+    write_results(moved, [replace(r, pano=f"gone/{k}.jpg") for k, r in enumerate(scene.results)])
     assert report.main(["--results", str(moved), *words[2:], "--out", str(tmp_path / "m")]) == 0
     assert "; if it is in another folder, give --images FOLDER\n" in capsys.readouterr().err
     assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(tmp_path / "no")]) == 3
@@ -262,8 +261,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     digest = hashlib.sha256(scene.cloud.read_bytes()).hexdigest()
     sources = [replace(scene.results[0].source, cloud_sha256=s) for s in (digest, "0" * 64, None)]
     results = [replace(r, source=s) for r, s in zip(scene.results, sources, strict=False)]
-    lines = tmp_path / "poses.jsonl"
-    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--cache", "none"]
     for option, name in (("--out", "r"), ("--plan", "p.svg")):
         assert report.main([*words, option, str(tmp_path / name)]) == 3
@@ -281,11 +279,9 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
 
 def test_hopeless_guesses_are_on_no_plan(house, tmp_path):
     scene, _ = house
-    results = [
-        replace(scene.results[k], status="not_localized", confidence=c) for k, c in ((0, 0.003), (2, 0.3))
-    ]
-    lines = tmp_path / "poses.jsonl"
-    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    guesses = ((0, 0.003), (2, 0.3))
+    results = [replace(scene.results[k], status="not_localized", confidence=c) for k, c in guesses]
+    lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--quiet"]
     assert report.main([*words, "--out", str(tmp_path / "r"), "--plan", str(tmp_path / "p.svg")]) == 0
     assert [photo["isOnPlan"] for photo in _document(tmp_path / "r")["photos"]] == [False, True]
@@ -339,8 +335,7 @@ def test_frames_of_a_video_are_taken_out_of_it(house, tmp_path, capsys):
     with writing_video(tmp_path / "walk.mp4", 1.0, (128, 64)) as add:
         for result in scene.results[:2]:
             add(cv2.cvtColor(cv2.imread(result.pano), cv2.COLOR_BGR2RGB))
-    lines = tmp_path / "poses.jsonl"
-    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--out", str(tmp_path / "r")]
     assert report.main(words) == 0
     document = _document(tmp_path / "r")

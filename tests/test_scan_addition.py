@@ -123,9 +123,8 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
     taken = old.from_world(rooms.query(1).pose).center_world  # within the room
     place = old.centers[np.linalg.norm(old.centers - taken, axis=1).argmin()]
     center_world = old.to_world(Pose(np.eye(3), place)).center_world
-    column = Cloud(
-        points.astype(np.float32), rng.integers(256, size=(len(points), 3), dtype=np.uint8), center_world
-    )
+    colors = rng.integers(256, size=(len(points), 3), dtype=np.uint8)
+    column = Cloud(points.astype(np.float32), colors, center_world)
     scan_map = _added(old, column, "column")
     gone = _rows(scan_map, old.centers)[1]
     beside = np.abs(old.centers - place) - size / 2

@@ -270,9 +270,8 @@ def test_bad_frames_are_black_mirrored_or_of_elsewhere():
 
 
 def test_photos_of_a_walk_have_one_light_and_their_own_noise():
-    clean, photos = (
-        np.array([frame.rgb for frame in frames(rate=0.2, variant=v)], float) for v in ("clean", "photo")
-    )
+    both = (frames(rate=0.2, variant=variant) for variant in ("clean", "photo"))
+    clean, photos = (np.array([frame.rgb for frame in taken], float) for taken in both)
     both = zip(photos, clean, strict=True)
     colors = [photo.mean(axis=(0, 1)) / picture.mean(axis=(0, 1)) for photo, picture in both]
     assert np.ptp(colors, axis=0).max() < 0.1 * np.mean(colors)

@@ -191,12 +191,8 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid(monkeypatch):
     assert len(drawn) == 1
     np.testing.assert_allclose(drawn[0].center_world, middle.center_world, atol=1e-12)
     np.testing.assert_allclose(drawn[0].R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
-    assert (
-        verification.matches_near(
-            query, Pose(middle.R_cam_from_world, middle.center_world + 0.6 * verification.PLACE)
-        )
-        == 2
-    )
+    beside = Pose(middle.R_cam_from_world, middle.center_world + 0.6 * verification.PLACE)
+    assert verification.matches_near(query, beside) == 2
     turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * verification.TURN, 0.0]))
     assert verification.matches_near(query, Pose(turned, middle.center_world)) == 3
     masked = query.mask(np.zeros((8, 16), bool))

@@ -158,13 +158,11 @@ def test_known_motions_have_the_error_of_their_length():
     moved = walk_path.motion_between(frames, 0, 1)
     assert walk_path.is_moved(moved, frames[0].states, frames[1].states).tolist() == [[True]]
     frames[1].odometry = _pose(27, 0, 0)
-    assert not walk_path.is_moved(
-        walk_path.motion_between(frames, 0, 1), frames[0].states, frames[1].states
-    ).any()
+    moved = walk_path.motion_between(frames, 0, 1)
+    assert not walk_path.is_moved(moved, frames[0].states, frames[1].states).any()
     frames[1].odometry = _pose(30, 0, 0, yaw=0.5)
-    assert not walk_path.is_moved(
-        walk_path.motion_between(frames, 0, 1), frames[0].states, frames[1].states
-    ).any()
+    moved = walk_path.motion_between(frames, 0, 1)
+    assert not walk_path.is_moved(moved, frames[0].states, frames[1].states).any()
 
 
 def test_a_jump_has_a_price_and_is_reported():
