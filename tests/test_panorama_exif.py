@@ -63,6 +63,8 @@ def test_a_photo_twice_as_wide_as_high_is_read_as_a_sphere_with_a_warning(tmp_pa
     assert read_panorama(photo(tmp_path / "b.jpg", size=(480, 240))).warnings == ()
     sphere = with_metadata(path.read_bytes(), xmp=xmp_packet({"ProjectionType": "equirectangular"}))
     assert read_panorama(write(tmp_path / "c.jpg", sphere)).warnings == ()
+    given = Calibration("made", (Mount(Camera("EQUIRECTANGULAR", 960, 480, (960.0, 480.0))),))
+    np.testing.assert_array_equal(read_panorama(Photo(path, camera=given)).rgb, panorama.rgb)
 
 
 def test_the_resolution_of_the_sensor_goes_before_the_rounded_equivalent():
@@ -148,14 +150,6 @@ def test_a_part_of_a_panorama_is_not_taken_for_a_photo(tmp_path):
     sphere = with_metadata(encoded(PHOTO, ".jpg"), xmp=xmp_packet({"PosePitchDegrees": 10}))
     path = write(tmp_path / "b.jpg", sphere)
     assert read_panorama(Photo(path, fov_deg=65.0)).warnings == ()
-
-
-def test_a_sphere_stays_a_sphere_whatever_its_exif(tmp_path):
-    wide = photo(tmp_path / "a.jpg", FILM, size=(480, 240))
-    assert read_panorama(wide).cameras == ()
-    assert len(read_panorama(Photo(wide, projection="pinhole")).cameras) == 1
-    sphere = Calibration("made", (Mount(Camera("EQUIRECTANGULAR", 960, 480, (960.0, 480.0))),))
-    np.testing.assert_array_equal(read_panorama(Photo(wide, camera=sphere)).rgb, read_panorama(wide).rgb)
 
 
 def test_photos_of_which_nothing_is_known_are_refused(tmp_path):
