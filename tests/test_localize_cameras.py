@@ -25,8 +25,8 @@ from piccolo.result import Result, read_results
 from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))
-FISHEYE = Camera("OPENCV_FISHEYE", 512, 512, (150.0, 150.0, 256.0, 256.0, 0.01, -0.003, 0.0, 0.0), 95.0)
-DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(512, 0)))
+FISHEYE = Camera("OPENCV_FISHEYE", 256, 256, (75.0, 75.0, 128.0, 128.0, 0.01, -0.003, 0.0, 0.0), 95.0)
+DUAL = (Mount(FISHEYE), Mount(FISHEYE, BACK, offset=(256, 0)))
 SEED = 5
 
 
@@ -79,7 +79,7 @@ def test_a_dual_fisheye_is_localized(tmp_path):
     photo = write(tmp_path / "a.png", encoded(rgb, ".png"))
     result = scan().localize(Photo(photo, camera=calibration), gravity="unknown")
     rooms.assert_near(result.best_pose, pose, 0.01, 0.2)
-    assert json.loads(result.to_json())["camera"]["cameras"][1]["offset"] == [512, 0]
+    assert json.loads(result.to_json())["camera"]["cameras"][1]["offset"] == [256, 0]
 
 
 def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
@@ -87,10 +87,10 @@ def test_a_tilted_wide_photo_is_found_by_its_gravity(tmp_path):
     this, upright = place()
     R_tilt = exp_so3(np.radians([15.0, 0.0, 0.0])) @ exp_so3(np.radians([0.0, 20.0, 0.0]))
     pose = Pose(R_tilt @ upright.R_cam_from_world, upright.center_world)
-    camera = Camera("SIMPLE_FISHEYE", 800, 600, (230.0, 400.0, 300.0))
+    camera = Camera("SIMPLE_FISHEYE", 400, 300, (115.0, 200.0, 150.0))
     rgb = render_picture(Mount(camera), this, pose, Workers(2))
     down = tuple((pose.R_cam_from_world @ [0.0, 0.0, -9.81]).tolist())
-    fov_deg = float(np.degrees(800 / 230.0))
+    fov_deg = float(np.degrees(400 / 115.0))
     photo = Photo(rgb, fov_deg=fov_deg, projection="fisheye", gravity_vector=down)
     result = scan().localize(photo, gravity="known")
     rooms.assert_near(result.best_pose, pose, 0.02, 0.5)
@@ -136,9 +136,9 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     assert all(pose_errors(result.best_pose, pose)[0] < 0.02 for result in results)
     assert results[0].source.pano_sha256 == results[1].source.pano_sha256
     capsys.readouterr()
-    wide = render_picture(Mount(pinhole(480, 360, 150.0)), this, pose, Workers(2))
+    wide = render_picture(Mount(pinhole(240, 180, 75.0)), this, pose, Workers(2))
     exif = Image.Exif()
-    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 600 px diagonal: 152.5 px
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 300 px diagonal: 76.3 px
     Image.fromarray(wide).save(tmp_path / "phone.jpg", exif=exif, quality=95)
     main([*cloud, "--pano", str(tmp_path / "phone.jpg")])
     out, err = capsys.readouterr()
@@ -146,7 +146,7 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     first, *_, last = err.splitlines()  # a warning stands below the line of its photo
     assert first.startswith(f"{tmp_path / 'phone.jpg'}: localized at")
     assert last.startswith(
-        "  warning: read as a pinhole photo 115.1 deg wide, focal length 153 px from EXIF's 35 mm"
+        "  warning: read as a pinhole photo 115.1 deg wide, focal length 76 px from EXIF's 35 mm"
     )
     assert main([*cloud, "--pano", str(tmp_path / "phone.jpg"), "--camera", str(rig)]) == 2
     assert "give it as --rig" in capsys.readouterr().err
@@ -156,14 +156,14 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
     photos, cameras = tmp_path / "photos", tmp_path / "cameras"
     photos.mkdir()
     cameras.mkdir()
-    rgb = render_picture(Mount(pinhole(480, 360, 150.0)), *place(), Workers(2))
+    rgb = render_picture(Mount(pinhole(240, 180, 75.0)), *place(), Workers(2))
     for name in ("a", "b", "c"):
         write(photos / f"{name}.jpg", encoded(rgb, ".jpg"))
-    write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(480, 360, 150.0)),))).encode())
-    write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(480, 360, 160.0)),))).encode())
+    write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(240, 180, 75.0)),))).encode())
+    write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(240, 180, 75.5)),))).encode())
     given = [Photo(path, camera=cameras) for path in sorted(photos.iterdir())]
     results = list(scan().localize_many(given, gravity="known"))
-    assert [result.focal_length.given_px for result in results[:2]] == [150.0, 160.0]
+    assert [result.focal_length.given_px for result in results[:2]] == [75.0, 75.5]
     assert results[0].status == "localized"
     assert results[0].settings["panorama"]["camera"] == str(cameras)
     assert results[2].status == "unreadable"
