@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .camera import Calibration, Mount
-from .camera.files import document_of, read_mounts
+from .camera.calibration import document_of, read_mounts
 from .errors import InputError
 from .files.atomic import write_atomically
 from .files.json_file import DAMAGE, describe, read_json
@@ -148,10 +148,7 @@ def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return a path as a folder's files may give it, whatever links lead to either.
-
-    A link itself stays one.
-    """
+    """Return a path as a folder's files may give it, whatever links lead to either; a link stays one."""
     return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
 
 

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize

@@ -19,10 +19,10 @@ from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, opened_scan
 from piccolo.batch.localizer import Localizer
-from piccolo.batch.outputs import StreamOutput
+from piccolo.batch.results_file import StreamOutput
 from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks_beside
 from piccolo.camera import Mount
-from piccolo.camera.files import document_of
+from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize
 from piccolo.cloud.settings import CloudSettings
@@ -54,8 +54,8 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     photos, cameras, out = tmp_path / "photos", tmp_path / "cameras", tmp_path / "poses.jsonl"
     photos.mkdir()
     cameras.mkdir()
-    for name, focal, at in (("narrow", 360.0, near), ("wide", 200.0, pose)):
-        camera = Mount(pinhole(640, 480, focal))
+    for name, focal, at in (("narrow", 180.0, near), ("wide", 100.0, pose)):
+        camera = Mount(pinhole(320, 240, focal))
         write(photos / f"{name}.png", encoded(render_picture(camera, room, at, Workers(2)), ".png"))
         write(cameras / f"{name}.camera.json", json.dumps(document_of((camera,))).encode())
     words = ["--cloud", str(rooms.map_path(SEED)), "--camera", str(cameras), "--quiet"]
@@ -159,7 +159,7 @@ def looked(monkeypatch):
 
     monkeypatch.setattr(OpenedScan, "localize", localize)
     monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
-    monkeypatch.setattr(Localizer, "locate", lambda self, scan, line: line)
+    monkeypatch.setattr(Localizer, "place_keypoints", lambda self, scan, line: line)
     return looked
 
 
@@ -330,7 +330,7 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
-    located, confidence, gaussian = localizer.locate(opened, text)
+    located, confidence, gaussian = localizer.place_keypoints(opened, text)
     assert confidence == json.loads(text)["confidence"]
     in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix
     np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
@@ -339,15 +339,15 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     assert (located.ranges > 0.0).all()
     asked = []
     with monkeypatch.context() as patch:
-        patch.setattr(Localizer, "locate", lambda self, scan, line: asked.append(line))
+        patch.setattr(Localizer, "place_keypoints", lambda self, scan, line: asked.append(line))
         patch.setattr(OpenedScan, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
         answer = localizer.answer_in(opened)
         for beside in ((text, " " + text), (" " + text, "  " + text)):
             answer(localizer.task(photo)._replace(look=Look(0, "ambiguous", str(photo), text, beside, "1")))
     assert [line.count(" {") - text.count(" {") for line in asked] == [0, 1, 1]
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert localizer.locate(opened, text) is None
+    assert localizer.place_keypoints(opened, text) is None
     photo.unlink()
-    assert localizer.locate(opened, text) is None
+    assert localizer.place_keypoints(opened, text) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
         opened.require_default_method("photos beside others", None)

@@ -36,7 +36,7 @@ def _alone(*probabilities):
     poses = [at(float(k), 0.5) for k in range(len(probabilities))]
     likely = list(zip(poses, probabilities, strict=True))
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
-    alone = Localization(confidence=probabilities[0], alternatives=alternatives)
+    alone = Localization(pose=poses[0].pose, confidence=probabilities[0], alternatives=alternatives)
     return bundle_search.Member(
         None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0]
     )

@@ -13,10 +13,9 @@ import numba
 import numpy as np
 import pytest
 
-from piccolo.cli import progress
-from piccolo.files import cache, temporary
-from piccolo.files.atomic import replacing
-from piccolo.files.temporary import PREFIX, temporary_folder
+from piccolo.cli import terminal
+from piccolo.files import atomic, cache
+from piccolo.files.atomic import PREFIX, replacing, temporary_folder
 from piccolo.kernels import jit
 from piccolo.kernels.jit import kernel
 from piccolo.optimize.channel_loss import add_channels
@@ -259,7 +258,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     monkeypatch.setattr(jit.time, "monotonic", lambda: next(seconds))
     for is_quiet in (False, True):
         compiling = jit.Compiling()
-        with progress.showing_log(is_quiet):
+        with terminal.showing_log(is_quiet):
             compiling.start()
             compiling.finish()
             compiling.finish()
@@ -279,7 +278,7 @@ def test_importing_writes_nothing(tmp_path):
 
 HOLD = """
 import sys, time
-from piccolo.files.temporary import temporary_folder
+from piccolo.files.atomic import temporary_folder
 with temporary_folder() as folder:
     (folder / "frame.jpg").touch()
     print(folder, flush=True)
@@ -290,7 +289,7 @@ with temporary_folder() as folder:
 @pytest.fixture
 def temporary_folders(tmp_path, monkeypatch):
     """A function that lists the temporary folders there are."""
-    monkeypatch.setattr(temporary.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
     return lambda: [path for path in tmp_path.iterdir() if path.name.startswith(PREFIX)]
 
 

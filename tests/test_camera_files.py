@@ -7,10 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from refusals import assert_refused, mutated, read_or_refused
 
-from piccolo.camera.files import document_of, read_calibration, read_mounts, read_rig
+from piccolo.camera.calibration import Mount, document_of, read_calibration, read_mounts, read_rig
 from piccolo.camera.model import MODELS, Camera
 from piccolo.camera.resampling import View, make_sphere, sphere_width
-from piccolo.camera.rig import Mount
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM

@@ -10,7 +10,7 @@ from pictures import write
 from rooms import write_room
 
 from piccolo.camera import Camera, Mount
-from piccolo.camera.files import document_of
+from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli import export_poses, localize, render_pose
 from piccolo.geometry.pose import exp_so3

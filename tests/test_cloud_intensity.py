@@ -15,9 +15,8 @@ from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.readers.ptx import open_ptx
 from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, intensity_reader
-from piccolo.cloud.readers.text import open_text
+from piccolo.cloud.readers.text import open_ptx, open_text
 from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.geometry.pose import exp_so3
 

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import naive
@@ -7,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, open_source, stream_points
-from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud import Cloud, CloudStream, open_source
+from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.voxels import morton_codes, morton_order
 
@@ -26,7 +25,7 @@ def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
 
 def clean(path, raw, scale):
     """The cloud of points in memory as if they had been read from a file."""
-    return replace(stream_points(path, raw), scale=scale).read()
+    return CloudStream([PointSource(path, lambda: iter([raw]))], scale).read()
 
 
 def whole(open_file, path, options=IN_COLORS, *channel):

@@ -9,9 +9,9 @@ from refusals import assert_input_error, assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.ply_writer import coordinate_type, vertex_rows, write_ply, writing_ply
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.writers import coordinate_type, vertex_rows, write_ply, writing_ply
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

@@ -9,8 +9,7 @@ from test_cloud_text import write
 from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import reader as raw
 from piccolo.cloud.readers import text
-from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.text import line_blocks, open_pts
+from piccolo.cloud.readers.text import line_blocks, open_pts, open_ptx
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

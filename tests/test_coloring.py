@@ -15,18 +15,21 @@ from piccolo.cli import color_scan as tool
 from piccolo.cli import localize as command_line
 from piccolo.cli.together import steps_file
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.colored_writer import write_colored, writing_e57
 from piccolo.cloud.octree import build_octree, recolor
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_colored, write_ply, writing_e57
 from piccolo.coloring import alignment, color_scan
-from piccolo.coloring.alignment import Anchor, add_pairs, align
-from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligned_brushes
-from piccolo.coloring.exposure import balance
-from piccolo.coloring.painting import find_medians, make_brushes, paint_points
-from piccolo.coloring.sight import look, weigh_points
+from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
+from piccolo.coloring.color_scan import (
+    PAINTED,
+    find_medians,
+    localize_by_colors,
+    make_aligned_brushes,
+    make_brushes,
+    paint_points,
+)
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
-from piccolo.files.journal import Journal
+from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
@@ -118,7 +121,7 @@ def test_a_photo_sees_what_is_in_front_and_nothing_behind_walls():
     points = np.concatenate([leaves, leaves + 0.5 * away / np.linalg.norm(away, axis=1, keepdims=True)])
     found = np.empty(len(points), np.float32)
     R, t = poses[0].R_cam_from_world, poses[0].center_world
-    weigh_points(np.ascontiguousarray(points, np.float32), *sight, R, t, found)
+    weigh_points(np.ascontiguousarray(points, np.float32), sight, R, t, found)
     assert (found[: len(leaves)] > 0.0).mean() > 0.5
     assert (found[len(leaves) :] > 0.0).mean() < 0.1
 
@@ -213,10 +216,10 @@ def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
     rng = np.random.default_rng(5)
     weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
 
-    def weigh(points, ranges, sight, R_cam_from_map, center_map, found):
+    def weigh(points, sight, R_cam_from_map, center_map, found):
         found[:] = weights[int(center_map[0])]
 
-    monkeypatch.setattr(alignment, "look", lambda octree, pose: (None, None))
+    monkeypatch.setattr(alignment, "look", lambda octree, pose: None)
     monkeypatch.setattr(alignment, "weigh_points", weigh)
     poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
     sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))

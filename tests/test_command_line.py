@@ -15,9 +15,9 @@ import pytest
 from batches import ROOT
 from rooms import errors, query, room
 
-from piccolo.cli import localize, prepare_map, progress
+from piccolo.cli import localize, prepare_map, terminal
+from piccolo.cli.checks import UsageError, checking_options
 from piccolo.cli.command import command, new_parser, parse
-from piccolo.cli.errors import UsageError, checking_options
 from piccolo.cli.options import add_arguments, cloud_settings_from
 from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import IN_METRES, WITHOUT_COLORS, CloudSettings
@@ -187,9 +187,9 @@ def test_help_of_a_script_names_no_installed_commands(monkeypatch, capsys, scrip
 
 
 def test_progress_says_step_and_time_left(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "DELAY", 0.0)
+    monkeypatch.setattr(terminal, "DELAY", 0.0)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    show = progress.progress_bar(is_quiet=False)
+    show = terminal.progress_bar(is_quiet=False)
     for label, title in (("find features", "prepare, 3 of 4: find features: "), ("write", "write: ")):
         shown = show(iter([1, 2]), 2, label)
         next(shown)

@@ -14,7 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from piccolo.cli import export_poses
 from piccolo.scene import read_scene
-from research.datasets import DATASETS, checking
+from research.datasets import checking
+from research.datasets.convert_dataset import list_scenes
 from research.datasets.files import AXES, DIRECTIONS, pose_of_transform
 from research.datasets.model import ConvertOptions
 
@@ -252,7 +253,7 @@ FILES = {
 
 def read_poses(name, folder):
     options = ConvertOptions(folder, axes="optical" if name == "generic tum" else None)
-    listed = DATASETS[name.split()[0]].list_scenes(options)
+    listed = list_scenes(name.split()[0], options)
     return [panorama.pose for spec in listed.specs for panorama in spec.panoramas]
 
 

@@ -24,7 +24,7 @@ from research.evaluation.query_result import (
     match_results,
     read_run,
 )
-from research.evaluation.walks import alone_table, group_walks, walk_table
+from research.evaluation.tables import alone_table, group_walks, walk_table
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
 

@@ -15,8 +15,8 @@ from test_export_tables import rotation
 
 from piccolo.errors import InputError
 from piccolo.export import Options, export
-from piccolo.export.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
 from piccolo.panorama import panorama_size
+from piccolo.panorama.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
 
 ANGLES = (123.25, -10.5, 7.0)
 XMP_MARK = b"http://ns.adobe.com/xap/1.0/\0"

@@ -28,7 +28,7 @@ from piccolo.result import Result
 from piccolo.scene import read_scene
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
-from research.synthetic.room import LABEL_NAMES
+from research.synthetic.layout import LABEL_NAMES
 
 POINTS = seeded_cloud(1, num_points=3000).points_world
 LABELS = np.random.default_rng(2).integers(0, 21, 3000)

@@ -9,8 +9,8 @@ import pytest
 import rooms
 from rooms import as_panorama, errors, query
 
-from piccolo.cloud import stream_points
-from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud import CloudStream
+from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.confidence.covariance import describe_errors
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
@@ -256,7 +256,9 @@ def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(fou
 def test_truth_is_among_the_poses_of_a_place_that_repeats(kind):
     world = World(1, make_alike(kind, 1, 0.0))
     points, colors, _ = scan_world(world, 80_000 * len(world.rooms), Workers(2))
-    cloud = stream_points(Path("repeated"), RawCloud(points.astype(float), colors))
+    cloud = CloudStream(
+        [PointSource(Path("repeated"), lambda: iter([RawCloud(points.astype(float), colors)]))]
+    )
     taken = make_query(world, 0, "clean", rooms.WIDTH, Workers(2))
     built, panorama = prepare_map(cloud, Workers(2)), as_panorama(taken.rgb)
     result = rooms.locate(panorama, built)

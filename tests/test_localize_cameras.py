@@ -14,7 +14,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 
 from piccolo.camera import Mount
-from piccolo.camera.files import document_of, read_rig
+from piccolo.camera.calibration import document_of, read_rig
 from piccolo.camera.model import Camera, pinhole
 from piccolo.cli.localize import main
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors

@@ -19,6 +19,7 @@ from piccolo.confidence.localization import Alternative, FocalLength, Localizati
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.localization import judge as judging
+from piccolo.localization.covariance import UNKNOWN_ERRORS
 from piccolo.localization.judge import MIRRORED
 from piccolo.localization.selection import Selection
 from research.synthetic.world import photograph, render_picture
@@ -69,7 +70,7 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
     query, focal = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1)), FocalLength(300.0, 3.0, 300.0, 3.0)
     fit = SimpleNamespace(doubt=doubt, conflict=conflict, focal_length=lambda given: focal)
     found = Selection(Hypothesis(HERE, 0.5), ())
-    measured = judging.Measured(HERE, None, None, 0.05, None)
+    measured = judging.Measured(HERE, UNKNOWN_ERRORS, 0.05, None)
     standings = [Standing(1.0, 0.5, 60, "map features")]
     p = np.array([probability, 1.0 - probability])
     result = judging.conclude(query, found, fit, measured, standings, p)

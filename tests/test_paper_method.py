@@ -15,8 +15,16 @@ from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.panorama.model import shrink
-from piccolo.paper.localize import localize, paper_confidence, prepare
-from piccolo.paper.search import MIN_CLEARANCE, PROBE_WIDTH, color_histogram, free_grid, histogram_similarity
+from piccolo.paper.localize import (
+    MIN_CLEARANCE,
+    PROBE_WIDTH,
+    color_histogram,
+    free_grid,
+    histogram_similarity,
+    localize,
+    paper_confidence,
+    prepare,
+)
 from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import is_free_space
 

@@ -16,8 +16,15 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
-from piccolo.paper.localize import localize, make_loss, prepare
-from piccolo.paper.photometric import photometric_equations, photometric_loss, pixel_motion, view_gradient
+from piccolo.paper.localize import (
+    localize,
+    make_loss,
+    photometric_equations,
+    photometric_loss,
+    pixel_motion,
+    prepare,
+    view_gradient,
+)
 from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import View, render_view
 

@@ -16,7 +16,8 @@ from test_cloud_las import RAW
 
 import piccolo
 from piccolo.batch.priors import read_priors
-from piccolo.cloud.crs import from_wgs84, read_crs
+from piccolo.cloud.settings import from_wgs84
+from piccolo.cloud.stream import read_crs
 from piccolo.panorama.photo import GpsPosition, read_photo_facts
 from piccolo.photo import Photo
 from piccolo.prior import Prior

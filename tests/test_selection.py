@@ -15,6 +15,7 @@ from piccolo.geometry.pose import step
 from piccolo.localization import beam, last_descent, selection
 from piccolo.localization import judge as judging
 from piccolo.localization.comparison import score_pose
+from piccolo.localization.covariance import UNKNOWN_ERRORS
 from piccolo.localization.last_descent import refine_best
 from piccolo.localization.selection import Selection
 from piccolo.localization.verification import count_agreeing
@@ -198,9 +199,8 @@ def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(monkeypatch, is_c
     query = compared(monkeypatch, {0.0: 0.3, 3.0: 0.5, 6.0: 0.1}, {0.0: 20, 3.0: 20})
     monkeypatch.setattr(judging, "find_copies", lambda *_: [is_copy, False])
     monkeypatch.setattr(judging, "settle", lambda _, h: h)
-    monkeypatch.setattr(
-        judging, "measure", lambda _, found, fit: judging.Measured(found.best.pose, *[None] * 4)
-    )
+    measured = judging.Measured(at(0.0, 0.0).pose, UNKNOWN_ERRORS, 0.05, None)
+    monkeypatch.setattr(judging, "measure", lambda *_: measured)
     monkeypatch.setattr(judging, "conclude", lambda _, found, *more: found)
     found = Selection(at(0.0, 0.3), (at(3.0, 0.5), at(6.0, 0.1)))
     judged = judging.judge(replace(query, evidence="drawn scan"), found)

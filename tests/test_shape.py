@@ -21,8 +21,8 @@ from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
-from piccolo.cloud.shape import paint_shape
 from piccolo.cloud.stream import Cloud
+from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
@@ -33,8 +33,7 @@ from piccolo.localization.selection import Selection, assess_alone
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
-from piccolo.panorama.edges import draw_edges, soften
-from piccolo.panorama.manhattan import find_axes
+from piccolo.panorama.edges import draw_edges, find_axes, soften
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 

@@ -20,9 +20,9 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.scene import read_scene
 from research.synthetic import make_room as tool
+from research.synthetic.layout import make_room
 from research.synthetic.office import make_office
 from research.synthetic.raycast import cast_rays
-from research.synthetic.room import make_room
 from research.synthetic.walk_frames import BAD_KINDS, WalkOptions, frames_of
 from research.synthetic.walking import HEIGHT, Walker
 from research.synthetic.world import (

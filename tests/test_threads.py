@@ -12,8 +12,7 @@ import rooms
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from piccolo.jobs import threads
-from piccolo.jobs.blas import one_blas_thread
-from piccolo.jobs.threads import Once, Stopwatch, Workers
+from piccolo.jobs.threads import Once, Stopwatch, Workers, one_blas_thread
 from piccolo.localization import localize as method
 from piccolo.localization.settings import CoarseToFineSettings
 
@@ -198,12 +197,12 @@ def test_within_is_one_thread_until_the_last_is_out(three_threads):
     inside, go_on = threading.Event(), threading.Event()
 
     def stay():
-        with one_blas_thread:
+        with one_blas_thread():
             inside.set()
             assert go_on.wait(60)
 
     other = threading.Thread(target=stay)
-    with one_blas_thread:
+    with one_blas_thread():
         other.start()
         assert inside.wait(60)
         assert _threads() == {1}
@@ -214,7 +213,7 @@ def test_within_is_one_thread_until_the_last_is_out(three_threads):
 
 
 def test_an_error_gives_them_back(three_threads):
-    with pytest.raises(ValueError, match="broken"), one_blas_thread:
+    with pytest.raises(ValueError, match="broken"), one_blas_thread():
         raise ValueError("broken")
     assert _threads() == three_threads
 

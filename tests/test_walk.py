@@ -14,11 +14,11 @@ from piccolo.cli import localize as localize_command
 from piccolo.cli.together import steps_file
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
-from piccolo.export.video import writing_video
 from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import picture
+from piccolo.panorama.video import writing_video
 from piccolo.photo import Photo
 from piccolo.result import read_results
 from piccolo.scan_walk import Walk

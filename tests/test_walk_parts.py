@@ -10,7 +10,7 @@ from pictures import encoded, write
 from refusals import assert_input_error
 from test_priors import write_photo
 
-from piccolo.batch.frame_times import times_of
+from piccolo.batch.inputs import times_of
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3

@@ -12,9 +12,9 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
 from piccolo.walk import path as walk_path
 from piccolo.walk import second_look
-from piccolo.walk.beliefs import NOTHING, Belief, believe
 from piccolo.walk.frames import MOST_EXPECTED, Frame, State
 from piccolo.walk.motion import JUMP_LOG, Motion, check_times
+from piccolo.walk.path import NOTHING, Belief, believe
 from piccolo.walk.tracker import Followed, expect
 
 MOTION = Motion(max_speed=1.0)

@@ -173,7 +173,6 @@ class Camera:
     max_angle_deg: float | None = None  # from the axis; beyond, nothing is shown (a fisheye's circle)
 
     def __post_init__(self) -> None:
-        """Refuse what is no camera."""
         if self.model not in MODELS:
             raise InputError(f"found the camera model {self.model!r}, wanted one of {', '.join(MODELS)}")
         names = MODELS[self.model][1]

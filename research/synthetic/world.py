@@ -14,16 +14,16 @@ from numpy.typing import NDArray
 
 from piccolo.arrays import Array, Array32, Bytes, Int64s
 from piccolo.camera import Calibration, Mount
-from piccolo.camera.rig import compute_extent
+from piccolo.camera.calibration import compute_extent
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.rotations import uniform_rotations
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 
+from .layout import Room, make_room
 from .photos import change_light
 from .raycast import cast_rays
-from .room import Room, make_room
 
 SUPERSAMPLING = 2  # rays a pixel, each way
 TILE = 64  # side [px] of what is cast at once: rays near each other meet few boxes
