@@ -134,13 +134,7 @@ def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_p
     cache.own_folder(folder, jit.NAME)
     tag = (folder / "CACHEDIR.TAG").read_bytes()
     assert tag.startswith(b"Signature: 8a477f597d28d172789f06886806bc55\n")
-    names = [
-        f"{key}.kernel",
-        f".{key}.kernel.{16 * 'a'}",
-        f"{key[1:]}.kernel",
-        "a.txt",
-        "1" + f"{key[1:]}.kernel",
-    ]
+    names = [f"{key}.kernel", f".{key}.kernel.{16 * 'a'}", f"{key[1:]}.kernel", "a.txt", f"1{key[1:]}.kernel"]
     for foreign in (folder, tmp_path / "foreign"):
         foreign.mkdir(exist_ok=True)
         for name in names:
@@ -320,8 +314,5 @@ def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(t
     (tmp_path / f"{PREFIX}12345678").symlink_to(tmp_path)
     (tmp_path / f"{PREFIX}87654321").mkdir()  # made a moment ago
     with temporary_folder() as own:
-        assert {path.name for path in temporary_folders()} == {
-            own.name,
-            f"{PREFIX}12345678",
-            f"{PREFIX}87654321",
-        }
+        others = {f"{PREFIX}12345678", f"{PREFIX}87654321"}
+        assert {path.name for path in temporary_folders()} == {own.name, *others}

@@ -182,9 +182,8 @@ def test_ptx_scan_with_colors_after_one_without_is_read_by_its_intensity(tmp_pat
 def test_pcd(tmp_path, encoding):
     intensity = _measured(11, "decibels").astype(np.float32)
     table = np.column_stack([POINTS, intensity]).astype("<f4")
-    fields = [
-        (name, "f4", 1, column) for name, column in zip(("x", "y", "z", "intensity"), table.T, strict=True)
-    ]
+    names = ("x", "y", "z", "intensity")
+    fields = [(name, "f4", 1, column) for name, column in zip(names, table.T, strict=True)]
     path = tmp_path / "a.pcd"
     path.write_bytes(content_of(fields, encoding, 3000))
     assert_gray(open_pcd, path, intensity.astype(float), table[:, :3])

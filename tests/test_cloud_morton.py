@@ -121,9 +121,8 @@ def test_millimetres_and_far_outliers_are_warned_of():
     raw = seeded_cloud(16)
     raw.points_world[0] = 5e6
     (warning,) = clean(A, raw, 1.0).warnings
-    assert (
-        warning == "a: points 5000004 m apart limit the precision of the rest to 0.25 m; remove the outliers"
-    )
+    words = "points 5000004 m apart limit the precision of the rest to 0.25 m; remove the outliers"
+    assert warning == f"a: {words}"
 
 
 def test_points_that_are_not_finite_are_dropped_and_counted():

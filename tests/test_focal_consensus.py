@@ -15,7 +15,6 @@ from piccolo.batch.second_look import list_changed_by_consensus, list_looks_by_f
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
 from piccolo.confidence.localization import FocalLength
 from piccolo.geometry.pose import Pose, yaw_rotation
@@ -124,17 +123,15 @@ def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
     for k in range(4):
         turned = yaw_rotation(0.5 * k) @ pose.R_cam_from_world
         poses.append(Pose(turned, pose.center_world + np.array([0.05 * k, 0.03, 0.0])))
-        picture = render_picture(Mount(pinhole(320, 240, 0.5 * TRUE)), room, poses[k], Workers(2))
+        picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, poses[k], Workers(2))
         write(photos / f"{k}.png", encoded(picture, ".png"))
-    cloud = rooms.room(SEED)[1]
-    write_ply(tmp_path / "scan.ply", vertex_rows(cloud.points + cloud.origin_world, cloud.colors))
-    words = ["--cloud", str(tmp_path / "scan.ply"), "--pano", str(photos), "--focal", str(0.515 * TRUE)]
+    words = ["--cloud", str(rooms.map_path(SEED)), "--pano", str(photos), "--focal", str(1.03 * TRUE)]
     out = tmp_path / "poses.jsonl"
     main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
     results = read_results([out])
     told = [r.focal_length.others_px for r in results if r.focal_length.others_px]
     assert told
-    assert told == pytest.approx([0.5 * TRUE] * len(told), rel=0.01)
+    assert told == pytest.approx([TRUE] * len(told), rel=0.01)
     for result, true in zip(results, poses, strict=True):
         if result.status == "localized":
             assert result.pose.distance(true) < 0.05

@@ -43,7 +43,8 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
             path.mkdir(parents=True)
         words = ["--cloud", str(scene / "cloud.ply"), "--pano", str(bad), str(scene / "images")]
         words += ["--out", str(folder / "out"), "--overlay", str(pictures[0]), "--priors", str(table)]
-        words += ["--occlusion-mask", str(pictures[1]), "--cache", "none", "--max-memory", "8"]
+        words += ["--occlusion-mask", str(pictures[1]), "--max-memory", "8"]
+        words += ["--cache", str(scene.parent / "maps")]
         assert localize.main([*words, "--jobs", jobs]) == 3
         err = re.sub(r" in [0-9.]+ s", "", capsys.readouterr().err)
         lines = [line for line in err.splitlines() if re.search("clean|bad|names", line)]

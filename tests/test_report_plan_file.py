@@ -8,6 +8,7 @@ import cv2
 import ezdxf
 import numpy as np
 import pytest
+from refusals import assert_input_error
 from report_scenes import HOSTILE, House, lifted
 
 from piccolo.cli import report
@@ -148,5 +149,4 @@ def test_two_control_points_give_a_turn_and_a_scale():
 def test_control_points_that_are_none(tmp_path, text, found):
     path = tmp_path / "points.csv"
     path.write_text(text)
-    with pytest.raises(InputError, match=found):
-        read_control_points(path)
+    assert_input_error(found, read_control_points, path)
