@@ -295,8 +295,8 @@ def photo_covariance(turn: float, median_range: float) -> Array:
 def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
-    These are correlated over many blocks: its noise and doubled surfaces, by `surface_variance`; of shape alone,
-    those of its edges.
+    These are correlated over many blocks: its noise and doubled surfaces, by `surface_variance`; of shape
+    alone, those of its edges.
     """
     surface = scan_map.surface_variance
     covariance = np.zeros((6, 6))
