@@ -1,7 +1,7 @@
 """A scan prepared for a method: `Scan`, the commands and the batches localize photos in it."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from .cloud.soa import PackedPoints
 from .confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from .confidence.localization import FocalLength, Localization
 from .confidence.occlusion import occlusion_mask
-from .errors import InputError
+from .errors import InputError, is_passing
 from .files.json_file import reading_once
 from .geometry.colors import Labels
 from .geometry.nearness import CONFIRMED
@@ -38,7 +38,6 @@ from .scan_map.gps import GpsPrior, gps_prior
 from .scan_map.named_scans import add_places, check_within
 from .scan_map.scan_map import ScanMap
 
-OTHER_METHOD = "`settings`: found another method than that for which the scan was prepared"
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
 ONLY_DEFAULT = ("refine_focal", "gravity_vector")  # options of photos that the preset paper does not have
@@ -83,11 +82,13 @@ class OpenedScan:
         """Localize a photo; `focal` is its focal length as found with those of others, which counts then."""
         watch = Stopwatch()
         self.check_options(photo, settings)
-        with watch.stage("read"), reading_once():
-            picture = expect_focal(self.read(photo), focal)
-            facts = read_photo_facts(photo)
+        picture, facts = self._take(photo, focal, watch)
         gps = None
-        if isinstance(self.prepared, ScanMap) and isinstance(settings, CoarseToFineSettings):
+        if isinstance(self.prepared, PaperMap):
+            assert isinstance(settings, PaperSettings)
+            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
+        else:
+            assert isinstance(settings, CoarseToFineSettings)
             gps = self.make_gps_prior(facts, settings.prior)
             run = localize_guessed if has_guessed_focal(picture) else localize
             found = Localization()
@@ -97,12 +98,8 @@ class OpenedScan:
             if found.status != LOCALIZED:
                 gps = gps and replace(gps, is_used=False)
                 found = run(self.prepared, picture, settings, self.workers, watch)
-        elif isinstance(self.prepared, PaperMap) and isinstance(settings, PaperSettings):
-            found = localize_by_paper(self.prepared, picture, settings, self.workers, watch)
-        else:
-            raise InputError(OTHER_METHOD)
         if focal is not None:
-            found = replace(found, focal_length=focal.after(found.focal_length))
+            found = replace(found, focal_length=focal.update(found.focal_length))
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
         return replace(self.add_localization(blank, found), gps_prior=gps)
 
@@ -135,9 +132,7 @@ class OpenedScan:
         watch = Stopwatch(dict(first.seconds))
         prepared, settings = self.require_default_method("photos beside others", settings)
         focal = first.focal_length
-        with watch.stage("read"), reading_once():
-            picture = expect_focal(self.read(photo), focal)
-            facts = read_photo_facts(photo)
+        picture, facts = self._take(photo, focal, watch)
         if has_guessed_focal(picture) or prepared.has_shape or facts.sha256 != first.source.pano_sha256:
             return first, ()
         known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
@@ -150,12 +145,20 @@ class OpenedScan:
         if not names or not (is_surer or is_other):
             return first, ()
         if focal is not None:
-            found = replace(found, focal_length=focal.after(found.focal_length))
+            found = replace(found, focal_length=focal.update(found.focal_length))
         elif found.focal_length is not None:  # only what a photo says alone counts for others
             alone = replace(found.focal_length, picture_px=None, picture_std_px=None)
             found = replace(found, focal_length=alone)
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
         return replace(self.add_localization(blank, found), gps_prior=first.gps_prior), names
+
+    def _take(self, photo: Photo, focal: FocalLength | None, watch: Stopwatch) -> tuple[Panorama, PhotoFacts]:
+        """Read a photo, with the focal length that other photos of its camera have, if that is known."""
+        with watch.stage("read"), reading_once():
+            picture = self.read(photo)
+            if focal is not None and focal.others_px is not None and focal.others_std_px is not None:
+                picture = picture.expect_focal(focal.others_px, focal.others_std_px / focal.others_px)
+            return picture, read_photo_facts(photo)
 
     def require_default_method(self, what: str, settings: Settings) -> tuple[ScanMap, CoarseToFineSettings]:
         """Return the map and settings; InputError for the preset paper, which does not have `what`."""
@@ -245,13 +248,6 @@ class OpenedScan:
         return gps_prior(photo.gps, crs, self.cloud_settings.scale)
 
 
-def expect_focal(picture: Panorama, focal: FocalLength | None) -> Panorama:
-    """Return a photo with the focal length that other photos of its camera have, if that is known."""
-    if focal is None or focal.others_px is None or focal.others_std_px is None:
-        return picture
-    return picture.expect_focal(focal.others_px, focal.others_std_px / focal.others_px)
-
-
 def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Photo) -> dict[str, object]:
     """Return the settings as a result's JSON has them."""
     labels = cloud_settings.labels and asdict(cloud_settings.labels)
@@ -278,24 +274,10 @@ def labels_of(result: Result) -> Labels | None:
 def make_failed_result(
     scan: OpenedScan, photo: Photo, error: Exception, settings: Settings, name: str | None = None
 ) -> Result:
-    """Return the result of a photo that raised an error; an error in the program is raised again.
-
-    `name` replaces the photo's path in the result.
-    """
-    text, is_passing = describe_failure(error)
+    """Return the result of a photo, by `name`, that raised an error; one in the program is raised again."""
+    name = name or photo.name
     digest = None if isinstance(photo.picture, np.ndarray) else sha256_of(photo.path, photo.instant)
-    return unreadable_result(
-        text.replace(photo.name, name or photo.name),
-        scan.name,
-        name or photo.name,
-        is_passing,
-        settings=settings_json(settings, scan.cloud_settings, photo),
-        source=Source(scan.prepared.scan_sha256 or None, digest),
-    )
-
-
-def replace_settings(settings: Settings, given: dict[str, Any]) -> Settings:
-    """Return settings with options changed; InputError if the method has no such option."""
-    if unknown := given.keys() - {f.name for f in fields(settings)}:
-        raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
-    return replace(settings, **given)
+    source = Source(scan.prepared.scan_sha256 or None, digest)
+    about = {"settings": settings_json(settings, scan.cloud_settings, photo), "source": source}
+    text = describe_failure(error).replace(photo.name, name)
+    return unreadable_result(text, scan.name, name, is_passing(error), **about)

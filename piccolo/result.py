@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from html import escape
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from .camera.calibration import read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
-from .errors import UNPRINTABLE, InputError, is_passing, printable, text_of
+from .errors import UNPRINTABLE, InputError, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose
 from .geometry.rotations import heading_pitch_roll_deg
@@ -282,19 +282,19 @@ def with_localization(result: Result, found: Localization) -> Result:
     return replace(result, best_pose=found.pose, warnings=result.warnings + found.warnings, **values)
 
 
-class Failure(NamedTuple):
-    """Why a photo has no result."""
+def localization_of(result: Result) -> Localization:
+    """Return what was found of a photo, without warnings and cameras, from its result."""
+    own = {f.name for f in fields(result)} - {"warnings", "cameras"}
+    values = {f.name: getattr(result, f.name) for f in fields(Localization) if f.name in own}
+    return Localization(pose=result.best_pose, **values)
 
-    text: str  # one line
-    is_passing: bool  # it may have one when it is tried again
 
-
-def describe_failure(error: Exception) -> Failure:
-    """Return the failure of a photo; an error of none, but of the program, is raised."""
+def describe_failure(error: Exception) -> str:
+    """Return in one line why a photo has no result; an error of none, but of the program, is raised."""
     if isinstance(error, OSError | InputError):
-        return Failure(text_of(error), is_passing(error))
+        return text_of(error)
     if is_shortage(error):
-        return Failure(f"not enough memory ({' '.join(str(error).split()) or 'none is left'})", True)
+        return f"not enough memory ({' '.join(str(error).split()) or 'none is left'})"
     raise error
 
 
@@ -363,10 +363,7 @@ def check_scan(results: Sequence[Result], cloud_sha256: str, scan: str, is_force
 
 
 def _parse_result(text: str) -> Result:
-    """Return a result of one line.
-
-    Refused are names and numbers that can't be written.
-    """
+    """Return the result of a line; names and numbers that can't be written are refused."""
     result = Result.from_json(text)
     texts = {"status": result.status, "cloud": result.cloud_name, "scan": result.scan or ""}
     for label, value in texts.items():

@@ -1,8 +1,10 @@
 """The public class `Scan`: photos and walks are localized in it."""
 
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import fields, replace
 from itertools import repeat
 from pathlib import Path
+from typing import Any
 
 from .arguments import check_kind, check_one_each
 from .arrays import Bytes, Floats
@@ -12,7 +14,7 @@ from .files.atomic import check_output
 from .geometry.pose import Pose, check_pose
 from .geometry.rotations import Gravity
 from .localization.bundle_adjustment import RelativeScale
-from .opened_scan import OpenedScan, Settings, make_failed_result, replace_settings
+from .opened_scan import OpenedScan, Settings, make_failed_result
 from .photo import File, Photo, as_photo
 from .prior import Prior
 from .result import Result
@@ -248,6 +250,9 @@ class Scan:
 
     def _change(self, prior: Prior | None, gravity: Gravity | None, min_confidence: float | None) -> Settings:
         """Return the settings of `open_scan` with options that are not None in place of its own."""
-        options = {"prior": prior, "gravity": gravity, "min_confidence": min_confidence}
+        options: dict[str, Any] = {"prior": prior, "gravity": gravity, "min_confidence": min_confidence}
         given = {name: value for name, value in options.items() if value is not None}
-        return replace_settings(self._opened.settings, given)
+        settings = self._opened.settings
+        if unknown := given.keys() - {f.name for f in fields(settings)}:
+            raise InputError(f"`{min(unknown)}`: not an option of the preset paper")
+        return replace(settings, **given)

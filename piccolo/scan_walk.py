@@ -1,7 +1,7 @@
 """A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,22 +21,14 @@ from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
 from .result import Result, with_localization
 from .scan_map.named_scans import add_places, check_within
-from .walk.beliefs import believe
 from .walk.frames import Frame
 from .walk.motion import Motion, check_times
+from .walk.path import believe
 from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
 from .walk.second_look import finish
 from .walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
-
-
-@dataclass(frozen=True)
-class Kept:
-    """A frame as it is kept on disk until the walk is finished."""
-
-    blank: str  # its result without a pose, as JSON
-    frame: Frame
 
 
 class Prepared(NamedTuple):
@@ -151,17 +143,18 @@ class Walk:
         """Return what is known of the last frame on one line, for `restore`."""
         from msgspec import to_builtins  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = Kept(self.blanks[-1].to_json(), self.tracker.frames[-1])
+        kept = self.blanks[-1].to_json(), self.tracker.frames[-1]
         return json.dumps(to_builtins(kept, enc_hook=np.ndarray.tolist))  # of any name: msgspec's is of UTF-8
 
     def restore(self, text: str, photo: Photo) -> None:
         """Take the next frame, of a photo, from a text of `last_to_json`; ValueError if it is none."""
         from msgspec import convert  # noqa: PLC0415  # only walks with a file wait for it
 
-        kept = convert(json.loads(text), Kept, dec_hook=lambda _, rows: np.array(rows))
+        kept = tuple[str, Frame]
+        blank, frame = convert(json.loads(text), kept, dec_hook=lambda _, rows: np.array(rows))
         self.photos.append(photo)
-        self.blanks.append(replace(Result.from_json(kept.blank), settings=self.settings_of(photo)))
-        self.tracker.accept(kept.frame)
+        self.blanks.append(replace(Result.from_json(blank), settings=self.settings_of(photo)))
+        self.tracker.accept(frame)
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""
@@ -186,12 +179,9 @@ class Walk:
         """Read the photo of an earlier frame; None if it can't be read, or is another now."""
         photo = self.photos[k]
         blank = self.blanks[k]
+        if blank.error is not None:
+            return None
         with reading_once():
-            is_readable = blank.error is None and self._is_of(photo, blank)
-            return self._read(photo, blank.pano) if is_readable else None
-
-    def _is_of(self, photo: Photo, result: Result) -> bool:
-        """Return True if a result is of what a photo shows now."""
-        if isinstance(photo.picture, np.ndarray):
-            return True
-        return sha256_of(photo.path, photo.instant) == result.source.pano_sha256
+            is_array = isinstance(photo.picture, np.ndarray)
+            is_same = is_array or sha256_of(photo.path, photo.instant) == blank.source.pano_sha256
+            return self._read(photo, blank.pano) if is_same else None

@@ -148,10 +148,7 @@ def _walk_of(entry: dict[str, Any]) -> tuple[str | None, float | None, bool]:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """Return a path as a folder's files may give it, whatever links lead to either.
-
-    A link itself stays one.
-    """
+    """Return a path as a folder's files may give it, whatever links lead to either; a link stays one."""
     return Path(os.path.relpath(path.parent.resolve() / path.name, folder.resolve())).as_posix()
 
 

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from piccolo.cli.checks import UsageError, check_distinct, check_outputs, check_suffix
 from piccolo.cli.command import command
-from piccolo.cli.errors import UsageError
-from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix
 from piccolo.errors import InputError
 from piccolo.files import atomic
 from piccolo.files.atomic import (

@@ -12,7 +12,7 @@ import pytest
 
 from piccolo import open_scan, opened_scan
 from piccolo.batch.localizer import Localizer
-from piccolo.batch.outputs import StreamOutput
+from piccolo.batch.results_file import StreamOutput
 from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks_beside
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole

@@ -47,7 +47,7 @@ def _alone(*probabilities):
     alternatives = tuple(
         Alternative(h.pose, h.score, None, p) for h, p in zip(poses, probabilities, strict=True)
     )
-    alone = Localization(confidence=probabilities[0], alternatives=alternatives[1:])
+    alone = Localization(pose=poses[0].pose, confidence=probabilities[0], alternatives=alternatives[1:])
     return Member(None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0])
 
 

@@ -13,7 +13,7 @@ import numba
 import numpy as np
 import pytest
 
-from piccolo.cli import progress
+from piccolo.cli import terminal
 from piccolo.files import atomic, cache
 from piccolo.files.atomic import PREFIX, replacing, temporary_folder
 from piccolo.kernels import jit
@@ -264,7 +264,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
     monkeypatch.setattr(jit.time, "monotonic", lambda: next(seconds))
     for is_quiet in (False, True):
         compiling = jit.Compiling()
-        with progress.showing_log(is_quiet):
+        with terminal.showing_log(is_quiet):
             compiling.start()
             compiling.finish()
             compiling.finish()

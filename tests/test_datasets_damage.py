@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from poses import jpeg
 from refusals import mutated, read_or_refused
 
-from research.datasets import DATASETS
+from research.datasets.convert_dataset import list_scenes
 from research.datasets.model import ConvertOptions
 
 T = np.eye(4)[[1, 2, 0, 3]]
@@ -50,7 +50,7 @@ FILES = {
 
 def read_poses(name, folder):
     options = ConvertOptions(folder, axes="optical" if name == "generic tum" else None)
-    listed = DATASETS[name.split()[0]].list_scenes(options)
+    listed = list_scenes(name.split()[0], options)
     return [panorama.pose for spec in listed.specs for panorama in spec.panoramas]
 
 

@@ -14,7 +14,7 @@ from research.evaluation.query_result import (
     make_query_result,
     match_results,
 )
-from research.evaluation.walks import (
+from research.evaluation.tables import (
     alone_table,
     group_walks,
     walk_table,

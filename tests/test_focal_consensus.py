@@ -16,7 +16,7 @@ from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
 from piccolo.cloud.writers import vertex_rows, write_ply
-from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
+from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
 from piccolo.confidence.localization import FocalLength
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
@@ -31,7 +31,7 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
     pose = Pose(np.eye(3), np.zeros(3))
     told = {"picture_px": GIVEN * picture, "picture_std_px": GIVEN * picture * std} if picture else {}
     used = GIVEN * picture if picture and std < given_std else GIVEN
-    about = {"doubt": SLIPS, "source": "`camera`", **told, **more}
+    about = {"doubt": WRONG_SHARE, "source": "`camera`", **told, **more}
     focal = FocalLength(used, GIVEN * min(std, given_std), GIVEN, GIVEN * given_std, **about)
     camera = (Mount(pinhole(1024, 768, GIVEN)),)
     source = Source(None, None, (1024, 768), None)
@@ -42,7 +42,7 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
 def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
     """One in fifty is wrong; a sharp picture confirms or contradicts it, a blurred one says little."""
     assert Opinion(0.0, 0.004**2).doubt(0.003) < 0.005
-    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(SLIPS, abs=0.015)
+    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(WRONG_SHARE, abs=0.015)
     assert Opinion(0.05, 0.02**2).doubt(0.003) > 0.05
     assert Opinion(-0.05, 0.009**2).doubt(0.003) > 0.99
     rising = [Opinion(off, 0.02**2).doubt(0.003) for off in (0.0, 0.02, 0.04, 0.06, 1.0)]

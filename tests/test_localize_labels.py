@@ -11,7 +11,7 @@ from piccolo.result import Result
 from piccolo.scene import read_scene
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
-from research.synthetic.room import LABEL_NAMES
+from research.synthetic.layout import LABEL_NAMES
 
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 

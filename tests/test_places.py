@@ -10,9 +10,9 @@ from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
 from research.measuring import confidence
 from research.measuring.confidence import remove_texture
+from research.synthetic.layout import PLAIN
 from research.synthetic.photos import MOST_RADIUS, light_unevenly, mask_outside_field, occlude
 from research.synthetic.places import ALIKE_KINDS, CHANGED, make_alike
-from research.synthetic.room import PLAIN
 from research.synthetic.world import World, make_query
 
 WIDTH = 256

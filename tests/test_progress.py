@@ -3,13 +3,13 @@
 import sys
 import time
 
-from piccolo.cli import progress
+from piccolo.cli import terminal
 
 
 def test_progress_says_step_and_time_left(capsys, monkeypatch):
-    monkeypatch.setattr(progress, "DELAY", 0.0)
+    monkeypatch.setattr(terminal, "DELAY", 0.0)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
-    show = progress.progress_bar(is_quiet=False)
+    show = terminal.progress_bar(is_quiet=False)
     for label, title in (("find features", "prepare, 3 of 4: find features: "), ("write", "write: ")):
         shown = show(iter([1, 2]), 2, label)
         next(shown)

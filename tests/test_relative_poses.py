@@ -8,7 +8,7 @@ import pytest
 from poses import SIZE, result, tilted_poses
 from refusals import assert_refused
 
-from piccolo.batch.frame_times import times_of
+from piccolo.batch.inputs import times_of
 from piccolo.batch.relative_poses import read_odometry, read_relative_poses
 from piccolo.errors import InputError
 from piccolo.export import Options, export

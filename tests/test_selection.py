@@ -10,7 +10,7 @@ from made_up import QUERY, at, compared, place, places
 
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.occlusion import Agreement
-from piccolo.localization import beam, last_descent, selection
+from piccolo.localization import beam, covariance, last_descent, selection
 from piccolo.localization import judge as judging
 from piccolo.localization.last_descent import refine_best
 from piccolo.localization.selection import Selection
@@ -203,7 +203,7 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
         "measure_agreement": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
         "compare_occlusion": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
         "count_agreeing": lambda query, pose: counts.get(place(pose), 0),
-        "estimate_covariance": lambda *_: None,
+        "estimate_covariance": lambda *_: covariance.UNKNOWN_ERRORS,
         "is_mirrored": lambda *_: False,
     }.items():
         monkeypatch.setattr(judging, name, value)

@@ -11,8 +11,8 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.scene import read_scene
 from research.synthetic import make_room as tool
+from research.synthetic.layout import make_room
 from research.synthetic.raycast import cast_rays
-from research.synthetic.room import make_room
 from research.synthetic.world import (
     RANGE_NOISE,
     VARIANTS,

@@ -21,7 +21,7 @@ from piccolo.paper.settings import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, read_scene, write_queries
 from research.evaluation.query_result import QueryResult
-from research.measuring import benchmark, confidence, page, scaling, sensitivity, trials
+from research.measuring import benchmark, confidence, page, sensitivity, speed, trials
 from research.synthetic import photos
 
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
@@ -81,10 +81,10 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
 
 
 def test_sizes_are_those_asked_for(scene):
-    points, _, queries = scaling.scene_case(read_scene(scene), 50_000)  # more than it has
+    points, _, queries = speed.scene_case(read_scene(scene), 50_000)  # more than it has
     assert (len(points), len(queries)) == (50_000, 1)
-    points, _, queries = scaling.rooms_case(1)
-    assert (len(points), len(queries)) == (50_000, scaling.NUM_QUERIES)
+    points, _, queries = speed.rooms_case(1)
+    assert (len(points), len(queries)) == (50_000, speed.NUM_QUERIES)
 
 
 def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):

@@ -9,7 +9,7 @@ from rooms import write_room
 from test_gps import write_photo
 
 import piccolo
-from piccolo.batch.frame_times import times_of
+from piccolo.batch.inputs import times_of
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3

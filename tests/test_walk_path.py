@@ -8,12 +8,12 @@ import pytest
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.walk.beliefs import believe
 from piccolo.walk.frames import MOST_EXPECTED, Frame, State
 from piccolo.walk.motion import JUMP_LOG, Motion, check_times
 from piccolo.walk.path import (
     COPY_LOG_ODDS,
     Gap,
+    believe,
     build_lattice,
     emissions,
     is_moved,

@@ -7,10 +7,9 @@ import pytest
 
 from piccolo.geometry.pose import Pose
 from piccolo.walk import second_look
-from piccolo.walk.beliefs import NOTHING, Belief
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
-from piccolo.walk.path import Path
+from piccolo.walk.path import NOTHING, Belief, Path
 from piccolo.walk.tracker import Followed, expect
 
 TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost

@@ -21,8 +21,16 @@ from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
 from piccolo.walk.motion import Motion
-from piccolo.walk.places import find_places, query_near
-from piccolo.walk.tracker import Expected, expect, find_near, predict, refine_state, track
+from piccolo.walk.tracker import (
+    Expected,
+    expect,
+    find_near,
+    find_places,
+    predict,
+    query_near,
+    refine_state,
+    track,
+)
 
 SEED = 1
 

@@ -5,7 +5,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from ..errors import InputError
 from ..files.json_file import read_text
@@ -22,13 +22,7 @@ BETWEEN_NAMES = ";"
 WANTED = f"wanted a CSV file whose first line names its columns: name and any of {', '.join(COLUMNS)}"
 DEFAULT_RADIUS = 5.0  # [m]
 HEIGHT_TOLERANCE = 0.3  # [m] either side of a height
-
-
-class Row(NamedTuple):
-    """A row of the table."""
-
-    prior: Prior
-    gravity_vector: Vector | None  # in place of that of all photos
+Row = tuple[Prior, Vector | None]  # with the direction of gravity, in place of that of all photos
 
 
 @dataclass(frozen=True)
@@ -43,16 +37,14 @@ class PriorTable:
         """Return a photo and its prior, by the row of its path as given, or else of its file name."""
         name = photo.name if photo.name in self.by_name else photo.path.name
         self.used.add(name)
-        row = self.by_name.get(name)
-        if row is None:
-            return photo, general
-        return replace(photo, gravity_vector=row.gravity_vector or photo.gravity_vector), row.prior
+        prior, gravity_vector = self.by_name.get(name, (general, None))
+        return replace(photo, gravity_vector=gravity_vector) if gravity_vector else photo, prior
 
     def check_scans(self, scan_map: ScanMap) -> None:
         """Refuse names that no scan of a map has."""
-        for name, row in self.by_name.items():
+        for name, (prior, _) in self.by_name.items():
             try:
-                check_within(scan_map, row.prior.within)
+                check_within(scan_map, prior.within)
             except InputError as error:
                 text = str(error).replace("`within`", f"{self.path}: within, of {name}")
                 raise InputError(text) from error
@@ -78,7 +70,7 @@ def _row_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior)
     if "gravity_x" in row:
         x, y, z = (row[column] for column in GRAVITY)
         gravity_vector = Photo(Path(), gravity_vector=(x, y, z)).gravity_vector
-    return Row(replace(general, **changes), gravity_vector)
+    return replace(general, **changes), gravity_vector
 
 
 def read_priors(path: Path, general: Prior) -> PriorTable:
@@ -88,7 +80,6 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
     [deg], height [m] above the floor, gravity_x, gravity_y, gravity_z (down, in the camera's axes, of any
     length), within (names of the map's scans, with semicolons between them).
-
     Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
     rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")

@@ -26,9 +26,7 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
     """Return each photo's pose in the common frame of a file of poses.
 
     COLMAP's images.txt and transforms.json name their photos; in a TUM trajectory the time is the photo's
-    name without suffix.
-
-    Raises InputError if the file is none of these, or has no pose of a photo, or two.
+    name without suffix. Raises InputError if the file is none of these, or has no pose of a photo, or two.
     """
     poses = read_transforms(path) if path.suffix == ".json" else read_lines(path)
     found = match_names(path, poses, photos)
@@ -71,7 +69,6 @@ def read_odometry(
     A transforms.json names its frames. A trajectory has a pose of each frame in order, or, of TUM, poses by
     time [s]: each frame takes the nearest, within half of the time to the next frame. If `times` are by a
     clock, that may be the trajectory's; or else the trajectory begins at 0 with the first frame.
-
     Raises InputError if the file is no odometry, or of other frames.
     """
     if path.suffix == ".json":

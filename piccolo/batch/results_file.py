@@ -1,6 +1,7 @@
-"""Results on disk, one line a panorama, appended as they come, so that a stopped batch goes on."""
+"""Results of a batch, a line a panorama: on a stream, or in a file with which a stopped batch goes on."""
 
 import json
+import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -12,6 +13,7 @@ from ..errors import InputError
 from ..files.atomic import STDOUT, write_atomically
 from ..files.line_file import LineFile, whole_lines, whole_size
 from ..result import FAILED, FORMAT, Result
+from .second_look import parse_line
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
@@ -87,13 +89,6 @@ class Finished(NamedTuple):
     is_second: bool  # it replaces an earlier one, as the photo was looked at again
 
 
-def drop_replaced(lines: Sequence[Finished]) -> list[Finished]:
-    """Return the lines of a photo without those that another replaces."""
-    if not any(line.is_second for line in lines):
-        return list(lines)
-    return list({line.pano_sha256: line for line in lines}.values())
-
-
 class Records:
     """Which panoramas have results in a file, and the order in which the lines are to stand at the end."""
 
@@ -110,15 +105,10 @@ class Records:
         return Counter(line.status for line in self.order if line)
 
     @property
-    def names(self) -> set[str]:
-        """The panoramas of the lines that are in no place of the order."""
-        return {name for name, lines in self._others.items() if lines}
-
-    @property
     def is_in_order(self) -> bool:
         """True if the file has the lines of the panoramas so far, in their order, and no others."""
         spans = [line.span for line in self.order if line]
-        return spans == sorted(spans) and len(spans) == len(self.order) and not self.names
+        return spans == sorted(spans) and len(spans) == len(self.order) and not any(self._others.values())
 
     def read(
         self, expected: Callable[[Path], Mapping[str, Any]], panoramas: Iterable[Path | str] | None
@@ -169,23 +159,97 @@ class Records:
             else:
                 lines.remove(taken)
 
-    def list_spans(self, file: LineFile) -> list[tuple[int, int]]:
-        """Return the span [byte] of each panorama's line, in their order; those of this run are behind."""
-        new_lines = whole_lines(file.path, file.size, self.size)
-        new_spans = pairwise(accumulate(map(len, new_lines), initial=self.size))
-        return [line.span if line else next(new_spans) for line in self.order]
+    def list_unnamed(self) -> list[Finished]:
+        """List the lines of panoramas that were not named, without those that another replaces."""
+        found = []
+        for lines in (self._others[name] for name in self._others.keys() - self._named):
+            has_second = any(line.is_second for line in lines)
+            found += list({line.pano_sha256: line for line in lines}.values()) if has_second else lines
+        return found
 
-    def finish(self, file: LineFile, spans: Sequence[tuple[int, int]], keeps_others: bool) -> int:
-        """Put the lines at `spans`, those of the panoramas in their order, into the file, and no older ones.
+
+class StreamOutput:
+    """Lines on a stream, in the order of the photos; those behind one that may change wait for it."""
+
+    def __init__(self, write: Callable[[str], object], may_change: bool) -> None:
+        self._write = write
+        self._may_change = may_change
+        self._is_waiting = False
+        self._num_written = 0
+        self._texts: list[str] = []
+
+    def write(self, text: str) -> None:
+        """Write a photo's line, or keep it until the lines before it are final."""
+        if not self._may_change:
+            self._write(text)
+            return
+        self._texts.append(text)
+        self._is_waiting = self._is_waiting or parse_line(text).may_change
+        if not self._is_waiting:
+            self.close()
+
+    def texts(self) -> list[str]:
+        """Return the lines so far."""
+        return self._texts
+
+    def replace(self, number: int, text: str) -> None:
+        """Replace a photo's line."""
+        self._texts[number] = text
+
+    def close(self) -> None:
+        """Write the lines that waited."""
+        while self._num_written < len(self._texts):
+            self._num_written += 1
+            self._write(self._texts[self._num_written - 1])
+
+
+class FileOutput:
+    """Lines in a file, each at once on disk; what replaces others, and the order, follow at the end."""
+
+    def __init__(self, file: LineFile, records: Records) -> None:
+        self._file = file
+        self._records = records
+        self._replaced: dict[int, tuple[int, int]] = {}  # span [byte] of the newer line of a photo
+
+    def begin(self) -> None:
+        """Cut off what is no line of an earlier run, before the first is appended."""
+        self._file.cut(self._records.size)
+
+    def write(self, text: str) -> None:
+        """Append a photo's line."""
+        self._file.append(text)
+
+    def _spans(self) -> list[tuple[int, int]]:
+        """Return the span [byte] of each panorama's newest line, in their order; this run's are behind."""
+        begin = self._records.size
+        new_lines = whole_lines(self._file.path, self._file.size, begin)
+        new_spans = pairwise(accumulate(map(len, new_lines), initial=begin))
+        spans = [line.span if line else next(new_spans) for line in self._records.order]
+        return [self._replaced.get(k, span) for k, span in enumerate(spans)]
+
+    def texts(self) -> list[str]:
+        """Return the lines of the photos so far, in their order."""
+        with self._file.path.open("rb") as file:
+            return [os.pread(file.fileno(), end - begin, begin).decode() for begin, end in self._spans()]
+
+    def replace(self, number: int, text: str) -> None:
+        """Append a line that is to replace that of a photo, by its number in the order."""
+        begin = self._file.size
+        self._file.append(text)
+        self._replaced[number] = begin, self._file.size
+
+    def finish(self, keeps_others: bool) -> int:
+        """Put the lines of the panoramas into their order, and drop older ones.
 
         Those of panoramas that were not named are kept before them, or dropped; returns how many were.
         """
-        others = [
-            line for name in self._others.keys() - self._named for line in drop_replaced(self._others[name])
-        ]
+        others = self._records.list_unnamed()
         kept = sorted(line.span for line in others) if keeps_others else []
-        file.rearrange([*kept, *spans])
+        self._file.rearrange([*kept, *self._spans()])
         return 0 if keeps_others else len(others)
+
+
+Output = StreamOutput | FileOutput
 
 
 def write_results(out: Path | None, results: Sequence[Result]) -> None:

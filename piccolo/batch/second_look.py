@@ -10,10 +10,10 @@ from typing import Any, NamedTuple
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..confidence.focal_length import Consensus, Opinion
-from ..confidence.localization import FocalLength, Localization
+from ..confidence.localization import FocalLength
 from ..localization.focal_length import WIDE
 from ..localization.judge import follow_consensus
-from ..result import Result
+from ..result import Result, localization_of, with_localization
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
 LEAST_CONFIDENCE = 0.95  # of these: about the log odds of 3 that frames of walks need
@@ -113,23 +113,8 @@ def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> li
 
 def take_consensus(result: Result, consensus: Opinion, min_confidence: float) -> Result:
     """Return a result as all photos of its camera together leave it."""
-    found = Localization(
-        result.status,
-        result.confidence,
-        result.probability_none,
-        alternatives=result.alternatives,
-        focal_length=result.focal_length,
-    )
-    told = follow_consensus(found, consensus, min_confidence)
-    return replace(
-        result,
-        status=told.status,
-        confidence=told.confidence,
-        probability_none=told.probability_none,
-        alternatives=told.alternatives,
-        focal_length=told.focal_length,
-        warnings=tuple(dict.fromkeys(result.warnings + told.warnings)),
-    )
+    told = with_localization(result, follow_consensus(localization_of(result), consensus, min_confidence))
+    return replace(told, warnings=tuple(dict.fromkeys(told.warnings)))
 
 
 def group_by_camera(lines: Sequence[Line]) -> list[list[tuple[int, FocalLength]]]:

@@ -1,7 +1,6 @@
 """Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
-import argparse
-import json
+from argparse import ArgumentParser, Namespace
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,11 +23,10 @@ from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
 from ..scene import QUERIES_NAME, read_scene, write_queries
-from .command import command, option, print_warnings
-from .errors import checking_options, print_error
+from .checks import check_outputs, check_suffix, checking_options
+from .command import command, option
 from .options import add_cloud_options, cloud_settings_from
-from .outputs import check_outputs, check_suffix, print_report
-from .progress import progress_bar
+from .terminal import print_error, print_report, print_warnings, progress_bar
 
 EXIT_UNKNOWN = 1
 EPILOG = """\
@@ -45,7 +43,7 @@ keeps its other properties and faces. Prints one JSON object to stdout; without 
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py")
     option(parser, "--out FILE", "write the rotated cloud to this PLY file; - is stdout")
@@ -56,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--pano FILE", "localize this upright photo in the scan, and take its up direction")
 
 
-def check_arguments(a: argparse.Namespace) -> None:
+def check_arguments(a: Namespace) -> None:
     """Refuse options that do not go together."""
     refusals = {
         "--queries needs --out": a.queries and not a.out,
@@ -71,7 +69,7 @@ def check_arguments(a: argparse.Namespace) -> None:
 
 
 def find_known_up(
-    arguments: argparse.Namespace, cloud: CloudStream, evident: Array | None, reason: str
+    arguments: Namespace, cloud: CloudStream, evident: Array | None, reason: str
 ) -> tuple[Array | None, str]:
     """Return the direction (3,) that is up, None if that is not known, and why.
 
@@ -99,7 +97,7 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     return up, f"{photo} is {result.status}"
 
 
-def find(arguments: argparse.Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
+def find(arguments: Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
     """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on.
 
     It is the least turn that makes z up, and with --yaw-walls the least further one about z, about the middle
@@ -132,7 +130,7 @@ def find(arguments: argparse.Namespace, cloud: CloudStream) -> tuple[Array, dict
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 up is not known")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Find a transform, write what is sure; returns the exit code."""
     with checking_options():
         check_arguments(arguments)
@@ -161,5 +159,5 @@ def main(arguments: argparse.Namespace) -> int:
         print_warnings(arguments, write_transformed(cloud, T, out, write_others))
     report |= {"cloud": list(map(str, arguments.cloud)), "out": str(out) if out and not doubt else None}
     report |= {"T_aligned_from_scan": T.tolist(), "metres_per_unit": cloud.scale}
-    print_report(arguments, outputs, json.dumps(report, allow_nan=False))
+    print_report(arguments, outputs, report)
     return print_error(arguments, doubt, EXIT_UNKNOWN) if doubt else 0

@@ -1,18 +1,15 @@
 """Colour a scan by photos that were localized in it."""
 
-import argparse
-import json
+from argparse import ArgumentParser, Namespace
 
 from ..coloring.color_scan import check_suffix, write_colored_scan
-from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..result import read_results
-from .command import command, option, print_warnings
-from .errors import checking_options
+from .checks import check_outputs, checking_options
+from .command import command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
-from .outputs import check_outputs, print_report
-from .progress import progress_bar, warn_once
+from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -26,7 +23,7 @@ point as the property `photos`, LAS and LAZ as user data. Prints one JSON object
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     add_cloud_options(parser, "files of the scan in which the photos were localized")
@@ -35,19 +32,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, align, paint, write; returns the exit code."""
     with checking_options():
         settings = cloud_settings_from(arguments)
         check_suffix(arguments.out)
     check_outputs({"--out": arguments.out}, [*arguments.cloud, *arguments.results])
     results = read_results(arguments.results)
-    workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
-    cache = cache_from(arguments)
-    scan = open_files(arguments.cloud, settings, CoarseToFineSettings(), cache, workers)
+    method = CoarseToFineSettings()
+    scan = open_files(arguments.cloud, settings, method, cache_from(arguments), workers_from(arguments))
     print_warnings(arguments, scan.warnings)
     colored = write_colored_scan(scan, results, arguments.out)
     line = {"out": str(arguments.out), "photos": colored.num_photos, "points": colored.num_points}
     line["colored_points"] = colored.num_colored
-    print_report(arguments, {}, json.dumps(line))
+    print_report(arguments, {}, line)
     return 0

@@ -1,22 +1,32 @@
 """Commands: options written as a help text shows them, and the `main` that parses and runs them."""
 
 import argparse
-import math
+import os
+import signal
 import sys
-from collections.abc import Callable, Iterable, Sequence
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
-from ..jobs.memory import check_address_space
-from .errors import UsageError, print_note, raising_signals, report_error
-from .progress import showing_log
-from .start import as_started, for_terminal
+from ..errors import InputError, text_of
+from ..jobs.memory import check_address_space, is_shortage
+from .checks import UsageError
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started, for_terminal
+from .terminal import EXIT_BAD_INPUT, print_error, showing_log
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
     **dict.fromkeys(("N", "PX", "FIRST", "W", "ROOM"), int),
     **dict.fromkeys(("X", "M", "S", "DEG", "X0", "MIN", "HZ", "FRACTION", "GB"), float),
 }
+EXIT_BAD_USAGE = 2
+EXIT_INTERNAL = 4
+EXIT_BROKEN_PIPE = 141
+RETRY = 0.1  # [s] after which a signal is sent again
+SHORTAGE = "not enough memory ({}); lower --max-memory or --threads, or thin the scan"
 EXIT_CODES = "2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 terminated."
 Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
 
@@ -80,40 +90,6 @@ def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more
     group.add_argument(name, help=text, **more)
 
 
-def check_least(arguments: argparse.Namespace, **limits: float) -> None:
-    """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
-    for name, limit in limits.items():
-        value = getattr(arguments, name, None)
-        if value is not None and not limit <= value < math.inf:
-            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
-
-
-def check_alone(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
-    """Refuse options, by their names in `arguments`, that do not go with what is asked for."""
-    for name in others:
-        if is_given(arguments, name):
-            raise UsageError(f"--{name.replace('_', '-')}: not with {what}")
-
-
-def check_only_with(arguments: argparse.Namespace, what: str, others: Sequence[str]) -> None:
-    """Refuse options, by their names in `arguments`, that mean something only with what is not asked for."""
-    for name in others:
-        if is_given(arguments, name):
-            raise UsageError(f"--{name.replace('_', '-')}: only with {what}")
-
-
-def is_given(arguments: argparse.Namespace, name: str) -> bool:
-    """Return True for an option without a default, by its name in `arguments`, that was given."""
-    value = getattr(arguments, name)
-    return value is not None and value is not False
-
-
-def print_warnings(arguments: argparse.Namespace, warnings: Iterable[str]) -> None:
-    """Print a line on stderr for each warning, unless --quiet."""
-    for warning in warnings:
-        print_note(arguments, f"warning: {warning}")
-
-
 def command(
     file: str,
     description: str | None,
@@ -144,3 +120,76 @@ def command(
         return main
 
     return decorate
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM: a command ends as after Ctrl-C, so that no temporary file is left."""
+
+
+def report_error(
+    arguments: argparse.Namespace, error: Exception | KeyboardInterrupt, lost: list[KeyboardInterrupt]
+) -> int:
+    """Print the error that ended a command, and return its exit code; `lost` is that of raising_signals."""
+    is_foreseen = isinstance(error, OSError | InputError)
+    if lost and isinstance(error, Exception) and not is_foreseen:
+        error = lost[0]  # what was called back by C has failed for it
+    if isinstance(error, Terminated):
+        return print_error(arguments, "terminated", EXIT_TERMINATED)
+    if isinstance(error, KeyboardInterrupt):
+        return print_error(arguments, "interrupted", EXIT_INTERRUPTED)
+    if isinstance(error, OSError | InputError):
+        discard_stdout()
+        if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
+            return EXIT_BROKEN_PIPE
+        code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
+        return print_error(arguments, text_of(error), code)
+    if is_shortage(error):
+        text = " ".join(str(error).split()) or "none is left"
+        return print_error(arguments, SHORTAGE.format(text), EXIT_BAD_INPUT)
+    return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
+
+
+@contextmanager
+def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
+    """Within this, SIGTERM raises Terminated in the main thread, as SIGINT raises KeyboardInterrupt.
+
+    Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: it is
+    added to `lost`, and the signal is sent again a moment later.
+    """
+    if threading.current_thread() is not threading.main_thread():  # where no handler can be set
+        yield
+        return
+    timers: list[threading.Timer] = []
+
+    def send_again(unraisable: "sys.UnraisableHookArgs") -> None:
+        if isinstance(unraisable.exc_value, KeyboardInterrupt):
+            lost.append(unraisable.exc_value)
+            number = signal.SIGTERM if isinstance(unraisable.exc_value, Terminated) else signal.SIGINT
+            timers.append(threading.Timer(RETRY, os.kill, (os.getpid(), number)))
+            timers[-1].start()
+        else:
+            sys.__unraisablehook__(unraisable)
+
+    before = signal.signal(signal.SIGTERM, _terminate)
+    hook = sys.unraisablehook
+    sys.unraisablehook = send_again
+    try:
+        yield
+    finally:
+        for timer in timers:
+            timer.cancel()
+        signal.signal(signal.SIGTERM, before)
+        sys.unraisablehook = hook
+
+
+def _terminate(signum: int, frame: FrameType | None) -> None:
+    raise Terminated
+
+
+def discard_stdout() -> None:
+    """Drop what can't be written to stdout, so that it is not tried again at exit."""
+    try:
+        if sys.stdout:
+            sys.stdout.flush()
+    except OSError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,17 +1,17 @@
 """List the images inside an E57 file, one JSON object a line, and write them as files if asked."""
 
-import argparse
 import json
 import re
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
+from .checks import check_distinct, check_folder_name
 from .command import command, option
-from .errors import EXIT_BAD_INPUT, print_error
-from .outputs import check_distinct, check_folder_name
+from .terminal import EXIT_BAD_INPUT, print_error
 
 EPILOG = """\
 example:
@@ -35,14 +35,14 @@ def image_json(index: int, image: E57Image) -> dict[str, object]:
     return {**row, "is_usable": image.kind == "spherical", "pose": pose, "scan_guid": image.scan_guid or None}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     parser.add_argument("e57", type=Path, metavar="FILE", help="E57 file")
     option(parser, "--extract FOLDER", "write the images to this folder")
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """List and, if asked, write the images; returns the exit code. A broken one doesn't stop the others."""
     check_folder_name("--extract", arguments.extract)
     images = list_images(arguments.e57)

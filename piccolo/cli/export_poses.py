@@ -1,7 +1,6 @@
 """Write the poses of localize.py for other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
 
-import argparse
-import json
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,9 +12,9 @@ from ..geometry.rotations import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
 from ..scene import find_scenes, input_files
+from .checks import check_distinct, checking_options
 from .command import command, option
-from .errors import checking_options, print_note
-from .outputs import check_distinct, print_report
+from .terminal import print_note, print_report
 
 _FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
 EPILOG = f"""\
@@ -36,7 +35,7 @@ EXIT_CODES = "0 done, 1 pictures that the format can't hold were left out"
 OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options. One that is not given stays None, and keeps its default."""
     source = parser.add_mutually_exclusive_group(required=True)
     option(source, "--results FILE ...", "results of localize.py, JSON lines", default=[])
@@ -62,7 +61,7 @@ def _takers(option: str) -> str:
     return ", ".join(form.name for form in FORMATS.values() if option in form.options)
 
 
-def options_from(arguments: argparse.Namespace) -> Options:
+def options_from(arguments: Namespace) -> Options:
     """Return the options given; one that the format does not take is refused."""
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     form = FORMATS[arguments.format]
@@ -85,7 +84,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         yield f"poses in {num_clouds} clouds are assumed to be in one coordinate system; --cloud selects"
 
 
-def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> Iterable[str]:
+def check_content(arguments: Namespace, results: Sequence[Result]) -> Iterable[str]:
     """Yield notes on results of other clouds than those chosen; without --force they are refused."""
     for cloud in dict.fromkeys(result.cloud for result in results if result.cloud_name in arguments.cloud):
         paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
@@ -97,7 +96,7 @@ def check_content(arguments: argparse.Namespace, results: Sequence[Result]) -> I
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, EXIT_CODES)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, choose, write; returns the exit code."""
     with checking_options():
         options = options_from(arguments)
@@ -117,5 +116,5 @@ def main(arguments: argparse.Namespace) -> int:
         print_note(arguments, f"left out {len(names)}, the first {names[0]}: {reason}")
     num_poses = len(selection.results) - sum(counts.values())
     report = {"out": str(arguments.out), "format": arguments.format, "poses": num_poses}
-    print_report(arguments, outputs, json.dumps({**report, "left_out": {**selection.left_out, **counts}}))
+    print_report(arguments, outputs, {**report, "left_out": {**selection.left_out, **counts}})
     return EXIT_LEFT_OUT if left_out else 0

@@ -1,64 +1,53 @@
 """Command line: a coloured scan and photos in, camera poses out."""
 
-import argparse
 import itertools
 import os
 import sys
+from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from tqdm import tqdm
+import numpy as np
 
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas
 from ..batch.localizer import Answer, Localizer
-from ..batch.outputs import FileOutput, Output, StreamOutput
 from ..batch.priors import read_priors
-from ..batch.results_file import Records
+from ..batch.results_file import FileOutput, Output, Records, StreamOutput
 from ..batch.second_look import LISTINGS, Look, list_changed_by_consensus
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..errors import InputError, printable
-from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
+from ..errors import InputError
+from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
 from ..files.line_file import LineFile, open_locked, write_line
 from ..jobs.memory import limit_memory
-from ..jobs.threads import Stopwatch, Workers, num_cores
-from ..localization.focal_length import WIDE
+from ..jobs.threads import Stopwatch, num_cores
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
+from ..panorama import read_panorama
 from ..panorama.cube import is_cube
 from ..panorama.photo import sha256_of
-from ..result import FAILED, UNREADABLE, Result
+from ..result import FAILED, UNREADABLE
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from .bundle import check_bundle_options, make_bundle_job
-from .coloring import check_coloring_options, make_coloring_job
+from ..views.pictures import encode_image
+from . import execution, terminal, together
+from .checks import UsageError, check_distinct, check_suffix, checking_options
 from .command import command
-from .errors import EXIT_BAD_INPUT, UsageError, checking_options, print_error, print_note
-from .executing import (
-    Executor,
-    Interruption,
-    check_execution,
-    choose_exit_code,
-    connecting,
-    count_jobs,
-    executing,
-    interruptible,
-)
-from .handedness import LEFT_HANDED, is_left_handed
+from .execution import Executor, Interruption
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
-from .outputs import check_distinct, check_suffix
-from .progress import progress_bar, show_progress, warn_once
-from .start import for_terminal
-from .together import run_together
-from .walking import check_walk_options, make_walk_job, walk_frames
 
-MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
+NUM_MIRRORED = 3  # of the photos that were not localized
+LEFT_HANDED = (
+    "the photos fit the scan mirrored, left for right: its axes are left-handed, which `up` can't mend; "
+    "negate one of its coordinates, or export it with right-handed axes"
+)
 JOINT = ("walk", "video", "relative", "color_scan")  # options of photos that help each other
 Write = Callable[[str], object]
 
@@ -67,7 +56,7 @@ Write = Callable[[str], object]
 class Run:
     """A command's batch, and what it has done so far."""
 
-    arguments: argparse.Namespace
+    arguments: Namespace
     localizer: Localizer
     panoramas: Iterable[Path]
     total: int | None  # of the panoramas; None if they come on standard input
@@ -83,7 +72,7 @@ class Run:
         return is_default and self.total not in (None, 1) and not self.localizer.sends_photos
 
 
-def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int | None) -> None:
+def check_files(arguments: Namespace, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
     a = arguments
     given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative, a.odometry))
@@ -104,14 +93,12 @@ def check_files(arguments: argparse.Namespace, panoramas: list[Path], total: int
         check_output(path)
 
 
-def prepare_run(arguments: argparse.Namespace) -> Run:
+def prepare_run(arguments: Namespace) -> Run:
     """Return what is to be done: the options, the panoramas, and how many there are."""
     with checking_options():
         check_arguments(arguments)
-        check_walk_options(arguments)
-        check_bundle_options(arguments)
-        check_coloring_options(arguments)
-        check_execution(arguments)
+        together.check_joint_options(arguments)
+        execution.check_execution(arguments)
         limit_memory(arguments.max_memory)
         localizer = localizer_from(arguments, tuple(arguments.cloud))
     priors = None
@@ -137,17 +124,17 @@ def prepare_run(arguments: argparse.Namespace) -> Run:
     return Run(arguments, localizer, known, len(known), left_out, Counter())
 
 
-def note_unused_priors(arguments: argparse.Namespace, localizer: Localizer) -> None:
+def note_unused_priors(arguments: Namespace, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
     if localizer.priors and (names := localizer.priors.names_without_panorama):
         note = f"{len(names)} names without a photo, such as {names[0]}"
-        print_note(arguments, f"warning: {localizer.priors.path}: {note}")
+        terminal.print_note(arguments, f"warning: {localizer.priors.path}: {note}")
 
 
 def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
     """Read and prepare the scan."""
     arguments = run.arguments
-    workers = Workers(num_threads, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    workers = terminal.workers_from(arguments, num_threads)
     scan = localizer.open_scan(workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
@@ -184,35 +171,6 @@ def take_up_results(run: Run, file: LineFile) -> Records:
     return records
 
 
-def advise(result: Result) -> list[str]:
-    """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
-    is_ruled_out = result.best_pose is None or result.confidence == 0.0
-    if result.status == LOCALIZED or is_ruled_out or result.probability_none is None:
-        return []
-    focal = result.focal_length
-    if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:
-        return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
-    if result.status == AMBIGUOUS:
-        return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
-    if result.confidence >= MIN_FIT:
-        others = "add photos taken beside it" if result.cameras else "localize photos of a walk (--walk)"
-        return [f"  to be sure, look at the --overlay, give --near, or {others}"]
-    lens = ", a wrong focal length" if result.cameras else ""
-    return [f"  it fits nowhere well: another scan{lens}, or bare walls?"]
-
-
-def print_result(arguments: argparse.Namespace, result: Result, warnings: Sequence[str]) -> None:
-    """Print an error; or, unless --quiet, what was found, the warnings, and what to do if it is doubtful."""
-    if result.error is not None:
-        print_error(arguments, result.error, EXIT_BAD_INPUT)
-        return
-    if arguments.quiet:
-        return
-    lines = [f"  warning: {for_terminal(printable(warning))}" for warning in warnings]
-    for line in (result.summary(), *lines, *advise(result)):
-        tqdm.write(line, file=sys.stderr)
-
-
 def record(run: Run, answer: Answer, write: Write) -> None:
     """Write the pictures asked for and the result, and say what was found."""
     arguments = run.arguments
@@ -222,7 +180,7 @@ def record(run: Run, answer: Answer, write: Write) -> None:
     for path, png in pictures:
         if path and png is not None:
             write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
-    print_result(arguments, result, answer.warnings)
+    execution.print_result(arguments, result, answer.warnings)
     write(result.to_json())
     run.counts[result.status] += 1
     if result.best_pose is not None and result.pose is None and not result.cameras:
@@ -233,21 +191,16 @@ def localize_all(
     run: Run, records: Records, left: Iterable[Path], executor: Executor, write: Write
 ) -> Interruption:
     """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
-    is_quiet = run.arguments.quiet or run.total == 1
-    bar = {"desc": "photos", "total": run.total, "initial": records.counts.total(), "unit": ""}
-    values = executor.values(map(run.localizer.task, left))
-    with interruptible() as interruption:
-        pairs = show_progress(values, is_quiet, **bar)
-        # behind the photo after which a signal has ended it come those that are done already
-        for task, wait in pairs if run.total == 1 else interruption.each(pairs, values.take_finished()):
-            record(run, run.localizer.wait_for(task, wait, run.cloud_sha256), write)
+    is_one = run.total == 1
+    bar: dict[str, Any] = {"desc": "photos", "total": run.total, "unit": ""}
+    bar["initial"] = records.counts.total()
+    show = partial(terminal.show_progress, is_quiet=run.arguments.quiet or is_one, **bar)
+    tasks = map(run.localizer.task, left)
+    with execution.interruptible() as interruption:
+        signals = None if is_one else interruption
+        for answer in execution.answer_all(executor, run.localizer, tasks, show, signals, run.cloud_sha256):
+            record(run, answer, write)
     return interruption
-
-
-def list_all_looks(run: Run, output: Output) -> list[Look]:
-    """Return which of the finished photos are to be looked at again."""
-    texts = follow_consensus(run, output) if run.looks_again else []
-    return [look for list_looks in LISTINGS for look in list_looks(texts)]
 
 
 def follow_consensus(run: Run, output: Output) -> Sequence[str]:
@@ -270,12 +223,14 @@ def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
     localizer = run.localizer
     for list_looks in LISTINGS:
         looks = list_looks(follow_consensus(run, output))
-        values = executor.values(localizer.task(Path(look.pano))._replace(look=look) for look in looks)
-        with interruptible() as interruption:
-            pairs = show_progress(values, run.arguments.quiet, desc="second look", total=len(looks), unit="")
-            answers = interruption.each(pairs, values.take_finished())
-            for look, (task, wait) in zip(looks, answers, strict=False):
-                record_second(run, look, localizer.wait_for(task, wait, run.cloud_sha256), output)
+        tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
+        bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
+        show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
+        with execution.interruptible() as interruption:
+            digest = run.cloud_sha256
+            answers = execution.answer_all(executor, localizer, tasks, show, interruption, digest)
+            for look, answer in zip(looks, answers, strict=False):
+                record_second(run, look, answer, output)
         if interruption.number:
             return interruption
     follow_consensus(run, output)
@@ -288,7 +243,7 @@ def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
     replace_line = partial(output.replace, look.number)
     is_other = not look.first or (result.beside is not None and result.beside.photos)
     if result.error is not None:
-        print_error(run.arguments, result.error, EXIT_BAD_INPUT)
+        terminal.print_error(run.arguments, result.error, terminal.EXIT_BAD_INPUT)
     elif is_other:
         run.counts[look.status] -= 1
         record(run, answer, replace_line)
@@ -297,11 +252,23 @@ def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
 
 
 def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
-    """Say so if no photo was localized, but some are mirrored."""
+    """Say so if no photo was localized, but most of the first spheres are when they are mirrored."""
     is_over = interruption.number or run.counts[LOCALIZED] or records.counts[LOCALIZED]
-    with suppress(OSError, InputError):  # the results are written: it is only a hint
-        if not (is_over or run.arguments.quiet) and is_left_handed(run.localizer, run.doubtful, executor):
-            print_note(run.arguments, LEFT_HANDED)
+    if is_over or run.arguments.quiet or len(run.doubtful) < NUM_MIRRORED:
+        return
+    localizer = run.localizer
+    # the results are written: it is only a hint
+    with suppress(OSError, InputError), temporary_folder() as folder:
+        paths = [folder / f"{k}.png" for k in range(NUM_MIRRORED)]
+        for path, photo in zip(paths, run.doubtful, strict=False):
+            photo_asked, _ = localizer.ask(Path(photo))
+            panorama = read_panorama(photo_asked, localizer.cloud_settings.labels)
+            shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
+            path.write_bytes(encode_image(shown[:, ::-1], ".png"))
+        answers = execution.answer_all(executor, localizer, map(localizer.task, paths))
+        found = [answer.result.status for answer in answers]
+        if 2 * found.count(LOCALIZED) > NUM_MIRRORED:
+            terminal.print_note(run.arguments, LEFT_HANDED)
 
 
 def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
@@ -317,12 +284,13 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
         again = ", which the same command will try again" if counts[FAILED] else ""
         note = f"{counts.total()} photos in {seconds:.0f} s: {words}{again}"
         dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
-        print_note(arguments, "; ".join(filter(None, (note, dropped, describe_left_out(run.left_out)))))
+        parts = note, dropped, describe_left_out(run.left_out)
+        terminal.print_note(arguments, "; ".join(filter(None, parts)))
     if interruption.number:
         return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
     if run.total is None:
         note_unused_priors(arguments, run.localizer)
-    return choose_exit_code(+counts)
+    return execution.choose_exit_code(+counts)
 
 
 def run_jointly(run: Run) -> int:
@@ -335,18 +303,17 @@ def run_jointly(run: Run) -> int:
     photos = list(run.panoramas)
     opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
     if arguments.walk or arguments.video:
-        with walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
+        with together.walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
             if run.left_out:
-                print_note(arguments, describe_left_out(run.left_out))
+                terminal.print_note(arguments, describe_left_out(run.left_out))
             walk = Walk(opening(), settings, motion)
-            return run_together(arguments, make_walk_job(arguments, frames, walk))
-    make_job = make_bundle_job if arguments.relative else make_coloring_job
-    printing = partial(print_result, arguments)
-    return run_together(arguments, make_job(arguments, photos, run.localizer, opening(), printing))
+            return together.run_together(arguments, together.make_walk_job(arguments, frames, walk))
+    make_job = together.make_bundle_job if arguments.relative else together.make_coloring_job
+    return together.run_together(arguments, make_job(arguments, photos, run.localizer, opening()))
 
 
 @command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Localize every panorama, write the results, return the exit code."""
     watch = Stopwatch()
     run = prepare_run(arguments)
@@ -356,7 +323,8 @@ def main(arguments: argparse.Namespace) -> int:
     with open_output(run) as (output, records):
         panoramas = iter(run.panoramas)
         if run.total is not None:
-            panoramas = progress_bar(arguments.quiet)(panoramas, run.total, "check what is finished")
+            show = terminal.progress_bar(arguments.quiet)
+            panoramas = show(panoramas, run.total, "check what is finished")
         left = records.remaining(panoramas, lambda pano: sha256_of(pano, rig))
         num_left = None
         if run.total is not None:
@@ -364,14 +332,16 @@ def main(arguments: argparse.Namespace) -> int:
             left = iter(known)
             num_left = len(known)
         first = next(left, None)
-        looks = list_all_looks(run, output) if first is None else []
+        texts = follow_consensus(run, output) if first is None and run.looks_again else []
+        looks = [look for list_looks in LISTINGS for look in list_looks(texts)]
         if first is None and not looks:
-            print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
+            terminal.print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
-        num_jobs = count_jobs(arguments, num_left or len(looks) or None)
+        num_jobs = execution.count_jobs(arguments, num_left or len(looks) or None)
+        opening = partial(open_scan, run)
         with (
-            connecting(arguments, num_jobs) as cluster,
-            executing(arguments, run.localizer, num_jobs, cluster, partial(open_scan, run)) as place,
+            execution.connecting(arguments, num_jobs) as cluster,
+            execution.executing(arguments, run.localizer, num_jobs, cluster, opening) as place,
             watch.stage("all"),
         ):
             executor, run.localizer = place

@@ -2,11 +2,12 @@
 
 import argparse
 from collections.abc import Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from .. import __version__
-from ..batch.frame_times import EXIF, NAMES, ORDER
+from ..batch.inputs import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
 from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis, check_crs
 from ..errors import InputError
@@ -19,7 +20,8 @@ from ..photo import Photo, Projection
 from ..prior import Prior
 from ..scan_map.open_map import CachePolicy
 from ..walk.motion import MAX_SPEED, MAX_STEP
-from .command import check_least, option
+from .checks import check_least
+from .command import option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
 EPILOG = """\
@@ -108,10 +110,11 @@ def _metres_of(text: str) -> float:
 def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     """Add what the files of the panoramas do not say."""
     text = "horizontal field of view: of a photo with --projection; alone, of a crop of the sphere"
-    option(group, "--fov DEG", text)
+    option(group, "--fov DEG", text, dest="fov_deg")
     text = "projection of the picture (default equirectangular; pinhole if EXIF has a focal length)"
     group.add_argument("--projection", choices=get_args(Projection), help=text)
-    option(group, "--focal PX", "focal length of a pinhole photo, in its pixels, known to 1 %%", type=float)
+    text = "focal length of a pinhole photo, in its pixels, known to 1 %%"
+    option(group, "--focal PX", text, type=float, dest="focal_px")
     text = (
         "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times longer"
     )
@@ -126,7 +129,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     text = "mask whose white pixels are ignored; or a folder of masks, named like the photos"
     option(group, "--mask FILE", text)
     text = "ignore a cap of this half angle around straight down, with the tripod or the car"
-    group.add_argument("--mask-nadir", type=float, default=0.0, metavar="DEG", help=text)
+    option(group, "--mask-nadir DEG", text, default=0.0, dest="mask_nadir_deg")
     text = "coordinate system of the cloud, such as EPSG:25832; photos with GPS are searched near there first"
     default = f"(default: the one in LAS, LAZ or E57 files); {NONE}: ignore GPS"
     option(group, "--crs CRS", f"{text} {default}")
@@ -198,19 +201,8 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
 
 def photo_from(arguments: argparse.Namespace) -> Photo:
     """Return the options of all photos, with no picture."""
-    gravity_vector = vars(arguments).get("gravity_vector")  # not of commands without priors
-    return Photo(
-        Path(),
-        mask=arguments.mask,
-        mask_nadir_deg=arguments.mask_nadir,
-        camera=arguments.camera,
-        rig=arguments.rig,
-        focal_px=arguments.focal,
-        fov_deg=arguments.fov,
-        projection=arguments.projection,
-        gravity_vector=gravity_vector and tuple(gravity_vector),
-        refine_focal=arguments.refine_focal,
-    )
+    names = {f.name for f in fields(Photo)}
+    return Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
@@ -222,12 +214,8 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     if crs:
         check_crs(crs)
     channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
-    return CloudSettings(scale, arguments.up, channels, _labels_from(arguments), crs)
-
-
-def _labels_from(arguments: argparse.Namespace) -> Labels | None:
-    """Return how labels are to be read, None for colours."""
-    return None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
+    labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
+    return CloudSettings(scale, arguments.up, channels, labels, crs)
 
 
 def cache_from(arguments: argparse.Namespace) -> CachePolicy:

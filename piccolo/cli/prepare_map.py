@@ -1,16 +1,14 @@
 """Prepare the map of a cloud: a file that localize.py takes instead of the cloud."""
 
-import argparse
-import json
+from argparse import ArgumentParser, Namespace
 
-from ..jobs.threads import Stopwatch, Workers, num_cores
+from ..jobs.threads import Stopwatch
 from ..scan_map.named_scans import check_name, name_scan
 from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
+from .checks import check_outputs, checking_options
 from .command import command, option
-from .errors import checking_options
 from .options import add_cloud_options, cloud_settings_from
-from .outputs import check_outputs, print_report
-from .progress import progress_bar, warn_once
+from .terminal import print_report, workers_from
 
 EPILOG = """\
 example:
@@ -25,7 +23,7 @@ Prints one JSON object that describes the map to stdout.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py")
     text = "add the scan to this map with the same coordinate system; only changed parts are prepared again"
@@ -36,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Build and write the map; returns the exit code."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
@@ -45,7 +43,7 @@ def main(arguments: argparse.Namespace) -> int:
     name = arguments.cloud[0].stem if arguments.name is None else arguments.name
     check_name(name, ())
     watch = Stopwatch()
-    workers = Workers(num_cores(), progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    workers = workers_from(arguments)
     if arguments.add:
         scan_map = extend_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
@@ -62,5 +60,5 @@ def main(arguments: argparse.Namespace) -> int:
         "seconds": {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()},
         "warnings": list(scan_map.warnings),
     }
-    print_report(arguments, outputs, json.dumps(report))
+    print_report(arguments, outputs, report)
     return 0

@@ -1,7 +1,6 @@
 """Render the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
 
-import argparse
-import json
+from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
@@ -18,7 +17,7 @@ from ..files.atomic import check_output, check_output_folder, is_stream, replaci
 from ..files.json_file import read_text
 from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
 from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
-from ..jobs.threads import Workers, num_cores
+from ..jobs.threads import Workers
 from ..optimize import descent_animation
 from ..optimize.refine import DescentSettings
 from ..optional import import_optional
@@ -31,11 +30,10 @@ from ..scan_map.open_map import open_points
 from ..scene import read_scene
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
-from .command import command, option, print_warnings
-from .errors import checking_options
+from .checks import check_distinct, check_suffix, checking_options
+from .command import command, option
 from .options import add_cloud_options, cloud_settings_from
-from .outputs import check_distinct, check_suffix, print_report
-from .progress import progress_bar
+from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -73,7 +71,7 @@ class Shot(NamedTuple):
     camera: Camera | None  # None for a sphere
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     group = parser.add_argument_group("pose, one of")
@@ -96,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--animate FILE", text)
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
+def check_usage(arguments: Namespace) -> None:
     """Refuse options that make no sense, whatever the files hold."""
     cloud_settings_from(arguments)
     if not (arguments.out or arguments.animate):
@@ -110,7 +108,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     check_pose_options(arguments)
 
 
-def check_pose_options(arguments: argparse.Namespace) -> None:
+def check_pose_options(arguments: Namespace) -> None:
     """Refuse options that do not go with where the pose is from."""
     angles = [arguments.heading, arguments.pitch, arguments.roll]
     if not arguments.at and any(angle is not None for angle in angles):
@@ -121,7 +119,7 @@ def check_pose_options(arguments: argparse.Namespace) -> None:
         raise InputError("--at and angles must be finite numbers")
 
 
-def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+def outputs_of(arguments: Namespace) -> dict[str, Path | None]:
     """Return the outputs by option."""
     return {name: getattr(arguments, name[2:].replace("-", "_")) for name in SUFFIXES}
 
@@ -136,7 +134,7 @@ def suffix_of(option: str, path: Path) -> str:
     return SUFFIXES[option][0] if is_stream(path) else path.suffix.lower()
 
 
-def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
+def check_files(arguments: Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     given = (arguments.result, arguments.queries, arguments.pose, arguments.camera)
     photos = [find_photo(arguments, shot.pano) for shot in poses]
@@ -145,12 +143,12 @@ def check_files(arguments: argparse.Namespace, poses: list[Shot]) -> None:
         (check_output_folder if is_folder(path) else check_output)(path)
 
 
-def find_photo(arguments: argparse.Namespace, name: str) -> Path:
+def find_photo(arguments: Namespace, name: str) -> Path:
     """Return the panorama that a pose's file names."""
     return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
 
-def poses_from(arguments: argparse.Namespace) -> list[Shot]:
+def poses_from(arguments: Namespace) -> list[Shot]:
     """Return poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
     given = read_calibration(arguments.camera).mounts if arguments.camera else ()
     if len(given) > 1:
@@ -208,9 +206,7 @@ def depth_file(depth: Array32, suffix: str) -> bytes:
     return file.getvalue()
 
 
-def draw_pictures(
-    arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers
-) -> None:
+def draw_pictures(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
     """Write the pictures; one JSON line each."""
     is_many = is_folder(arguments.out)
     names = [f"{Path(shot.pano).stem}.png" for shot in poses] if is_many else [arguments.out.name]
@@ -237,10 +233,10 @@ def draw_pictures(
     with replacing_folder(arguments.out) if is_many else nullcontext(arguments.out.parent) as folder:
         lines = [write(folder, name, shot) for name, shot in zip(names, poses, strict=True)]
     for line in lines:
-        print_report(arguments, outputs_of(arguments), json.dumps(line))
+        print_report(arguments, outputs_of(arguments), line)
 
 
-def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
+def animate(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
     """Write the descent towards the pose; one JSON line."""
     ((name, pose, camera),) = poses
     if camera is not None:
@@ -264,11 +260,11 @@ def animate(arguments: argparse.Namespace, cloud: LocalCloud, poses: list[Shot],
         distance, angle = pose_errors(at, goal)
         line |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
     line["loss"] = refined.loss if np.isfinite(refined.loss) else None
-    print_report(arguments, outputs_of(arguments), json.dumps(line))
+    print_report(arguments, outputs_of(arguments), line)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
@@ -277,7 +273,7 @@ def main(arguments: argparse.Namespace) -> int:
     poses = poses_from(arguments)
     check_files(arguments, poses)
 
-    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    workers = workers_from(arguments)
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
     print_warnings(arguments, cloud.warnings)
     if arguments.out:

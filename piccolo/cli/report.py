@@ -1,24 +1,23 @@
 """Write a web page of results: plans of the storeys, photos as spheres, the scan seen from their poses."""
 
-import argparse
-import json
+from argparse import ArgumentParser, Namespace
 from collections import Counter
+from dataclasses import fields
 from pathlib import Path
 
 from ..errors import InputError
 from ..files.atomic import check_output
-from ..jobs.threads import Stopwatch, Workers, num_cores
+from ..jobs.threads import Stopwatch, num_cores
 from ..optional import import_optional
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
-from .command import check_least, command, option, print_warnings
-from .errors import UsageError, checking_options
+from .checks import UsageError, check_distinct, check_least, check_suffix, checking_options
+from .command import command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
-from .outputs import check_distinct, check_suffix, print_report
-from .progress import progress_bar, warn_once
+from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -35,7 +34,7 @@ scan's coordinates), and two rows or more. Prints one JSON object to stdout.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
@@ -54,7 +53,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--cache FOLDER", CACHE_TEXT)
 
 
-def settings_from(arguments: argparse.Namespace) -> ReportSettings:
+def settings_from(arguments: Namespace) -> ReportSettings:
     """Return what the options ask for; those that make no sense are refused."""
     check_least(arguments, jobs=1)
     if not (arguments.out or arguments.plan):
@@ -65,19 +64,13 @@ def settings_from(arguments: argparse.Namespace) -> ReportSettings:
     for number, *_ in arguments.own_plan:
         if not number.isdecimal():
             raise UsageError(f"--own-plan: found storey {number!r}, wanted a number, 1 for the lowest")
-    return ReportSettings(
-        title=arguments.title or "",
-        storeys=arguments.storeys,
-        images=arguments.images,
-        full_size=arguments.full_size,
-        self_contained=arguments.self_contained,
-        own_plans={int(k): (image, csv) for k, image, csv in arguments.own_plan},
-        crs=arguments.crs or "",
-        force=arguments.force,
-    )
+    own_plans = {int(k): (image, csv) for k, image, csv in arguments.own_plan}
+    names = {f.name for f in fields(ReportSettings)}
+    given = {name: value for name, value in vars(arguments).items() if name in names and value is not None}
+    return ReportSettings(own_plans=own_plans, **given)
 
 
-def check_files(arguments: argparse.Namespace) -> None:
+def check_files(arguments: Namespace) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     own = [Path(name) for _, *names in arguments.own_plan for name in names]
     inputs = [*arguments.results, *arguments.cloud, *own]
@@ -92,14 +85,14 @@ def check_files(arguments: argparse.Namespace) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, draw, write; returns the exit code."""
     with checking_options():
         settings = settings_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
     check_files(arguments)
     entries = collect_entries(arguments.results)
-    workers = Workers(arguments.jobs, progress_bar(arguments.quiet), warn_once(arguments.quiet))
+    workers = workers_from(arguments, arguments.jobs)
     cache = cache_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, cache, workers, Stopwatch())
     line: dict[str, object] = {"photos": len(entries)}
@@ -113,5 +106,5 @@ def main(arguments: argparse.Namespace) -> int:
         line["url"] = report.page.resolve().as_uri()
         line["storeys"] = len(report.document["storeys"])
     line |= Counter(entry.result.status for entry in entries)
-    print_report(arguments, {"--plan": arguments.plan}, json.dumps(line))
+    print_report(arguments, {"--plan": arguments.plan}, line)
     return 0

@@ -3,30 +3,73 @@
 Results are written when all are known. Until then the steps of the job are kept beside them.
 """
 
-import argparse
 import json
+from argparse import Namespace
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from ..batch.inputs import is_from_stdin, times_of
+from ..batch.localizer import Localizer
+from ..batch.relative_poses import find_scale, read_odometry, read_relative_poses
 from ..batch.results_file import WAYS, Records, write_results
-from ..files.atomic import is_stream
+from ..coloring import color_scan
+from ..confidence.confidence import LOCALIZED
+from ..errors import InputError
+from ..files.atomic import is_stream, temporary_folder
 from ..files.line_file import Journal, keeping_steps
+from ..geometry.pose import Pose
+from ..jobs.processes import InFlight
 from ..jobs.threads import Stopwatch
+from ..opened_scan import OpenedScan
 from ..panorama.photo import sha256_of
+from ..panorama.video import frames_of
 from ..photo import Photo
-from ..result import FAILED, Result, read_results
-from .errors import print_error, print_note
-from .executing import EXIT_SOME_NOT, Interruption, choose_exit_code
+from ..result import FAILED, UNREADABLE, Result, read_results
+from ..scan_map.scan_map import ScanMap
+from ..scan_walk import Walk
+from ..walk.motion import Motion
+from . import terminal
+from .checks import UsageError, refuse_given
+from .execution import EXIT_SOME_NOT, Interruption, choose_exit_code, interruptible, print_result
+from .options import DEFAULT_EVERY
+
+NOT_WITH = {  # options that do not go with what is asked for
+    "a video": ("times",),
+    "a walk": ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal"),
+    "--relative": ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal"),
+    "--color-scan": ("walk", "video", "relative", "jobs", "dask", "overlay", "occlusion_mask", "labels"),
+}
+ONLY_WITH_WALKS = ("times", "max_speed", "odometry")
+NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
 
 
-class Report(NamedTuple):
-    """The end of a job."""
-
-    words: str  # on all results
-    is_whole: bool = True  # False if what was asked for beside the results is not written
+def check_joint_options(arguments: Namespace) -> None:
+    """Refuse options that do not go with photos that help each other, or with each other."""
+    a = arguments
+    if not a.video:
+        refuse_given(a, ("every",), "only with --video")
+    if not (a.walk or a.video):
+        if not a.pano:
+            raise UsageError("the following arguments are required: --pano")
+        refuse_given(a, ONLY_WITH_WALKS, "only with --walk or --video")
+    elif bool(a.video) == bool(a.pano):
+        raise UsageError("--walk, --video: wanted --walk with --pano, or --video alone")
+    asked = {"a video": a.video, "a walk": a.walk or a.video, "--relative": a.relative}
+    asked["--color-scan"] = a.color_scan
+    for what in (what for what, is_asked in asked.items() if is_asked):
+        refuse_given(a, NOT_WITH[what], f"not with {what}")
+    if (a.walk or a.color_scan) and is_from_stdin(a.pano):
+        option = "--walk" if a.walk else "--color-scan"
+        raise UsageError(f"{option}: found names on stdin, wanted files or folders")
+    if a.color_scan:
+        color_scan.check_suffix(a.color_scan)
+    Motion(max_speed=a.max_speed)  # refuses a wrong one
 
 
 class Job(NamedTuple):
@@ -36,11 +79,12 @@ class Job(NamedTuple):
     photos: Mapping[str, Photo]  # by their names in the results
     fields: Callable[[Path], Mapping[str, Any]]  # of a photo's line, that say how it was made
     run: Callable[[Journal], list[Result] | Interruption]
-    report: Callable[[Sequence[Result]], Report]  # says what was found, and writes what else was asked for
+    # writes what else was asked for; returns words on all results, and whether it could be written
+    report: Callable[[Sequence[Result]], tuple[str, bool]]
     output: Path | None = None  # that is written beside the results
 
 
-def run_together(arguments: argparse.Namespace, job: Job) -> int:
+def run_together(arguments: Namespace, job: Job) -> int:
     """Do a job, or what an earlier run has left of it; write and print the results, return the exit code."""
     out = arguments.out
     path = steps_file(out)
@@ -48,7 +92,7 @@ def run_together(arguments: argparse.Namespace, job: Job) -> int:
     if path and not arguments.overwrite and is_finished(out, job):
         results = read_results([out])
         if job.output is None or job.output.exists():
-            print_note(arguments, f"{out}: nothing is left to do")
+            terminal.print_note(arguments, f"{out}: nothing is left to do")
             return choose_exit_code({result.status for result in results})
     else:
         digest = sha256(json.dumps([job.fields(Path(name)) for name in job.photos]).encode()).hexdigest()
@@ -61,14 +105,14 @@ def run_together(arguments: argparse.Namespace, job: Job) -> int:
         write_results(out, results)
         if path and not any(result.status == FAILED for result in results):
             path.unlink(missing_ok=True)
-    report = job.report(results)
+    more, is_whole = job.report(results)
     counts = Counter(result.status for result in results)
     words = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.items())
-    note = f"{len(results)} {job.what} in {watch.seconds.get('all', 0.0):.0f} s: {words}{report.words}"
+    note = f"{len(results)} {job.what} in {watch.seconds.get('all', 0.0):.0f} s: {words}{more}"
     code = choose_exit_code(counts)
-    if not report.is_whole:
-        return print_error(arguments, note, code or EXIT_SOME_NOT)
-    print_note(arguments, note)
+    if not is_whole:
+        return terminal.print_error(arguments, note, code or EXIT_SOME_NOT)
+    terminal.print_note(arguments, note)
     return code
 
 
@@ -86,3 +130,159 @@ def is_finished(out: Path, job: Job) -> bool:
     records.read(job.fields, job.photos)
     paths = {name: (Path(str(photo.picture)), photo.instant) for name, photo in job.photos.items()}
     return not list(records.remaining(paths, lambda name: sha256_of(*paths[name]))) and records.is_in_order
+
+
+def make_bundle_job(
+    arguments: Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
+) -> Job:
+    """Return the job of localizing photos as one camera, by --relative; a stopped one begins again."""
+    poses = read_relative_poses(arguments.relative, photos)
+    more = {"relative_sha256": sha256_of(arguments.relative, None)}
+    asked = [localizer.ask(path)[0] for path in photos]
+
+    def run(_journal: Journal) -> list[Result]:
+        scale = find_scale(arguments.relative)
+        found = scan.localize_bundle(asked, poses, localizer.settings, scale)
+        return [replace(result, settings={**result.settings, **more}) for result in found]
+
+    def report(results: Sequence[Result]) -> tuple[str, bool]:
+        for result in results:
+            print_result(arguments, result, result.warnings[len(scan.warnings) :])
+        return "", True
+
+    fields = localizer.expect(scan.prepared.scan_sha256, more)
+    return Job("photos together", {photo.name: photo for photo in asked}, fields, run, report)
+
+
+def make_coloring_job(
+    arguments: Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
+) -> Job:
+    """Return the job of localizing photos in the colours of the others, and of colouring the scan by them.
+
+    If too few are localized to colour the scan, the results alone are written.
+    """
+    scan_map = scan.prepared
+    assert isinstance(scan_map, ScanMap)
+    given = {str(path): localizer.ask(path)[0] for path in photos}
+    more = {"colors": "those of the other photos"}
+
+    def localize(shown: ScanMap, k: int) -> Result:
+        result = localizer.answer(replace(scan, prepared=shown), localizer.task(photos[k])).result
+        return replace(result, settings={**result.settings, **more})
+
+    def run(journal: Journal) -> list[Result]:
+        steps = (f"shape: {path} {sha256_of(path, localizer.photo.instant)}" for path in photos)
+        by_shape = journal.recall(steps, lambda _, text: Result.from_json(text))
+        left = range(len(by_shape), len(photos))
+        for k in scan.workers.show(iter(left), len(left), "photos"):
+            by_shape.append(localize(scan_map, k))
+            step = f"shape: {photos[k]} {by_shape[k].source.pano_sha256}"
+            color_scan.keep_step(journal, step, by_shape[k])
+        return color_scan.localize_by_colors(scan_map, by_shape, localize, scan.workers, journal)
+
+    def report(results: Sequence[Result]) -> tuple[str, bool]:
+        of_scan = {*scan.warnings, color_scan.PAINTED}
+        for result in results:
+            own = [warning for warning in result.warnings if warning not in of_scan]
+            print_result(arguments, result, own)
+        least = color_scan.LEAST_PHOTOS
+        if sum(result.status == LOCALIZED for result in results) < least:
+            return f"; {arguments.color_scan} is not written: wanted {least} localized photos or more", False
+        colored = color_scan.write_colored_scan(scan, results, arguments.color_scan)
+        part = 100.0 * colored.num_colored / max(colored.num_points, 1)
+        return f"; {part:.0f} % of the points coloured", True
+
+    fields = localizer.expect(scan_map.scan_sha256, more)
+    return Job("photos", given, fields, run, report, arguments.color_scan)
+
+
+class WalkInput(NamedTuple):
+    """A frame of a walk."""
+
+    photo: Photo
+    time: float  # [s] since the first; of frames without times their number
+    name: str  # in the results
+    odometry: Pose | None = None
+
+    def step(self, digest: str | None) -> str:
+        """Return the name of the step that follows it, if its file has a digest."""
+        return f"{self.name} {self.time} {digest}"
+
+
+@contextmanager
+def walk_frames(
+    arguments: Namespace, photo: Photo, panoramas: Sequence[Path]
+) -> Iterator[tuple[list[WalkInput], Motion]]:
+    """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
+    with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
+        times = None
+        if arguments.video:
+            taken = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
+            bar = {"desc": "read the video", "unit": " frames", "leave": False}
+            shots = terminal.show_progress(taken, arguments.quiet, **bar)
+            found = ((f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots)
+        else:
+            times = times_of(panoramas, arguments.times)
+            clock = times or [float(k) for k in range(len(panoramas))]
+            found = ((p, t - clock[0], str(p)) for p, t in zip(panoramas, clock, strict=True))
+        frames = [WalkInput(replace(photo, picture=path), *more) for path, *more in found]
+        if arguments.odometry:
+            paths = [frame.photo.path for frame in frames]
+            when = times or [frame.time for frame in frames]
+            poses = read_odometry(arguments.odometry, paths, when, has_clock=times is not None)
+            frames = [f._replace(odometry=pose) for f, pose in zip(frames, poses, strict=True)]
+        is_timed = times is not None or arguments.video is not None
+        yield frames, Motion(max_speed=arguments.max_speed, is_timed=is_timed)
+
+
+def make_walk_job(arguments: Namespace, frames: Sequence[WalkInput], walk: Walk) -> Job:
+    """Return the job of localizing the frames of a walk."""
+    if arguments.odometry:
+        walk.more_settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
+    fields = walk.key_of(frames[0].photo)
+
+    def run(journal: Journal) -> list[Result] | Interruption:
+        interruption = follow_all(arguments, walk, frames, journal)
+        return interruption if interruption.number else walk.finish(terminal.progress_bar(arguments.quiet))
+
+    def report(results: Sequence[Result]) -> tuple[str, bool]:
+        warnings = {w for r in results for w in r.warnings if w.startswith("`odometry`")}
+        terminal.print_warnings(arguments, warnings)
+        gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
+        return f"; {gaps} gaps", True
+
+    photos = {frame.name: frame.photo for frame in frames}
+    return Job("frames", photos, lambda _: fields, run, report)
+
+
+def follow_all(
+    arguments: Namespace, walk: Walk, frames: Sequence[WalkInput], journal: Journal
+) -> Interruption:
+    """Follow the frames, and keep what was found of each; say why one can't be read."""
+    steps = (frame.step(sha256_of(frame.photo.path, frame.photo.instant)) for frame in frames)
+    journal.recall(steps, lambda k, text: walk.restore(text, frames[k].photo))
+    bar = {"desc": "frames", "total": len(frames), "initial": len(walk.blanks), "unit": ""}
+    left = iter(frames[len(walk.blanks) :])
+    with ThreadPoolExecutor(1) as pool, interruptible() as interruption:
+        # each is prepared while the one before it is followed
+        prepared = InFlight(lambda frame: pool.submit(walk.prepare, frame.photo, frame.name), left, 2)
+        pairs = terminal.show_progress(prepared, arguments.quiet, **bar)
+        for frame, wait in interruption.each(pairs) if journal.is_kept else pairs:
+            result = walk.follow(wait(), frame.time, frame.odometry)
+            if result.status == UNREADABLE and frame is frames[0]:
+                check_others(walk, frames, str(result.error))
+            if result.error is not None:
+                terminal.print_error(arguments, result.error, terminal.EXIT_BAD_INPUT)
+            if result.status != FAILED:
+                journal.append(frame.step(result.source.pano_sha256), walk.last_to_json())
+        pool.shutdown(cancel_futures=True)
+    return interruption
+
+
+def check_others(walk: Walk, frames: Sequence[WalkInput], error: str) -> None:
+    """Refuse a walk whose first frames, and the last, can't be read for one reason."""
+    others = [*frames[1:NUM_TRIED], frames[-1]]
+    found = (str(walk.prepare(other.photo, other.name).blank.error) for other in others)
+    is_same = (text.replace(o.name, frames[0].name) == error for text, o in zip(found, others, strict=True))
+    if len(frames) > NUM_TRIED and all(is_same):
+        raise InputError(f"{error}; the other {len(frames) - 1} frames seem no better")

@@ -34,7 +34,7 @@ from .settings import CoarseToFineSettings
 from .verification import Located, match_beside, place_keypoints
 
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
-MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
+MOST_BESIDE = 3  # photos whose matches count, those with the most
 
 
 class SurePhoto(NamedTuple):

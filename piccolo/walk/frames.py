@@ -74,10 +74,7 @@ class Frame:
 
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
-    """List a frame's poses from its own localization, with the probabilities of that.
-
-    Alternatives count as not refined, as their covariance is not known.
-    """
+    """List a frame's poses by its own localization; alternatives, whose covariance is unknown, are rough."""
     if found.pose is None or found.probability_none is None or found.evidence is None:
         return []
     total = 1.0 - found.probability_none

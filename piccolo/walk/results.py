@@ -17,9 +17,8 @@ from ..geometry.pose_gaussian import probability_within, std_of
 from ..localization.judge import decide, take_pose
 from ..localization.prior import contradictions
 from ..optimize.smoothing import smooth_positions
-from .beliefs import Belief
 from .frames import Frame
-from .path import EVEN, Gap, Path
+from .path import EVEN, Belief, Gap, Path
 from .tracker import Tracker
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked

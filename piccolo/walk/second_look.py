@@ -11,9 +11,8 @@ from ..confidence.confidence import MIN_CONFIDENCE
 from ..geometry.pose import Pose, carry
 from ..jobs.threads import Progress, no_progress, one_blas_thread
 from ..localization.query import Query
-from .beliefs import Belief, believe
 from .frames import Frame
-from .path import EVEN, Path, build_lattice
+from .path import EVEN, Belief, Path, believe, build_lattice
 from .tracker import Expected, Followed, Tracker, find_near, refine_state
 
 Find = Callable[[Query], Followed | None]

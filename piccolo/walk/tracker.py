@@ -9,12 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.alternatives import Hypothesis
-from ..confidence.confidence import posterior
+from ..confidence.confidence import MODELS, Standing, pose_features, posterior
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE
 from ..geometry.pose import Pose, carry, exp_so3, log_so3
+from ..geometry.rotations import uniform_yaws
+from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..localization.attempts import is_whole
-from ..localization.beam import brief_query, descend_briefly, score_briefly, score_mirror, score_near
+from ..localization.beam import Ends, brief_query, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.comparison import compare
 from ..localization.localize import localize
 from ..localization.near import refine_near
@@ -39,11 +41,12 @@ from .frames import (
 )
 from .motion import REACH_SLACK, Motion
 from .path import COPY_LOG_ODDS, EVEN, Lattice
-from .places import MOST_PLACES, find_places, list_places, log_behind, query_near
 
+Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 NUM_QUERIES = 4  # are kept, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
+MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] a camera of so long a reach may be at another place
 
 
@@ -333,3 +336,34 @@ def track(query: Query, start: Pose) -> State | None:
     end = ends[best]
     is_wrong = odds[best] < 0.0 or end.seen.score < SURE_SCORE
     return None if is_wrong else State(end.pose, odds[best], end.seen.score, end.gaussian, end.seen)
+
+
+def query_near(query: Query, pose: Pose, radius: float) -> Query:
+    """Return the query of whole views that searches within a radius [m] of a pose: its tilt, any heading."""
+    m = query.scan_map
+    distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
+    near = m if math.isinf(radius) else m.narrow(distances <= max(radius, float(distances.min())))
+    level = pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
+    close = replace(query.by_views(), scan_map=near, cache=Cache(query.cache.views), rotations=level)
+    return brief_query(close, max(len(near.sparse), 1))
+
+
+def find_places(query: Query, own: Pose) -> list[Place]:
+    """Find the distinct poses, of the tilt of its own, that look like a photo beside that; best first."""
+    ends = descend_briefly(query_near(query, own, math.inf))
+    return list_places(query, ends, score_near(query, own))
+
+
+def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
+    """List the distinct ends with their odds to a pose of a score."""
+    R, centers = ends.poses.R_cam_from_map, ends.poses.center_map
+    kept = non_maximum_suppression(R, centers, MOST_PLACES, ONE_ANSWER)
+    found = zip(ends.poses.take(kept).poses(), ends.scores[kept], strict=True)
+    return [(pose, log_behind(query, float(score), own_score)) for pose, score in found]
+
+
+def log_behind(query: Query, score: float, own_score: float) -> float:
+    """Return the log odds of a pose against another by their scores, at most 0, by the model of views."""
+    standing = Standing(score / max(own_score, 1e-9), 1.0, None, query.by_views().evidence)
+    weight = MODELS[standing.evidence].weights[0]
+    return min(weight * float(pose_features(standing)[0]), 0.0)

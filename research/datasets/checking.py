@@ -13,7 +13,7 @@ from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.soa import pack_points
 from piccolo.confidence.occlusion import VIEW_WIDTH, measure_agreement
 from piccolo.geometry.pose import Pose
-from piccolo.jobs.threads import Progress, Workers, no_progress
+from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.scene import Query, Scene
@@ -56,9 +56,9 @@ class Check(NamedTuple):
         return f"{text}; no other axes fit better"
 
 
-def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress = no_progress) -> Check:
+def check_scene(scene: Scene, num_queries: int, workers: Workers) -> Check:
     """Score some panoramas of a scene, evenly spaced over the list, against its cloud at their poses."""
-    voxels = open_cloud([scene.cloud], IN_COLORS, show).voxels(np.eye(3))
+    voxels = open_cloud([scene.cloud], IN_COLORS, workers.show).voxels(np.eye(3))
     nodes = build_octree(voxels).level(0.08)  # [m] enough for views of a few degrees
     points = pack_points(nodes[:, :3], np.round(nodes[:, 3:] * 255.0).astype(np.uint8))
 
@@ -81,10 +81,8 @@ def check_scene(scene: Scene, num_queries: int, workers: Workers, show: Progress
 def convention_variants(pose: Pose, origin: Array) -> dict[str, Pose]:
     """Return the pose under each convention that may have been mixed up, by its name.
 
-    Positions are less `origin`.
-
     The camera's axes in any order and sign; and the rotation, or the whole transform, of a camera with known
-    axes inverted.
+    axes inverted. Positions are less `origin`.
     """
     inverted = {"": pose}
     for axes, other_from_cam in AXES.items():

@@ -1,26 +1,49 @@
 """Write research datasets, or your own panoramas with known poses, as scenes that tools/evaluate.py reads."""
 
-import argparse
 import json
+import math
+import os
+import shutil
+from argparse import ArgumentParser, Namespace
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple
 
-from piccolo.cli.command import HelpFormatter, add_run_options, check_least, command, option
-from piccolo.cli.errors import EXIT_BAD_INPUT, print_error, print_note
-from piccolo.cli.outputs import check_folder_name
-from piccolo.cli.progress import progress_bar
-from piccolo.errors import InputError
-from piccolo.jobs.threads import Progress, Workers, num_cores
-from piccolo.scene import read_scene
+import numpy as np
 
-from . import DATASETS
+from piccolo.cli.checks import check_folder_name, check_least
+from piccolo.cli.command import HelpFormatter, add_run_options, command, option
+from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, workers_from
+from piccolo.cloud import open_source
+from piccolo.cloud.readers.reader import CHUNK
+from piccolo.cloud.settings import IN_COLORS
+from piccolo.cloud.stream import PointValidator
+from piccolo.cloud.writers import vertex_rows, writing_ply
+from piccolo.errors import InputError, unreadable
+from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
+from piccolo.geometry.pose import move, transform_points
+from piccolo.jobs.threads import Progress, Workers
+from piccolo.scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
+from piccolo.views.pictures import encode_image
+
+from . import generic, research, stanford
 from .checking import check_scene
 from .files import AXES, DIRECTIONS
-from .model import ConvertOptions, SceneSpec
-from .writing import write_scene
+from .model import ConvertOptions, PosedPanorama, SceneList, SceneSpec
+
+DATASETS = {  # a line on each, and what finds its scenes
+    stanford.NAME: ("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.list_scenes),
+    research.OMNISCENES: ("OmniScenes, all splits", research.list_omniscenes),
+    research.MPO: ("MPO scans with panoramas, moved randomly as in the PICCOLO paper", research.list_mpo),
+    research.MATTERPORT: ("Matterport3D skyboxes and house meshes", research.list_matterport),
+    research.LOC360: ("360Loc 360-degree queries, with a cloud of your own", research.list_360loc),
+    generic.NAME: ("any panoramas with poses in a CSV, JSON or TUM file", generic.list_scenes),
+}
 
 EXIT_BAD_FIT = 1
-_DATASETS = "\n".join(f"  {name:<14} {dataset.description}" for name, dataset in DATASETS.items())
+_DATASETS = "\n".join(f"  {name:<14} {text}" for name, (text, _) in DATASETS.items())
 EPILOG = f"""\
 datasets:
 {_DATASETS}
@@ -34,11 +57,11 @@ A scene with a damaged file is left out and named on stderr. Prints one JSON obj
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options; those that one dataset alone has are in its own subparser."""
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
-    for name, dataset in DATASETS.items():
-        one = subparsers.add_parser(name, description=dataset.description, formatter_class=HelpFormatter)
+    for name, (description, _) in DATASETS.items():
+        one = subparsers.add_parser(name, description=description, formatter_class=HelpFormatter)
         option(one, "--from FOLDER", "folder of the dataset", required=True, dest="folder")
         option(one, "--out FOLDER", "folder of the scenes; created if missing", required=True)
         text = "only these, the last parts of scene names: office_1, weddingHall_1, a house"
@@ -50,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_run_options(one)
 
 
-def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
+def add_own_options(parser: ArgumentParser, dataset: str) -> None:
     """Add the options of one dataset alone; of `generic` those where the list has no column."""
     if dataset == "stanford2d3ds":
         option(parser, "--areas 1-6 ...", "only these areas", default=[])
@@ -68,6 +91,24 @@ def add_own_options(parser: argparse.ArgumentParser, dataset: str) -> None:
         option(parser, "--direction", text, choices=DIRECTIONS)
 
 
+def list_scenes(dataset: str, options: ConvertOptions) -> SceneList:
+    """Return the scenes in a folder; InputError if there are none. None is read from files outside of it."""
+    _, find = DATASETS[dataset]
+    found = find(options)
+    specs = (spec._replace(panoramas=_inside(options, spec)) for spec in found.specs)
+    return found._replace(specs=tuple(specs))
+
+
+def _inside(options: ConvertOptions, spec: SceneSpec) -> Iterator[PosedPanorama]:
+    """Yield the panoramas of a scene; InputError if its cloud or one of their files lies outside."""
+    for part in spec.cloud:
+        options.inside(part.path)
+    for panorama in spec.panoramas:
+        for file in panorama.files.values():
+            options.inside(file)
+        yield panorama
+
+
 def choose_scenes(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneSpec]:
     """Return the scenes of some rooms, or all."""
     counts = Counter(spec.name for spec in specs)
@@ -79,31 +120,108 @@ def choose_scenes(specs: tuple[SceneSpec, ...], rooms: list[str]) -> list[SceneS
     return [spec for spec in specs if not rooms or spec.name.split("/")[-1] in rooms]
 
 
+class Written(NamedTuple):
+    """The scene that was written, or was there already."""
+
+    folder: Path
+    num_points: int | None  # None if it was there already
+    num_queries: int
+    warnings: tuple[str, ...] = ()  # one line each, for the user
+
+
+def write_scene(spec: SceneSpec, out: Path, copies: bool, show: Progress) -> Written:
+    """Write a scene below `out`, with links to its pictures or copies, or leave it as it is if it is there.
+
+    Raises InputError if a file of the scene is damaged or missing, there is no panorama, or what is there was
+    made otherwise.
+    """
+    folder = out / spec.name
+    if (folder / QUERIES_NAME).exists():
+        scene = read_scene(folder)
+        source = json.loads((folder / QUERIES_NAME).read_text()).get("source")
+        if source != spec.source:
+            found = f"found a scene of {json.dumps(source)}, wanted {json.dumps(spec.source)}"
+            raise InputError(f"{folder}: {found}: remove it, or change `out`")
+        return Written(folder, None, len(scene.queries))
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    check_output_folder(folder)
+    panoramas = list(spec.panoramas)
+    if not panoramas:
+        raise InputError(f"{spec.cloud[0].path}: found no panorama with a pose for it")
+    with replacing_folder(folder) as unfinished:
+        num_points, warnings = _write_cloud(spec, unfinished / CLOUD_NAME, show)
+        queries = [_write_panorama(spec, panorama, unfinished, copies) for panorama in panoramas]
+        write_queries(unfinished, queries, source=spec.source)
+    return Written(folder, num_points, len(queries), tuple(warnings))
+
+
+def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list[str]]:
+    """Stream the finite points of the cloud's files into one PLY; returns how many it has, and warnings."""
+    T = spec.T_written_from_dataset
+    validator = PointValidator(spec.cloud[0].path, 1.0)  # one for all files, as an object may be small
+    warnings: list[str] = []
+    with writing_ply(path) as writer:
+        for part in spec.cloud:
+            source = open_source(part.path, IN_COLORS)
+            warnings += source.warnings
+            validator.path = part.path
+            total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
+            try:
+                for raw in show(source.read_chunks(), total, f"{spec.name}: {part.path.name}"):
+                    points, colors = validator.filter(raw)
+                    moved = points if T is None else transform_points(points, T)
+                    labels = None if part.label is None else np.full(len(points), part.label, np.int32)
+                    writer.add(vertex_rows(moved, colors, label=labels))
+            except OSError as error:
+                raise unreadable(part.path, error) from error
+        validator.check()
+    return validator.num_finite, [*warnings, *validator.warnings()]
+
+
+def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, copies: bool) -> Query:
+    for name, file in panorama.files.items():
+        if not (file.is_file() and os.access(file, os.R_OK)):
+            raise InputError(f"{file}: no such panorama, or no permission to read it")
+        target = folder / "images" / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if copies:
+            shutil.copyfile(file, target)
+        else:
+            target.symlink_to(file.resolve())
+    labels = None
+    if panorama.read_labels is not None:
+        labels = (folder / "labels" / panorama.name).with_suffix(".png")
+        labels.parent.mkdir(parents=True, exist_ok=True)
+        write_atomically(labels, encode_image(panorama.read_labels(), ".png"))  # 16 bits, one channel
+    T = spec.T_written_from_dataset
+    pose = panorama.pose if T is None else move(panorama.pose, T, 1.0)
+    return Query(folder / "images" / panorama.name, panorama.variant, pose, labels)
+
+
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Write the scenes one by one; returns the exit code."""
     check_least(arguments, check=0, seed=0)
     check_folder_name("--out", arguments.out)
     # a dataset's subparser has only some of the options
     own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
     options = ConvertOptions(**own | {"areas": frozenset(getattr(arguments, "areas", ()))})
-    found = DATASETS[arguments.dataset].list_scenes(options)
+    found = list_scenes(arguments.dataset, options)
     specs = choose_scenes(found.specs, arguments.rooms)
     for note in found.notes:
         print_note(arguments, note)
-    show = progress_bar(arguments.quiet)
+    workers = workers_from(arguments)
     # bad input goes before a bad fit
-    return max((convert_scene(spec, arguments, show) for spec in specs), default=0)
+    return max((convert_scene(spec, arguments, workers) for spec in specs), default=0)
 
 
-def convert_scene(spec: SceneSpec, arguments: argparse.Namespace, show: Progress) -> int:
+def convert_scene(spec: SceneSpec, arguments: Namespace, workers: Workers) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
-        written = write_scene(spec, arguments.out, arguments.copy, show)
+        written = write_scene(spec, arguments.out, arguments.copy, workers.show)
         check = None
         if arguments.check:
-            scene = read_scene(written.folder, spec.name)
-            check = check_scene(scene, arguments.check, Workers(num_cores(), show), show)
+            check = check_scene(read_scene(written.folder, spec.name), arguments.check, workers)
     except InputError as error:
         return print_error(arguments, f"{spec.name}: {error}", EXIT_BAD_INPUT)
     for warning in written.warnings:

@@ -62,10 +62,7 @@ def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
 
 
 def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
-    """Return the labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B into a table.
-
-    0 beyond.
-    """
+    """Return labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B of a table; 0 beyond."""
     rgb = read_picture(path).rgb.astype(np.uint32)
     index = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]
     return np.asarray(np.append(table, np.uint16(0))[np.minimum(index, len(table))], dtype=np.uint16)

@@ -10,9 +10,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from piccolo import InputError, Pose
 from piccolo.arrays import Array
-from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
 
 Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
 
@@ -95,10 +94,7 @@ class SceneList(NamedTuple):
 
 
 def scene_list(folder: Path, specs: Sequence[SceneSpec], missing: Sequence[str], layout: str) -> SceneList:
-    """Return the scenes found in a folder, and a note on those that miss a cloud.
-
-    InputError if none is found.
-    """
+    """Return the scenes found in a folder, InputError if none; and a note on those that miss a cloud."""
     if not specs:
         raise InputError(f"{folder}: found no {layout}, wanted the layout in docs/DATASETS.md")
     notes = (f"{len(missing)} scenes without a cloud: {', '.join(missing)}",) if missing else ()

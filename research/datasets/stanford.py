@@ -101,10 +101,7 @@ def _glob(folder: Path, patterns: Iterable[str]) -> list[Path]:
 
 
 def _cloud_of(folder: Path, area: str, room: str, has_labels: bool) -> tuple[CloudPart, ...]:
-    """Return the room's points, one `x y z r g b` a line.
-
-    With labels the same, an object a file named by class.
-    """
+    """Return the room's points, one `x y z r g b` a line; with labels, an object a file named by class."""
     found = _glob(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
     if found and not usable:

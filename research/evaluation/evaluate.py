@@ -1,52 +1,44 @@
 """Localize the panoramas of scenes with true poses, and measure the errors of the poses."""
 
-import argparse
 import json
 import signal
-from collections.abc import Sequence
+from argparse import ArgumentParser, Namespace
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import options
-from piccolo.cli.command import check_least, command, option
-from piccolo.cli.errors import (
-    EXIT_BAD_INPUT,
-    Terminated,
+from piccolo.cli import execution, options
+from piccolo.cli.checks import (
     UsageError,
+    check_distinct,
+    check_least,
+    check_outputs,
+    check_suffix,
     checking_options,
-    print_error,
-    print_note,
 )
-from piccolo.cli.executing import (
-    Interruption,
-    check_execution,
-    connecting,
-    count_jobs,
-    executing,
-    interruptible,
-)
-from piccolo.cli.outputs import check_distinct, check_outputs, check_suffix, print_report
-from piccolo.cli.progress import progress_bar
+from piccolo.cli.command import Terminated, command, option
+from piccolo.cli.execution import Interruption
+from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, print_report, progress_bar
 from piccolo.errors import InputError
 from piccolo.files.atomic import check_output, is_stream, write_atomically
-from piccolo.files.line_file import LineFile, open_locked
+from piccolo.files.line_file import open_locked
 from piccolo.jobs.cluster import Cluster
 from piccolo.jobs.memory import limit_memory
 from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan, settings_json
-from piccolo.result import UNREADABLE, Result, check_scan, describe_failure, read_results
+from piccolo.result import UNREADABLE, check_scan, describe_failure, read_results
 from piccolo.scan_map.open_map import scan_sha256_of
 from piccolo.scene import Query, Scene, find_scenes, input_files
 
 from . import query_result, tables
 from .plots import errors_figure, figure_png, risk_figure
 from .query_result import QueryResult, Thresholds
-from .walks import alone_table, group_walks, walk_table
 
 EPILOG = """\
 examples:
@@ -67,7 +59,7 @@ and the exit code is 3.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     group = parser.add_argument_group("input and output")
     option(group, "--scenes FOLDER ...", "scenes with true poses")
@@ -91,7 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options.add_execution_options(parser, default_jobs=1)
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
+def check_usage(arguments: Namespace) -> None:
     """Refuse options that do not go together, and values that are wrong whatever the files hold."""
     if (arguments.scenes is None) == (arguments.compare is None):
         raise UsageError("--scenes: needed with --out and --results, not with --compare")
@@ -100,7 +92,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
     check_least(arguments, jobs=1, threads=1)
-    check_execution(arguments)
+    execution.check_execution(arguments)
     for option_ in ("errors", "risk"):
         check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
     if arguments.out and is_stream(arguments.out):
@@ -117,23 +109,23 @@ def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: 
         found.append(tables.summary_table(inside, thresholds, title))
     found.append(tables.threshold_table(rows, thresholds))
     found.append(tables.risk_table(tables.risk_and_coverage(rows, thresholds)))
-    if walks := group_walks(scenes, rows):
-        found += [walk_table(walks, thresholds), alone_table(walks, thresholds)]
+    if walks := tables.group_walks(scenes, rows):
+        found += [tables.walk_table(walks, thresholds), tables.alone_table(walks, thresholds)]
     return "\n".join(table.markdown() for table in found)
 
 
 def write_report(
-    arguments: argparse.Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
+    arguments: Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
 ) -> None:
     """Print the tables of one run or two, and write them and the plot of their errors if asked for."""
     if arguments.markdown:
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
         write_atomically(arguments.errors, figure_png(errors_figure(runs, thresholds)))
-    print_report(arguments, outputs_of(arguments), text, end="")
+    print_report(arguments, outputs_of(arguments), text)
 
 
-def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
+def compare(arguments: Namespace, thresholds: Thresholds) -> int:
     """Print two runs side by side."""
     runs = [query_result.read_run(path)[0] for path in arguments.compare]
     if arguments.variants:
@@ -151,12 +143,12 @@ def compare(arguments: argparse.Namespace, thresholds: Thresholds) -> int:
     return 0
 
 
-def outputs_of(arguments: argparse.Namespace) -> dict[str, Path | None]:
+def outputs_of(arguments: Namespace) -> dict[str, Path | None]:
     """Return the files beside a run, by option."""
     return {f"--{name}": getattr(arguments, name) for name in ("csv", "markdown", "errors", "risk")}
 
 
-def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
+def check_files(arguments: Namespace, inputs: list[Path]) -> None:
     """Refuse outputs that would replace an input, a run or each other."""
     given = arguments.results, arguments.mask, arguments.camera, arguments.rig
     more = filter(None, (*given, *(arguments.compare or ())))
@@ -164,7 +156,7 @@ def check_files(arguments: argparse.Namespace, inputs: list[Path]) -> None:
     check_outputs(outputs_of(arguments))
 
 
-def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: argparse.Namespace) -> None:
+def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: Namespace) -> None:
     """Refuse results of other content than the scenes' clouds have, or with --force say so."""
     for scene in scenes:
         results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
@@ -175,11 +167,7 @@ def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments
 
 
 def run_scenes(
-    arguments: argparse.Namespace,
-    path: Path,
-    config: Localizer,
-    scenes: Sequence[Scene],
-    variants: Sequence[str],
+    arguments: Namespace, path: Path, config: Localizer, scenes: Sequence[Scene], variants: Sequence[str]
 ) -> tuple[list[QueryResult], int]:
     """Localize the queries that a run does not have yet; `config` is for any scan, no variants are all.
 
@@ -188,98 +176,93 @@ def run_scenes(
     """
     query_result.check_variants(scenes, variants)
     check_output(path)
+    # of all rows, without the cameras of queries.json
     settings = settings_json(config.settings, config.cloud_settings, config.photo)
-    with open_locked(path) as file, ExitStack() as stack:
+    with open_locked(path) as file:
         rows, size = query_result.read_run(path)
+
+        def keep(row: QueryResult) -> None:
+            line = replace(row, result=replace(row.result, settings=settings)).to_json()
+            file.append(line)
+            rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
+
         query_result.check_run(path, rows, scenes, {"settings": json.loads(json.dumps(settings))})
         pairs = [(scene, query) for scene in scenes for query in scene.queries]
         keys = {(s.name, s.name_of(q)) for s, q in pairs if not variants or q.variant in variants}
         open_keys = keys - {row.key for row in rows}
         found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
-        left = [(scene, queries) for scene, queries in found if queries]
-        evaluation = Evaluation(arguments, config, settings, file, rows)
-        if left:
+        if left := [(scene, queries) for scene, queries in found if queries]:
             file.cut(size)
-            num_jobs = count_jobs(arguments, max(len(queries) for _, queries in left))
-            cluster = stack.enter_context(connecting(arguments, num_jobs))
-            with interruptible() as interruption:
+            num_jobs = execution.count_jobs(arguments, max(len(queries) for _, queries in left))
+            with (
+                execution.connecting(arguments, num_jobs) as cluster,
+                execution.interruptible() as interruption,
+            ):
                 for scene, queries in left:
                     if not interruption.number:
-                        evaluation.localize(scene, queries, cluster, interruption)
+                        localize_queries(arguments, config, scene, queries, cluster, interruption, keep)
             if interruption.number:
                 raise Terminated if interruption.number == signal.SIGTERM else KeyboardInterrupt
-    return [row for row in evaluation.rows if row.key in keys], evaluation.num_failed
+    own = [row for row in rows if row.key in keys]
+    return own, len(keys) - len(own)
 
 
-@dataclass
-class Evaluation:
-    """A run over scenes that is being written."""
+def select_labelled(arguments: Namespace, scene: Scene, queries: Sequence[Query]) -> list[Query]:
+    """Return the queries that have labels; say which have none."""
+    for query in queries:
+        if query.labels is None:
+            text = f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json"
+            print_error(arguments, text, EXIT_BAD_INPUT)
+    return [query for query in queries if query.labels]
 
-    arguments: argparse.Namespace
-    config: Localizer  # of any scan
-    settings: dict[str, object]  # of all rows, without the cameras of queries.json
-    file: LineFile
-    rows: list[QueryResult]
-    num_failed: int = 0
 
-    def localize(
-        self, scene: Scene, queries: Sequence[Query], cluster: Cluster | None, interruption: Interruption
-    ) -> None:
-        """Localize queries of a scene, and append their lines."""
-        show = progress_bar(self.arguments.quiet)
-        are_inside: list[bool] = []  # the cloud's box
+def localize_queries(
+    arguments: Namespace,
+    config: Localizer,
+    scene: Scene,
+    queries: Sequence[Query],
+    cluster: Cluster | None,
+    interruption: Interruption,
+    keep: Callable[[QueryResult], None],
+) -> None:
+    """Localize queries of a scene until a signal; keep each result as it comes, or say why there is none."""
+    show = progress_bar(arguments.quiet)
+    are_inside: list[bool] = []  # the cloud's box
 
-        def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
-            scan = localizer.open_scan(Workers(num_threads, show))
-            are_inside.extend(query_result.is_in_box(scan, query.pose) for query in queries)
-            return scan
+    def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
+        scan = localizer.open_scan(Workers(num_threads, show))
+        are_inside.extend(query_result.is_in_box(scan, query.pose) for query in queries)
+        return scan
 
-        if cluster:
-            cluster.forget()  # a worker may not have room for the last scene's map and this one's
-        localizer = replace(self.config, paths=(scene.cloud,))
-        if has_labels := localizer.cloud_settings.labels is not None:
-            queries = self.select_labelled(scene, queries)
-        num_jobs = count_jobs(self.arguments, len(queries))
-        with ExitStack() as stack:
-            place = executing(self.arguments, localizer, num_jobs, cluster, open_scan)
-            try:
-                executor, localizer = stack.enter_context(place)
-            except Exception as error:
-                self.report(f"{scene.name}: {describe_failure(error).text}", len(queries))
-                return
-            pictures = (query.labels if has_labels and query.labels else query.image for query in queries)
-            tasks = (localizer.task(p, q.calibration) for p, q in zip(pictures, queries, strict=True))
-            values = executor.values(tasks)
-            pairs = interruption.each(show(iter(values), len(queries), scene.name), values.take_finished())
-            for query, is_inside, (task, wait) in zip(queries, are_inside, pairs, strict=False):
-                self.record(scene, query, localizer.wait_for(task, wait, None).result, is_inside)
-
-    def select_labelled(self, scene: Scene, queries: Sequence[Query]) -> list[Query]:
-        """Return the queries that have labels; the others are reported."""
-        for query in queries:
-            if query.labels is None:
-                self.report(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
-        return [query for query in queries if query.labels]
-
-    def record(self, scene: Scene, query: Query, result: Result, is_inside: bool) -> None:
-        """Append the line of a query, or say why it has none."""
-        if result.error is not None and (result.status != UNREADABLE or query.is_answerable):
-            self.report(result.error)
+    if cluster:
+        cluster.forget()  # a worker may not have room for the last scene's map and this one's
+    localizer = replace(config, paths=(scene.cloud,))
+    if has_labels := localizer.cloud_settings.labels is not None:
+        queries = select_labelled(arguments, scene, queries)
+    with ExitStack() as stack:
+        num_jobs = execution.count_jobs(arguments, len(queries))
+        place = execution.executing(arguments, localizer, num_jobs, cluster, open_scan)
+        try:
+            executor, localizer = stack.enter_context(place)
+        except Exception as error:
+            print_error(arguments, f"{scene.name}: {describe_failure(error)}", EXIT_BAD_INPUT)
             return
-        result = replace(result, settings=self.settings)
-        row = query_result.make_query_result(scene, query, result, None if result.error else is_inside)
-        line = row.to_json()
-        self.file.append(line)
-        self.rows.append(QueryResult.from_json(line))  # as whoever reads the file has it
+        tasks = (localizer.task((has_labels and q.labels) or q.image, q.calibration) for q in queries)
 
-    def report(self, text: str, num_queries: int = 1) -> None:
-        """Say why queries could not be localized."""
-        print_error(self.arguments, text, EXIT_BAD_INPUT)
-        self.num_failed += num_queries
+        def shown(values: Iterable[Any]) -> Iterator[Any]:
+            return show(iter(values), len(queries), scene.name)
+
+        answers = execution.answer_all(executor, localizer, tasks, shown, interruption)
+        for query, is_inside, (result, *_) in zip(queries, are_inside, answers, strict=False):
+            if result.error is None or (result.status == UNREADABLE and not query.is_answerable):
+                in_box = None if result.error else is_inside
+                keep(query_result.make_query_result(scene, query, result, in_box))
+            else:
+                print_error(arguments, result.error, EXIT_BAD_INPUT)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Run or read the results, print the tables; returns the exit code."""
     check_usage(arguments)
     with checking_options():

@@ -149,7 +149,6 @@ def match_results(
 
     The image is found by its path, or else by its file name if only one query has that. A frame of a video,
     FOLDER/WALK.mp4#t=SECONDS, is the query of the walk of that name and time.
-
     A result of no query, or of a name that several have, goes to `tell` and is left out. Raises
     InputError for a second result of a query.
     """

@@ -7,28 +7,25 @@ Kim et al. (ICCV 2021) show such a surface to argue that their loss has a deep, 
 with L over the points that a camera at (x, y, z) sees, and the same rotations at each place.
 """
 
-import argparse
-import json
 import math
 import time
+from argparse import ArgumentParser, Namespace
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import minimum_filter
 
+from piccolo import InputError, Pose
 from piccolo.arrays import Array, Int64s, Mask
-from piccolo.cli.command import command, option, print_warnings
-from piccolo.cli.errors import checking_options
+from piccolo.cli.checks import check_outputs, check_suffix, checking_options
+from piccolo.cli.command import command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
-from piccolo.cli.outputs import check_outputs, check_suffix, print_report
-from piccolo.cli.progress import progress_bar
+from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
-from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
-from piccolo.jobs.threads import Workers, num_cores
+from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.optional import new_figure
 from piccolo.panorama import read_panorama
@@ -114,16 +111,11 @@ def loss_surface(
     return LossSurface(loss=loss, height=height, rotation=rotation, is_free=is_free)
 
 
-def plan_shift(cloud: LocalCloud) -> Array:
-    """Return the offset (3,) [m] from the frame of the points to the plan's, which has the world's origin."""
-    return np.asarray(cloud.R_local_from_world @ cloud.origin_world)
-
-
 def surface_png(
     surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
 ) -> bytes:
     """Draw the surface over the plan, with the known poses marked, and return the PNG."""
-    shift = plan_shift(cloud)
+    shift = cloud.R_local_from_world @ cloud.origin_world  # (3,) [m] to the plan, with the world's origin
     x = grid.x + shift[0]
     y = grid.y + shift[1]
     aspect = (y[-1] - y[0] + 1.0) / (x[-1] - x[0] + 1.0)
@@ -175,7 +167,7 @@ NUM_ROTATIONS = 1000  # of SO(3)
 HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     option(parser, "--pano FILE", "the panorama", required=True)
@@ -187,7 +179,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--gravity", text, choices=["known", "unknown"], default="known")
 
 
-def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownPoses:
+def read_known_poses(arguments: Namespace, cloud: LocalCloud) -> KnownPoses:
     """Return the pose found and the true one of the panorama, as far as files are given."""
     name = arguments.pano.name
     known: KnownPoses = {}
@@ -204,7 +196,7 @@ def read_known_poses(arguments: argparse.Namespace, cloud: LocalCloud) -> KnownP
     return known
 
 
-def grid_from(arguments: argparse.Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
+def grid_from(arguments: Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
     """Return the poses to try over all of the cloud, in the frame of the points."""
     points = cloud.points
     ends = [np.percentile(c, [0.5, 99.5]) for c in (points.x, points.y)]
@@ -245,7 +237,7 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Read, compute, write."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
@@ -257,7 +249,7 @@ def main(arguments: argparse.Namespace) -> int:
     check_outputs(outputs, filter(None, inputs))
     new_figure()  # now: where matplotlib is missing, the work would be lost
 
-    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    workers = workers_from(arguments)
     panorama = shrink(read_panorama(arguments.pano), WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     cloud = open_points(arguments.cloud, cloud_settings, workers)
@@ -272,5 +264,5 @@ def main(arguments: argparse.Namespace) -> int:
     write_atomically(arguments.out, surface_png(surface, grid, cloud, known, arguments.pano.name))
     report = {"out": str(arguments.out)} | summary(surface, grid, cloud, known)
     report |= {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
-    print_report(arguments, outputs, json.dumps(report))
+    print_report(arguments, outputs, report)
     return 0

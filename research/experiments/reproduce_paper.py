@@ -4,8 +4,8 @@ The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an
 2021): they say what to expect of a trend, and compare in full only on the same data.
 """
 
-import argparse
 import tempfile
+from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,26 +16,23 @@ from zlib import crc32
 import cv2
 import numpy as np
 
+from piccolo import CoarseToFineSettings, InputError, PaperSettings, Photo
 from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
-from piccolo.cli.command import check_least, command, option
-from piccolo.cli.errors import EXIT_BAD_INPUT, checking_options, print_error
-from piccolo.cli.executing import check_execution
+from piccolo.cli.checks import check_distinct, check_folder_name, check_least, checking_options
+from piccolo.cli.command import command, option
+from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
-from piccolo.cli.outputs import check_distinct, check_folder_name
+from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
 from piccolo.cloud import read_cloud
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.writers import vertex_rows, write_ply
-from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
 from piccolo.geometry.pose import Pose, move, transform_points
 from piccolo.geometry.rotations import random_rotation
 from piccolo.jobs.memory import limit_memory
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
-from piccolo.paper.settings import PaperSettings
-from piccolo.photo import Photo
 from piccolo.scan_map.open_map import CachePolicy
 from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
@@ -258,7 +255,7 @@ A repeated command resumes a stopped experiment. Modified clouds and images are 
 PRESETS: dict[str, Settings] = {"paper": PaperSettings(), "default": CoarseToFineSettings(gravity="known")}
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     names = list(EXPERIMENTS)
     parser.add_argument("names", nargs="+", choices=names, metavar="NAME", help="experiments, see below")
@@ -277,7 +274,7 @@ def file_name(condition: Condition) -> str:
 
 
 def run_condition(
-    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: argparse.Namespace
+    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: Namespace
 ) -> tuple[list[QueryResult], int]:
     """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
@@ -302,7 +299,7 @@ def run_condition(
 
 
 def run_experiment(
-    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: argparse.Namespace
+    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: Namespace
 ) -> int:
     """All conditions of an experiment and its table; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
@@ -332,7 +329,7 @@ def run_experiment(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Run the experiments one by one; returns the exit code."""
     check_least(arguments, jobs=1, threads=1)
     check_folder_name("--out", arguments.out)

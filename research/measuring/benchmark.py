@@ -1,6 +1,6 @@
 """Measure the method, write BENCHMARK.md, and fit the confidence."""
 
-import argparse
+from argparse import ArgumentParser, Namespace
 
 from piccolo.cli.command import HelpFormatter, add_run_options, command
 
@@ -19,7 +19,7 @@ MEASUREMENTS = {
 }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add a subcommand for each measurement."""
     subparsers = parser.add_subparsers(dest="measurement", required=True)
     for name, module in MEASUREMENTS.items():
@@ -30,6 +30,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 confidence found a false answer")
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Run the measurement asked for; returns the exit code."""
     return int(MEASUREMENTS[arguments.measurement].run(arguments))

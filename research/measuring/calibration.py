@@ -1,7 +1,7 @@
 """Fit the confidence to trials, and check it and the covariances on others."""
 
-import argparse
 import json
+from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -12,20 +12,8 @@ from scipy.stats import chi2
 
 from piccolo.arrays import Array
 from piccolo.cli.command import option
-from piccolo.confidence.confidence import (
-    AMBIGUOUS,
-    FEATURES,
-    LOCALIZED,
-    MIN_CONFIDENCE,
-    NONE_FEATURES,
-    ChoiceModel,
-    EvidenceKind,
-    Standing,
-    classify,
-    none_features,
-    pose_features,
-    posterior,
-)
+from piccolo.confidence import confidence
+from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED, ChoiceModel, EvidenceKind, Standing
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.pose import is_correct
@@ -73,7 +61,7 @@ class Outcome(NamedTuple):
         """Return the probability of each pose, and of none (K + 1,); by default with the model in use."""
         if self.is_refused:
             return np.append(np.zeros(len(self.standings)), 1.0)
-        return posterior(self.standings, self.std, self.std_of_fit, model)
+        return confidence.posterior(self.standings, self.std, self.std_of_fit, model)
 
 
 def read_outcome(line: str) -> Outcome | None:
@@ -97,8 +85,10 @@ def read_outcome(line: str) -> Outcome | None:
 
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
     """Return the weights of the greatest penalised likelihood."""
-    poses = [np.array([pose_features(s) for s in o.standings]) for o in outcomes]
-    nones = np.array([none_features(o.std if o.std_of_fit is None else o.std_of_fit) for o in outcomes])
+    poses = [np.array([confidence.pose_features(s) for s in o.standings]) for o in outcomes]
+    nones = np.array(
+        [confidence.none_features(o.std if o.std_of_fit is None else o.std_of_fit) for o in outcomes]
+    )
     deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
 
     def loss(w: Array) -> tuple[float, Array]:
@@ -152,14 +142,14 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
     print(Table("", columns, tuple(rows)).markdown())
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--fit FILE ...", "trials to which the weights are fitted", default=[])
     option(parser, "--check FILE ...", "other trials, on which they are checked", default=[])
     option(parser, "--without CASE ...", "leave these cases out", default=[])
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Fit the weights, print the tables."""
 
     def read(paths: Sequence[Path]) -> list[Outcome]:
@@ -173,14 +163,17 @@ def run(arguments: argparse.Namespace) -> int:
     for kind in sorted({o.evidence for o in learnt}):
         models[kind] = model = fit([o for o in learnt if o.evidence == kind])
         print(f"{kind}:")
-        for names, weights in ((FEATURES, model.weights), (NONE_FEATURES, model.none_weights)):
+        for names, weights in (
+            (confidence.FEATURES, model.weights),
+            (confidence.NONE_FEATURES, model.none_weights),
+        ):
             print(", ".join(f"{name} {w:.2f}" for name, w in zip(names, weights, strict=False)))
     for name, outcomes in sets.items():
         if not outcomes:
             continue
         stated = [o.probabilities(models.get(o.evidence)) for o in outcomes]
         right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
-        called = [classify(p, MIN_CONFIDENCE) for p in stated]
+        called = [confidence.classify(p, confidence.MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
         print_cases(f"case, {name}", rows)
         all_stated = np.concatenate(stated).tolist()

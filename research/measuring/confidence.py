@@ -1,29 +1,28 @@
 """Measure the status on seeded queries with and without an answer: how often each is called localized."""
 
-import argparse
 import json
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from itertools import chain
 
 import numpy as np
 
+from piccolo import CoarseToFineSettings, Photo
 from piccolo.cli.command import option
-from piccolo.cli.errors import print_note
+from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import is_correct
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
-from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scan_map.scan_map import ScanMap, prepare_map
 from piccolo.scene import Scene, document_of_pose, read_scene
 
+from ..synthetic.layout import PLAIN
 from ..synthetic.photos import change_sensor, cut_photo, occlude
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
-from ..synthetic.room import PLAIN
 from ..synthetic.world import VARIANTS, World, make_query, make_world, scan_world
 from .calibration import Case, print_cases
 from .trials import Points, Trial, damage_trial, make_sceneless, thin_points, turn_over
@@ -129,7 +128,7 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
     yield (cloud.points + cloud.origin_world, cloud.colors), trials
 
 
-def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
+def all_trials(arguments: Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
@@ -142,6 +141,13 @@ def all_trials(arguments: argparse.Namespace, workers: Workers) -> Iterator[tupl
         of_scene = photo_trials(scene, others, number) if number else scene_trials(scene, others)
         for points, trials in of_scene:
             yield scene.name, points, trials
+
+
+def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers) -> Localization:
+    """Localize the photo of a trial."""
+    settings = CoarseToFineSettings(gravity=trial.gravity)
+    photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
+    return localize(scan_map, photo, settings, workers, Stopwatch())
 
 
 def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
@@ -162,7 +168,7 @@ def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, objec
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", required=True)
     text = "kinds of places that look alike"
@@ -174,7 +180,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--threads N", "number of threads", default=num_cores())
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Localize every trial, write its line, print the table."""
     workers = Workers(arguments.threads)
     rows: list[Case] = []
@@ -183,9 +189,7 @@ def run(arguments: argparse.Namespace) -> int:
             cloud = stream_of_arrays(points.astype(np.float64), None if arguments.ignore_colors else colors)
             scan_map = prepare_map(cloud, workers, has_features=False)
             for trial in trials:
-                settings = CoarseToFineSettings(gravity=trial.gravity)
-                photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
-                found = localize(scan_map, photo, settings, workers, Stopwatch())
+                found = localize_trial(scan_map, trial, workers)
                 truth = trial.true_pose
                 ok = truth is not None and is_correct(found.pose, truth)
                 rows.append((trial.case, found.status, ok))

@@ -1,10 +1,10 @@
 """Measure accuracy, damage, phone photos, time and memory, and write them as one page of Markdown."""
 
-import argparse
 import datetime
 import platform
 import subprocess
 import tempfile
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -15,26 +15,23 @@ import numpy as np
 from scipy.stats import chi2
 
 import piccolo
+from piccolo import InputError, PaperSettings, Pose, Result
 from piccolo.arrays import Bytes
-from piccolo.cli.command import check_least, option
-from piccolo.cli.errors import print_note
+from piccolo.cli.checks import check_least
+from piccolo.cli.command import option
+from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
-from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import subtract
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.panorama import read_panorama
-from piccolo.paper.settings import PaperSettings
-from piccolo.result import Result
 from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
 from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
-from .kernels import kernel_table
-from .scaling import clean_queries, size_table
+from .speed import clean_queries, kernel_table, size_table
 from .trials import DAMAGED_SCANS, Points, Trial, damage_trial
 
 EPILOG = """\
@@ -129,7 +126,7 @@ def camera_path(scene: Scene, query: Query) -> Path:
 class Bench:
     """Measurements of one run of the command."""
 
-    def __init__(self, arguments: argparse.Namespace) -> None:
+    def __init__(self, arguments: Namespace) -> None:
         self.arguments = arguments
         scenes = [read_scene(folder) for folder in arguments.scenes]
         if empty := [scene for scene in scenes if not scene.queries]:
@@ -287,7 +284,7 @@ def processor_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def page_head(arguments: argparse.Namespace) -> str:
+def page_head(arguments: Namespace) -> str:
     """Return title, date, commit, options, versions and machine."""
     words = ["all", "--scenes", *(folder.resolve().name for folder in arguments.scenes)]
     for name in ("only", "damaged", "photos", "points", "rooms"):
@@ -305,7 +302,7 @@ def page_head(arguments: argparse.Namespace) -> str:
     )
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--scenes FOLDER ...", "scenes with true poses", required=True)
     option(parser, "--only PART ...", "measure only these parts", choices=PARTS, default=list(PARTS))
@@ -319,7 +316,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--out FILE", "write the page here (default: print it)")
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Measure, and write the page."""
     check_least(arguments, damaged=0, photos=0)
     head = page_head(arguments)

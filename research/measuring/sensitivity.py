@@ -1,9 +1,9 @@
 """Move the constants that decide by a fifth, one at a time, and measure what changes."""
 
-import argparse
 import importlib
 import math
 import sys
+from argparse import ArgumentParser, Namespace
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -13,21 +13,17 @@ from typing import NamedTuple
 import numpy as np
 
 from piccolo.cli.command import option
-from piccolo.cli.errors import print_note
+from piccolo.cli.terminal import print_note
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import is_correct
-from piccolo.jobs.threads import Stopwatch, Workers, num_cores
-from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.panorama import read_panorama
-from piccolo.photo import Photo
+from piccolo.jobs.threads import Workers, num_cores
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 from piccolo.scene import read_scene
 
 from ..evaluation.tables import table_of
-from .confidence import photo_trials, room_trials, scene_trials
+from .confidence import localize_trial, photo_trials, room_trials, scene_trials
 from .trials import Trial
 
 EPILOG = """\
@@ -107,7 +103,7 @@ def moved(module: str, name: str, factor: float) -> Iterator[None]:
             names[name] = value
 
 
-def list_places(arguments: argparse.Namespace, workers: Workers) -> Iterator[Place]:
+def list_places(arguments: Namespace, workers: Workers) -> Iterator[Place]:
     """Yield each scene and each seed's made rooms, prepared, with the first of their trials."""
     scenes = [read_scene(folder) for folder in arguments.scenes]
     of_scenes = []
@@ -128,9 +124,7 @@ def measure(places: Sequence[Place], workers: Workers) -> Measured:
     measured = Measured([], [])
     for scan_map, trials in places:
         for trial in trials:
-            settings = CoarseToFineSettings(gravity=trial.gravity)
-            photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
-            found = localize(scan_map, photo, settings, workers, Stopwatch())
+            found = localize_trial(scan_map, trial, workers)
             measured.found.append(found)
             truth = trial.true_pose
             if truth and found.pose and is_correct(found.pose, truth):
@@ -157,7 +151,7 @@ def row_of(name: str, measured: Measured, before: Measured) -> dict[str, str]:
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """Add all options."""
     option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
     option(parser, "--seeds FIRST END", "seeds of synthetic rooms, END excluded", default=[0, 0])
@@ -165,7 +159,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(parser, "--threads N", "number of threads", default=num_cores())
 
 
-def run(arguments: argparse.Namespace) -> int:
+def run(arguments: Namespace) -> int:
     """Measure with every constant as it is, then with each of them moved; print the table."""
     workers = Workers(arguments.threads)
     places = list(list_places(arguments, workers))

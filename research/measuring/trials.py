@@ -11,16 +11,7 @@ from piccolo.arrays import Bytes, Floats, Mask
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import Gravity
 
-from ..synthetic.photos import (
-    UPSIDE_DOWN,
-    blur,
-    compress,
-    draw_fractal_noise,
-    light_unevenly,
-    mask_outside_field,
-    occlude,
-    take_at_night,
-)
+from ..synthetic import photos
 
 POINT_NOISE = 0.05  # [m]
 JPEG_QUALITY = 10
@@ -48,16 +39,16 @@ def damage_trial(trial: Trial, other: Bytes, rng: np.random.Generator) -> Iterat
         return trial._replace(case=case, rgb=np.asarray(rgb, np.uint8))
 
     for fraction in (0.2, 0.4, 0.6):
-        yield change(f"{fraction:.0%} hidden by objects", occlude(rgb, other, fraction, rng))
-    lit = light_unevenly(rgb, 2.0, rng)
-    yield change("uneven light (2 stops), 30% hidden", occlude(lit, other, 0.3, rng))
-    yield change("night", take_at_night(rgb, rng))
-    noisy = compress(rgb + rng.normal(0.0, 15.0, rgb.shape), JPEG_QUALITY)
+        yield change(f"{fraction:.0%} hidden by objects", photos.occlude(rgb, other, fraction, rng))
+    lit = photos.light_unevenly(rgb, 2.0, rng)
+    yield change("uneven light (2 stops), 30% hidden", photos.occlude(lit, other, 0.3, rng))
+    yield change("night", photos.take_at_night(rgb, rng))
+    noisy = photos.compress(rgb + rng.normal(0.0, 15.0, rgb.shape), JPEG_QUALITY)
     yield change(f"noise and JPEG quality {JPEG_QUALITY}", noisy)
-    yield change("blurred by 1 deg (one sigma)", blur(rgb, width / 360.0))
+    yield change("blurred by 1 deg (one sigma)", photos.blur(rgb, width / 360.0))
     yield change("256 x 128 pixels", cv2.resize(rgb, (256, 128), interpolation=cv2.INTER_AREA))
     for fov_deg in FOVS_DEG:
-        is_outside = mask_outside_field(width, fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
+        is_outside = photos.mask_outside_field(width, fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
         yield trial._replace(case=f"masked outside of {fov_deg:g} deg", is_masked=is_outside)
     is_behind = np.broadcast_to(np.abs(np.arange(width) - width // 2) >= width // 4, (height, width))
     yield trial._replace(case="half of the sphere masked", is_masked=is_behind)
@@ -70,15 +61,15 @@ def make_sceneless(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
     yield Trial("black", np.zeros_like(rgb), None)
     yield Trial("white", np.full_like(rgb, 255), None)
     yield Trial("noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8), None)
-    yield Trial("cloudy", draw_fractal_noise(rgb.shape, rng), None)
-    yield Trial("blurred", blur(rgb, 0.02 * rgb.shape[1]).astype(np.uint8), trial.true_pose)
+    yield Trial("cloudy", photos.draw_fractal_noise(rgb.shape, rng), None)
+    yield Trial("blurred", photos.blur(rgb, 0.02 * rgb.shape[1]).astype(np.uint8), trial.true_pose)
 
 
 def turn_over(trial: Trial) -> Trial:
     """Turn the camera over, and search for it as if it were upright."""
     pose = trial.true_pose
     if pose is not None:
-        pose = Pose(UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
+        pose = Pose(photos.UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
     return Trial("upside down", np.ascontiguousarray(trial.rgb[::-1, ::-1]), pose, "known")
 
 

@@ -1,8 +1,8 @@
 """Make a synthetic furnished room from a seed: a coloured scan, and panoramas with true poses."""
 
-import argparse
 import itertools
 import json
+from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -11,14 +11,13 @@ import numpy as np
 from piccolo import scene as scenes
 from piccolo.camera import Calibration
 from piccolo.camera.calibration import read_cameras
-from piccolo.cli.command import check_least, check_only_with, command, option
-from piccolo.cli.errors import UsageError, checking_options
-from piccolo.cli.outputs import check_folder_name
-from piccolo.cli.progress import progress_bar
+from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
+from piccolo.cli.command import command, option
+from piccolo.cli.terminal import workers_from
 from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.export.formats import tum_lines, write_lines
 from piccolo.files.atomic import write_atomically
-from piccolo.jobs.threads import Workers, num_cores
+from piccolo.jobs.threads import Workers
 from piccolo.optional import import_optional
 from piccolo.panorama.video import writing_video
 from piccolo.views.pictures import encode_image
@@ -56,7 +55,7 @@ mirrored or taken elsewhere, each kind a variant, with "answerable": false: they
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     option(parser, "--out FOLDER", "folder of the scene; created if missing", required=True)
     option(parser, "--seed N", "seed; equal seeds give equal files", default=0)
@@ -88,12 +87,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--video", "also write FOLDER/VARIANT_walk_K.mp4")
 
 
-def is_building(arguments: argparse.Namespace) -> bool:
+def is_building(arguments: Namespace) -> bool:
     """Return True if the rooms are to be joined."""
     return bool(arguments.storeys or arguments.walk)
 
 
-def check_usage(arguments: argparse.Namespace) -> None:
+def check_usage(arguments: Namespace) -> None:
     """Refuse options that do not go together."""
     check_least(arguments, panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
     if arguments.twins and not is_building(arguments):
@@ -103,7 +102,7 @@ def check_usage(arguments: argparse.Namespace) -> None:
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
     if not arguments.walk:
-        check_only_with(arguments, "--walk", [name for name in OF_WALKS if getattr(arguments, name)])
+        refuse_given(arguments, [name for name in OF_WALKS if getattr(arguments, name)], "only with --walk")
     if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
     if arguments.walk and (arguments.labels or arguments.camera):
@@ -112,14 +111,14 @@ def check_usage(arguments: argparse.Namespace) -> None:
         walk_options(arguments, variant)  # refuses what can't be made
 
 
-def walk_options(arguments: argparse.Namespace, variant: str) -> WalkOptions:
+def walk_options(arguments: Namespace, variant: str) -> WalkOptions:
     """Return the options of walks of a variant."""
     a = arguments
     return WalkOptions(a.frame_rate, variant, a.people, a.blur, a.bad_frames, a.width)
 
 
 def write_photos(
-    arguments: argparse.Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
+    arguments: Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> list[scenes.Query]:
     """Write single photos, of each variant as many; those of a rig are a folder."""
     queries = []
@@ -144,9 +143,7 @@ def write_photos(
     return queries
 
 
-def write_walks(
-    arguments: argparse.Namespace, office: Office, folder: Path, workers: Workers
-) -> list[scenes.Query]:
+def write_walks(arguments: Namespace, office: Office, folder: Path, workers: Workers) -> list[scenes.Query]:
     """Write the frames, poses and videos of all walks."""
     walker = Walker(office)
     queries: list[scenes.Query] = []
@@ -173,7 +170,7 @@ def write_walks(
 
 
 def write_scene(
-    arguments: argparse.Namespace, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
+    arguments: Namespace, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> dict[str, object]:
     """Make and write one scene; returns what was written."""
     office = None
@@ -205,7 +202,7 @@ def write_scene(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: argparse.Namespace) -> int:
+def main(arguments: Namespace) -> int:
     """Make and write all scenes."""
     check_folder_name("--out", arguments.out)
     cameras = read_cameras(arguments.camera) if arguments.camera else None
@@ -215,7 +212,7 @@ def main(arguments: argparse.Namespace) -> int:
             worlds.check_cameras(cameras)
     if arguments.video:
         import_optional("--video", "av", "video")
-    workers = Workers(num_cores(), progress_bar(arguments.quiet))
+    workers = workers_from(arguments)
     for number in range(max(1, arguments.scenes)):
         folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
         line = write_scene(arguments, arguments.seed + number, folder, cameras, workers)

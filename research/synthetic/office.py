@@ -14,23 +14,8 @@ import numpy as np
 from piccolo.arrays import Array, Int64s
 from piccolo.errors import InputError
 
-from .room import (
-    DOOR_ROOM,
-    PICTURE,
-    PLAIN,
-    PLANKS,
-    TILES,
-    WALL_THICKNESS,
-    Door,
-    Room,
-    RoomBuilder,
-    join_rooms,
-    make_room,
-    put_furniture,
-    put_hangings,
-    put_wall,
-    put_walls,
-)
+from . import layout
+from .layout import PICTURE, PLAIN, PLANKS, TILES, WALL_THICKNESS, Door, Room, RoomBuilder
 from .world import MAX_ROOMS, MAX_SIZE, SEED_STEP, World
 
 MAX_STOREYS = 4
@@ -163,7 +148,7 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
     num_copies = min(round(twins * num_rooms), num_rooms - 1)
     copies[order[:num_copies]] = rng.choice(order[num_copies:], num_copies)
     made = {
-        int(k): make_room(seed * SEED_STEP + int(k), plan.size, np.zeros(3), doors=[plan.door])
+        int(k): layout.make_room(seed * SEED_STEP + int(k), plan.size, np.zeros(3), doors=[plan.door])
         for k in np.unique(copies)
     }
     slots = plan.slots()
@@ -172,7 +157,7 @@ def make_office(seed: int, size: Array, num_rooms: int, num_storeys: int, twins:
         for k, slot in zip(copies, slots, strict=True)
     ]
     others = [*corridors(seed, plan, twins > 0.0), *halls(seed, plan)]
-    whole = join_rooms([*rooms, *others])
+    whole = layout.join_rooms([*rooms, *others])
     parts = [part for other in others for part in _parts(other)]
     cells = tuple(whole._replace(corner=cell.corner, size=cell.size) for cell in (*rooms, *parts))
     levels = plan.height * np.arange(num_storeys, dtype=np.float64)
@@ -247,8 +232,8 @@ def corridors(seed: int, plan: Plan, are_alike: bool) -> Iterator[Room]:
                     doors[is_south].append(Door(1, not is_south, at))
         b.kind = "wall"
         for is_far in (False, True):
-            put_wall(b, size, (1, is_far), walls[is_far], doors[not is_far])
-            put_wall(b, size, (0, is_far), walls[2], [Door(0, is_far, size[1] / 2, PASSAGE)])
+            layout.put_wall(b, size, (1, is_far), walls[is_far], doors[not is_far])
+            layout.put_wall(b, size, (0, is_far), walls[2], [Door(0, is_far, size[1] / 2, PASSAGE)])
         yield _room_of(b, size)
 
 
@@ -263,16 +248,16 @@ def halls(seed: int, plan: Plan) -> Iterator[Room]:
         doors = [Door(0, not is_east, passage, PASSAGE) for passage in plan.passages]
         up = plan.flight(storey) if storey < plan.num_storeys - 1 and not is_east else None
         down = plan.flight(storey - 1) if storey and not is_east else None
-        b.clear = [door.clear(size, DOOR_ROOM) for door in doors]
+        b.clear = [door.clear(size, layout.DOOR_ROOM) for door in doors]
         b.clear += [_around(b, flight) for flight in (up, down) if flight]
         b.kind = "floor"
         _put_slab(b, size, (-WALL_THICKNESS, 0.0), down, b.paint((PLANKS, TILES), 0.35, 0.75))
         b.kind = "ceiling"
         ends = size[2], size[2] + SLAB - WALL_THICKNESS
         _put_slab(b, size, ends, up, b.paint((PLAIN,), 0.75, 0.95))
-        put_walls(b, size, doors)
-        put_hangings(b, size)
-        put_furniture(b, size, area=8.0)
+        layout.put_walls(b, size, doors)
+        layout.put_hangings(b, size)
+        layout.put_furniture(b, size, area=8.0)
         if up is not None:
             _put_steps(b, up)
         if down is not None:

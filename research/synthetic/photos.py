@@ -60,10 +60,7 @@ def write_photo(photo: Photo, path: Path) -> None:
 
 
 def change_sensor(rgb: Bytes, rng: np.random.Generator) -> Bytes:
-    """Process a photo (H, W, 3) as another phone would.
-
-    Exposure, white balance, tone curve, sharpening, noise and JPEG compression are drawn at random.
-    """
+    """Process a photo (H, W, 3) as another phone would: light, colours, sharpness, noise and file."""
     linear = (rgb / 255.0) ** 2.2 * 2.0 ** rng.uniform(-0.7, 0.7) * rng.uniform(0.8, 1.25, 3)
     toned = linear.clip(0.0, 1.0) ** (1.0 / rng.uniform(1.7, 2.8))
     smooth = cv2.GaussianBlur(toned, (0, 0), rng.uniform(1.0, 3.0))

@@ -4,29 +4,14 @@ from collections.abc import Iterable, Iterator, Sequence
 
 import numpy as np
 
+from . import layout
+from .layout import CHECKS, PICTURE, PLAIN, PLANKS, STRIPES, TILES, Room, RoomBuilder
 from .office import place
-from .room import (
-    CHECKS,
-    PICTURE,
-    PLAIN,
-    PLANKS,
-    STRIPES,
-    TILES,
-    WALL_THICKNESS,
-    Room,
-    RoomBuilder,
-    make_room,
-    put_crate,
-    put_shelf,
-    put_shell,
-    put_sofa,
-    put_table,
-)
 from .world import GAP
 
 ALIKE_KINDS = ("hotel", "doors", "cubicles", "racks", "hall")  # some of whose things are changed
 CHANGED = (0.0, 0.05, 0.1, 0.2, 0.5)  # fractions of a unit's things
-PIECES = (put_table, put_shelf, put_sofa, put_crate, put_crate)
+PIECES = (layout.put_table, layout.put_shelf, layout.put_sofa, layout.put_crate, layout.put_crate)
 
 Thing = tuple[Sequence[float], Sequence[float], tuple[int, ...]]  # centre (3,), size (3,) [m], patterns
 
@@ -61,7 +46,7 @@ def hotel(seed: int, changed: float) -> tuple[Room, ...]:
     rooms = []
     for unit in range(5):
         b = RoomBuilder(np.random.default_rng([seed, 43]), np.array([unit * (size[0] + GAP), 0.0, 0.0]))
-        put_shell(b, size)
+        layout.put_shell(b, size)
         for number, own in enumerate(thing_seeds(seed, unit, 12, changed)):
             b.rng = np.random.default_rng(own)
             if number < 6:  # on the walls
@@ -85,7 +70,7 @@ def doors(seed: int, changed: float) -> tuple[Room, ...]:
     count = 8
     step = 2.6
     size = np.array([count * step, 2.2, 2.6])
-    put_shell(b, size)
+    layout.put_shell(b, size)
     for unit in range(count):
         x = (unit + 0.5) * step
         things: list[Thing] = [
@@ -105,7 +90,7 @@ def cubicles(seed: int, changed: float) -> tuple[Room, ...]:
     columns = 5
     cell = 2.6
     size = np.array([columns * cell + 1.0, 2 * cell + 1.8, 2.8])
-    put_shell(b, size)
+    layout.put_shell(b, size)
     screen = b.paint((PLAIN, TILES), 0.5, 0.8)
     for unit in range(2 * columns):
         x = 0.5 + cell * (unit // 2)
@@ -133,7 +118,7 @@ def racks(seed: int, changed: float) -> tuple[Room, ...]:
     bay = 1.6
     aisle = 2.4
     size = np.array([bays * bay + 3.0, rows * aisle + 1.2, 3.2])
-    put_shell(b, size)
+    layout.put_shell(b, size)
     steel = b.paint((PLAIN,), 0.3, 0.6)
     for unit in range(rows * bays):
         x = 1.5 + bay * (unit // rows)
@@ -153,12 +138,12 @@ def racks(seed: int, changed: float) -> tuple[Room, ...]:
 def hall(seed: int, changed: float) -> tuple[Room, ...]:
     """Make a room that half a turn about its middle takes to itself."""
     rng = np.random.default_rng([seed, 47])
-    room = make_room(seed, rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4]), np.zeros(3))
+    room = layout.make_room(seed, rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4]), np.zeros(3))
     x, y, _ = room.size
     is_long = room.boxes[:, 3] > 0.45 * x  # floor, ceiling and two of the walls: their half
     boxes = room.boxes.copy()
-    boxes[is_long, 0] = 0.25 * x - 0.5 * WALL_THICKNESS
-    boxes[is_long, 3] = 0.25 * x + 0.5 * WALL_THICKNESS
+    boxes[is_long, 0] = 0.25 * x - 0.5 * layout.WALL_THICKNESS
+    boxes[is_long, 3] = 0.25 * x + 0.5 * layout.WALL_THICKNESS
     is_kept = boxes[:, 0] < 0.5 * x
     half = room._replace(boxes=boxes[is_kept])
     own = room.materials[is_kept]

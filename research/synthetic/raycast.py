@@ -9,7 +9,7 @@ from piccolo.arrays import Array, Int64s
 from piccolo.jobs.threads import Workers
 from piccolo.kernels.jit import inline_kernel, kernel
 
-from .room import Room, box_distances
+from .layout import Room, box_distances
 
 AMBIENT = 0.55  # of a surface's colour
 LAMP = 0.9  # of it, head on and near
@@ -54,7 +54,7 @@ def cloudy(s: float, t: float, seed: Integer) -> float:
 
 @inline_kernel
 def second_color_fraction(pattern: Integer, s: float, t: float, scale: float, seed: Integer) -> float:
-    """Fraction in [0, 1] of the second colour at (s, t) [m]; patterns as in room.py."""
+    """Fraction in [0, 1] of the second colour at (s, t) [m]; patterns as in layout.py."""
     i = np.int64(math.floor(s / scale))
     j = np.int64(math.floor(t / scale))
     x = s / scale - math.floor(s / scale)

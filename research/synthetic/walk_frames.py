@@ -6,14 +6,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
-from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
 
+from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .office import Office
 from .photos import change_light
-from .room import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .walking import Walk
 from .world import make_query, make_world, photograph
 

@@ -21,9 +21,9 @@ from piccolo.geometry.rotations import uniform_rotations
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 
+from .layout import Room, make_room
 from .photos import change_light
 from .raycast import cast_rays
-from .room import Room, make_room
 
 SUPERSAMPLING = 2  # rays a pixel, each way
 TILE = 64  # side [px] of what is cast at once: rays near each other meet few boxes

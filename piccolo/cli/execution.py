@@ -1,32 +1,39 @@
-"""Executors of a batch: this process, several, or a cluster; and its end by a signal."""
+"""The work of a batch: in this process, several, or a cluster, until a signal ends it."""
 
-import argparse
 import os
 import signal
-from collections.abc import Callable, Collection, Iterable, Iterator
+import sys
+from argparse import Namespace
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import FrameType
-from typing import TypeVar
+from typing import Any, TypeVar
 
-from ..batch.localizer import Localizer
-from ..confidence.confidence import LOCALIZED
-from ..errors import InputError
+from tqdm import tqdm
+
+from ..batch.localizer import Answer, Localizer, Task
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED
+from ..errors import InputError, printable
 from ..jobs.cluster import LOCAL, Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes
 from ..jobs.threads import num_cores
+from ..localization.focal_length import WIDE
 from ..opened_scan import OpenedScan
-from ..result import FAILED, UNREADABLE
+from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .errors import EXIT_BAD_INPUT, UsageError, print_error
+from .checks import UsageError
 from .options import PHOTOS_OF_A_JOB
+from .start import for_terminal
+from .terminal import EXIT_BAD_INPUT, print_error
 
 EXIT_SOME_NOT = 1
+MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
 SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 Item = TypeVar("Item")
@@ -40,7 +47,36 @@ def choose_exit_code(statuses: Collection[str]) -> int:
     return 0 if set(statuses) <= {LOCALIZED} else EXIT_SOME_NOT
 
 
-def check_execution(arguments: argparse.Namespace) -> None:
+def advise(result: Result) -> list[str]:
+    """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
+    is_ruled_out = result.best_pose is None or result.confidence == 0.0
+    if result.status == LOCALIZED or is_ruled_out or result.probability_none is None:
+        return []
+    focal = result.focal_length
+    if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:
+        return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
+    if result.status == AMBIGUOUS:
+        return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
+    if result.confidence >= MIN_FIT:
+        others = "add photos taken beside it" if result.cameras else "localize photos of a walk (--walk)"
+        return [f"  to be sure, look at the --overlay, give --near, or {others}"]
+    lens = ", a wrong focal length" if result.cameras else ""
+    return [f"  it fits nowhere well: another scan{lens}, or bare walls?"]
+
+
+def print_result(arguments: Namespace, result: Result, warnings: Sequence[str]) -> None:
+    """Print an error; or, unless --quiet, what was found, the warnings, and what to do if it is doubtful."""
+    if result.error is not None:
+        print_error(arguments, result.error, EXIT_BAD_INPUT)
+        return
+    if arguments.quiet:
+        return
+    lines = [f"  warning: {for_terminal(printable(warning))}" for warning in warnings]
+    for line in (result.summary(), *lines, *advise(result)):
+        tqdm.write(line, file=sys.stderr)
+
+
+def check_execution(arguments: Namespace) -> None:
     """Refuse options that do not go together."""
     if is_remote(arguments) and arguments.jobs not in (None, 1):
         raise UsageError(f"--jobs: not with --dask {arguments.dask}, whose scheduler starts the workers")
@@ -48,12 +84,12 @@ def check_execution(arguments: argparse.Namespace) -> None:
         raise UsageError(f"--mask {arguments.mask}: wanted an absolute path with --dask {arguments.dask}")
 
 
-def is_remote(arguments: argparse.Namespace) -> bool:
+def is_remote(arguments: Namespace) -> bool:
     """Return True if a cluster that others have begun does the work."""
     return arguments.dask not in (None, LOCAL)
 
 
-def count_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
+def count_jobs(arguments: Namespace, num_left: int | None) -> int:
     """Return the processes asked for, or as many as are worth their start for `num_left` photos, if known."""
     if arguments.jobs is not None:
         return int(min(arguments.jobs, num_left or arguments.jobs))
@@ -62,7 +98,7 @@ def count_jobs(arguments: argparse.Namespace, num_left: int | None) -> int:
     return max(1, min(num_cores(), num_left // PHOTOS_OF_A_JOB))
 
 
-def count_fitting(arguments: argparse.Namespace, num_jobs: int) -> int:
+def count_fitting(arguments: Namespace, num_jobs: int) -> int:
     """Return how many of the processes memory is left for; called where one has what each will need."""
     if arguments.jobs is not None:
         return num_jobs
@@ -70,7 +106,7 @@ def count_fitting(arguments: argparse.Namespace, num_jobs: int) -> int:
     return max(1, min(num_jobs, int((memory_left() + taken) // (taken + QUERY_MEMORY))))
 
 
-def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
+def share_of_a_job(arguments: Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
     """Return the localizer of one of some processes, which divide cores and --max-memory."""
     if is_remote(arguments):
         return replace(localizer, num_threads=arguments.threads or 1, max_memory=arguments.max_memory)
@@ -81,7 +117,7 @@ def share_of_a_job(arguments: argparse.Namespace, localizer: Localizer, num_jobs
     return replace(localizer, num_threads=num_threads, max_memory=memory)
 
 
-def connecting(arguments: argparse.Namespace, num_jobs: int) -> AbstractContextManager[Cluster | None]:
+def connecting(arguments: Namespace, num_jobs: int) -> AbstractContextManager[Cluster | None]:
     """Return the cluster of --dask; None without."""
     if not arguments.dask:
         return nullcontext()
@@ -91,16 +127,13 @@ def connecting(arguments: argparse.Namespace, num_jobs: int) -> AbstractContextM
 
 @contextmanager
 def executing(
-    arguments: argparse.Namespace,
+    arguments: Namespace,
     localizer: Localizer,
     num_jobs: int,
     cluster: Cluster | None,
     open_scan: Callable[[Localizer, int], OpenedScan],
 ) -> Iterator[tuple[Executor, Localizer]]:
-    """Yield an executor, and the localizer for it.
-
-    `open_scan` prepares the scan before, with so many threads.
-    """
+    """Yield an executor, and the localizer for it; `open_scan` prepares the scan, with so many threads."""
     is_kept = localizer.cache.is_used
     with ExitStack() as stack:
         if not is_kept and (cluster or num_jobs > 1):  # others will open what is prepared here
@@ -122,7 +155,7 @@ def executing(
 
 
 def at_the_workers(
-    arguments: argparse.Namespace, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
+    arguments: Namespace, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
 ) -> Localizer:
     """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()
@@ -169,7 +202,7 @@ class Interruption:
         finally:
             self.is_at_work = False
 
-    def stop(self, arguments: argparse.Namespace, done: str, is_kept: bool) -> int:
+    def stop(self, arguments: Namespace, done: str, is_kept: bool) -> int:
         """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
         same = "the same command"
         how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
@@ -197,3 +230,18 @@ def interruptible() -> Iterator[Interruption]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def answer_all(
+    executor: Executor,
+    localizer: Localizer,
+    tasks: Iterator[Task],
+    show: Callable[[Iterable[Any]], Iterable[Any]] = iter,
+    interruption: Interruption | None = None,
+    cloud_sha256: str | None = None,
+) -> Iterator[Answer]:
+    """Yield the answers to tasks in order, after a signal those that are done; `show` wraps the tasks."""
+    values = executor.values(tasks)
+    pairs = show(values)
+    for task, wait in interruption.each(pairs, values.take_finished()) if interruption else pairs:
+        yield localizer.wait_for(task, wait, cloud_sha256)

@@ -1,17 +1,47 @@
-"""Outputs of a command, checked before it begins to work."""
+"""Options that make no sense, and outputs that can't be written, are refused before any work."""
 
-import argparse
+import math
 import os
 import stat
-import sys
-from collections.abc import Iterable, Iterator, Mapping
+from argparse import Namespace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from ..errors import InputError
 from ..files.atomic import check_output, is_stdout, is_stream
 from ..panorama.cube import SUFFIXES
-from .errors import UsageError
 
 Outputs = Mapping[str, Path | None]  # by option; None where it is not given
+
+
+class UsageError(InputError):
+    """The options are wrong, whatever the files hold."""
+
+
+@contextmanager
+def checking_options() -> Iterator[None]:
+    """Within this, an InputError is a UsageError."""
+    try:
+        yield
+    except InputError as error:
+        raise UsageError(str(error)) from error
+
+
+def check_least(arguments: Namespace, **limits: float) -> None:
+    """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
+    for name, limit in limits.items():
+        value = getattr(arguments, name, None)
+        if value is not None and not limit <= value < math.inf:
+            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+
+
+def refuse_given(arguments: Namespace, options: Sequence[str], why: str) -> None:
+    """Refuse options without a default that are given, by their names in `arguments`."""
+    for name in options:
+        value = getattr(arguments, name)
+        if value is not None and value is not False:
+            raise UsageError(f"--{name.replace('_', '-')}: {why}")
 
 
 def check_outputs(outputs: Outputs, inputs: Iterable[Path] = ()) -> None:
@@ -80,11 +110,3 @@ def check_folder_name(option: str, path: Path | None) -> None:
     """Refuse stdout and devices where a folder is wanted."""
     if path and is_stream(path):
         raise UsageError(f"{option} {path}: found stdout or a device, wanted a folder's name")
-
-
-def print_report(arguments: argparse.Namespace, outputs: Outputs, text: str, end: str = "\n") -> None:
-    """Print what a command says on stdout; to stderr, without --quiet, where one of its outputs is stdout."""
-    if not any(path and is_stdout(path) for path in outputs.values()):
-        print(text, end=end)
-    elif not arguments.quiet:
-        print(text, end=end, file=sys.stderr)
