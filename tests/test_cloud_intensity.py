@@ -1,5 +1,7 @@
 """Intensity taken for a gray."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from e57_files import ScanToWrite
@@ -15,7 +17,7 @@ from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, intensity_reader
+from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, make_source
 from piccolo.cloud.readers.text import open_ptx, open_text
 from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.geometry.pose import exp_so3
@@ -38,7 +40,7 @@ def _in_gray(intensity, points=POINTS, chunk=701):
         for lo in range(0, len(points), chunk):
             yield points[lo : lo + chunk], intensity[lo : lo + chunk]
 
-    return np.concatenate([raw.colors for raw in intensity_reader(read)()])
+    return np.concatenate([raw.colors for raw in make_source(Path("a"), read, "intensity").read_chunks()])
 
 
 def assert_gray(open_file, path, intensity, points_world=POINTS, atol=1e-9):

@@ -324,10 +324,7 @@ def pinhole(width: int, height: int, focal: float) -> Camera:
 
 
 def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:
-    """Return ideal photo of this size, `lens` pinhole or fisheye, whose `width` shows a field of view [deg].
-
-    Raises InputError for a field that the lens can't have.
-    """
+    """Return an ideal pinhole or fisheye that shows `fov_deg` across its width; InputError if none can."""
     if lens == "fisheye":
         focal = width / math.radians(fov_deg)
         return Camera("SIMPLE_FISHEYE", width, height, (focal, width / 2.0, height / 2.0))

@@ -70,10 +70,7 @@ def color_edges(nodes: Array32, around: Surroundings, workers: Workers) -> Array
 
 
 def find_edges(points: Array, around: Surroundings, workers: Workers) -> Array:
-    """Return the edges (N, 2) of surfaces at points (N, 3) [m], z up, each in [0, 1].
-
-    They are how strong an edge is, and how strong a vertical one.
-    """
+    """Return how strong edges, and vertical ones, are at points (N, 3) [m], z up: (N, 2), each in [0, 1]."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     tree = cKDTree(points)

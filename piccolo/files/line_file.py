@@ -164,7 +164,9 @@ class Journal:
         taken: list[Kept] = []
         for number, step in enumerate(steps):
             if self._num_recalled == len(self._earlier) or self._earlier[self._num_recalled][0] != step:
-                self.forget_rest()
+                del self._earlier[self._num_recalled :]
+                if self._file is not None:
+                    self._file.cut(self._earlier[-1][2] if self._earlier else 0)
                 break
             try:
                 taken.append(take(number, self._earlier[self._num_recalled][1]))
@@ -176,12 +178,6 @@ class Journal:
     def _damaged(self, error: ValueError) -> InputError:
         where = self._file.path if self._file else ""
         return InputError(f"{where}: found a damaged line ({type(error).__name__}); {self._ways}")
-
-    def forget_rest(self) -> None:
-        """Forget the steps that were not recalled."""
-        del self._earlier[self._num_recalled :]
-        if self._file is not None:
-            self._file.cut(self._earlier[-1][2] if self._earlier else 0)
 
     def append(self, step: str, text: str) -> None:
         """Keep the text of a step that is done."""

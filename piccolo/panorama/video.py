@@ -98,10 +98,7 @@ def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFra
 
 @contextmanager
 def writing_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Callable[[Bytes], None]]:
-    """Yield a function that takes the frames (H, W, 3) of an MP4 video (H.264), `rate` a second.
-
-    `size` (W, H) is even both ways. Raises InputError if PyAV is not there.
-    """
+    """Yield a function that takes frames (H, W, 3) of an MP4 (H.264), `rate` a second; W and H are even."""
     av = import_optional("video", "av", "video")
     with replacing(path) as file, av.open(file, "w", format="mp4") as container:
         stream = container.add_stream("libx264", Fraction(rate).limit_denominator(1001))

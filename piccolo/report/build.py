@@ -288,10 +288,6 @@ def write_report(
     opened = scan._opened
     if not isinstance(opened.prepared, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
-    entries = collect_entries(_items(results))
-    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page
-
-
-def _items(results: File | Iterable[File | Result]) -> list[Path | Result]:
     several = [results] if isinstance(results, str | PathLike) else results
-    return [item if isinstance(item, Result) else Path(item) for item in several]
+    entries = collect_entries([item if isinstance(item, Result) else Path(item) for item in several])
+    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page

@@ -183,9 +183,10 @@ def make_source(
         brightest = find_full_brightness(path, types)
         locate = partial(point_label, path)
         return PointSource(path, lambda: color_chunks(read(), brightest, locate), num_points)
+    limits = functools.cache(lambda: _limits(read()))
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: (RawCloud(*part) for part in read()),
-        "intensity": intensity_reader(read),
+        "intensity": lambda: (RawCloud(points, as_gray(values, *limits())) for points, values in read()),
         "shape": lambda: (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points, _ in read()),
     }
     return PointSource(path, readers[channel], num_points)
@@ -199,12 +200,6 @@ def join_columns(read_columns: Callable[[], Iterator[Columns]]) -> Iterator[Part
             points_of(columns),
             np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64),
         )
-
-
-def intensity_reader(read: PartReader) -> ChunkReader:
-    """Return `read_chunks` of a PointSource for a reader of points and their intensity."""
-    limits = functools.cache(lambda: _limits(read()))
-    return lambda: (RawCloud(points, as_gray(intensity, *limits())) for points, intensity in read())
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:
