@@ -21,10 +21,11 @@ from .geometry.nearness import CONFIRMED
 from .geometry.pose import Pose, check_pose
 from .jobs.memory import check_memory
 from .jobs.threads import Stopwatch, Workers
-from .localization.beside import SurePhoto, localize_beside, locate
+from .localization.beside import SurePhoto, localize_beside, place_sure
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
+from .localization.query import prepare_query
 from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
@@ -99,23 +100,20 @@ class OpenedScan:
                 gps = gps and replace(gps, is_used=False)
                 found = run(self.prepared, picture, settings, self.workers, watch)
         if focal is not None:
-            found = replace(found, focal_length=focal.after(found.focal_length))
+            found = replace(found, focal_length=focal.update(found.focal_length))
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)
         return replace(self.add_localization(blank, found), gps_prior=gps)
 
-    def locate(self, photo: Photo, result: Result, settings: Settings) -> SurePhoto | None:
+    def place_keypoints(self, photo: Photo, result: Result, settings: Settings) -> SurePhoto | None:
         """Return the keypoints of a photo that is localized; None if it is another photo now."""
-        if result.best_pose is None:
-            raise ValueError("a photo without a pose")
         prepared, settings = self.require_default_method("photos beside others", settings)
         with reading_once():
             picture = self.read(photo.with_refined_camera(result.cameras))
             digest = read_photo_facts(photo).sha256
-        if digest != result.source.pano_sha256:
+        if digest != result.source.pano_sha256 or result.best_pose is None:
             return None
-        pose = result.best_pose
-        found = Localization(confidence=result.confidence, pose=pose, covariance=result.covariance)
-        return locate(prepared, picture, found, settings, self.workers)
+        query = prepare_query(picture, prepared, settings, self.workers)
+        return place_sure(query, result.best_pose, result.covariance, result.confidence)
 
     def localize_again(
         self,
@@ -145,7 +143,7 @@ class OpenedScan:
         if not names or not (is_surer or is_other):
             return first, ()
         if focal is not None:
-            found = replace(found, focal_length=focal.after(found.focal_length))
+            found = replace(found, focal_length=focal.update(found.focal_length))
         elif found.focal_length is not None:  # only what a photo says alone counts for others
             alone = replace(found.focal_length, picture_px=None, picture_std_px=None)
             found = replace(found, focal_length=alone)

@@ -11,8 +11,7 @@ import numpy as np
 from .arguments import check_fields
 from .arrays import Bytes, Mask
 from .camera import Calibration, Mount
-from .camera.files import find_calibration, open_calibration, read_rig
-from .camera.rig import IDENTITY
+from .camera.calibration import IDENTITY, find_calibration, open_calibration, read_rig
 from .errors import InputError
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .camera import Calibration, Mount
-from .camera.files import document_of, read_mounts
+from .camera.calibration import document_of, read_mounts
 from .errors import InputError
 from .files.atomic import write_atomically
 from .files.json_file import DAMAGE, describe, read_json

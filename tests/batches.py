@@ -24,9 +24,8 @@ def main_of(script):
 
 def start_localize(words, **options):
     """A process of localize.py whose messages can be read."""
-    return subprocess.Popen(
-        command_of("localize.py", *words), stderr=subprocess.PIPE, text=True, bufsize=1, **options
-    )
+    command = command_of("localize.py", *words)
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, bufsize=1, **options)
 
 
 def run(command, **options):

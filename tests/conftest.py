@@ -1,12 +1,13 @@
 """Every result that a test makes is checked by the schema that users have."""
 
 import json
+import os
 import signal
 from pathlib import Path
 
 import jsonschema
 import pytest
-from rooms import write_room
+import rooms
 
 from piccolo.result import Result
 
@@ -15,6 +16,21 @@ VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 
 # A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+# The files that take longest begin first, so that in the end no worker waits for another.
+SLOWEST = (
+    "test_focal_length.py", "test_bundle.py", "test_cluster.py", "test_walk.py", "test_tools.py",
+    "test_shape.py", "test_verification.py", "test_coloring.py", "test_documents.py", "test_batch.py",
+    "test_camera_tools.py", "test_localize_cameras.py", "test_batch_second_look.py", "test_one_judge.py",
+    "test_jobs.py", "test_localize.py", "test_localization.py", "test_doors.py", "test_focal_consensus.py",
+    "test_localization_covariance.py",
+)  # fmt: skip
+
+
+def pytest_collection_modifyitems(items):
+    order = {name: number for number, name in enumerate(SLOWEST)}
+    items.sort(key=lambda item: order.get(item.path.name, len(order)))
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -33,8 +49,15 @@ def _checked_results():
     patch.undo()
 
 
+@pytest.fixture(autouse=True, scope="session")
+def _shared_folder(tmp_path_factory):
+    """The temporary folder of the run, above that of the worker if there are several."""
+    folder = tmp_path_factory.getbasetemp()
+    rooms.SHARED[:] = [folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder]
+
+
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory):
+def scene():
     """A room's cloud and three panoramas, in a folder with a blank in its name; only to be read."""
     words = "--seed 7 --points 60000 --panoramas 3 --width 512"
-    return write_room(tmp_path_factory.mktemp("a scene"), words)
+    return rooms.make_once("a scene", lambda folder: rooms.write_room(folder, words))

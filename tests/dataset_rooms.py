@@ -34,11 +34,8 @@ def rays(axes, width=WIDTH):
     longitude, latitude = np.meshgrid(longitude, latitude)
     right, up = np.sin(longitude) * np.cos(latitude), np.sin(latitude)
     forward = np.cos(longitude) * np.cos(latitude)
-    of = {
-        OPTICAL: (right, -up, forward),
-        OPENGL: (right, up, -forward),
-        FORWARD_LEFT_UP: (forward, -right, up),
-    }
+    of = {OPTICAL: (right, -up, forward), OPENGL: (right, up, -forward)}
+    of[FORWARD_LEFT_UP] = (forward, -right, up)
     return np.stack(of[axes], axis=-1)
 
 

@@ -6,6 +6,13 @@ from piccolo.errors import InputError
 from piccolo.photo import Photo
 
 
+def assert_input_error(message, call, *arguments, **options):
+    """A call is refused in one line that holds an expression."""
+    with pytest.raises(InputError, match=message) as error:
+        call(*arguments, **options)
+    assert "\n" not in str(error.value)
+
+
 def assert_refused(message, read, path, *arguments, **options):
     """`read` refuses a file or photo in one line that begins with its name and holds an expression."""
     with pytest.raises(InputError, match=message) as error:

@@ -1,16 +1,28 @@
 """Seeded synthetic rooms, small and quick, kept for all tests of a run."""
 
+import contextlib
+import fcntl
 import functools
+import io
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
+from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.geometry.pose import Pose, angle_between
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.localization.localize import localize
+from piccolo.localization.query import prepare_query
+from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
+from piccolo.scan import Scan
+from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import average_view, normalize_view
 from research.synthetic import make_room
@@ -19,6 +31,8 @@ from research.synthetic.world import make_query, make_world, scan_world
 SIZE = (4.5, 3.5, 2.5)
 NUM_POINTS = 60_000
 WIDTH = 512
+SHARED = []  # the folder that all workers of a run have in common; conftest.py puts it in
+AUTO, KNOWN, UNKNOWN = (CoarseToFineSettings(gravity=gravity) for gravity in ("auto", "known", "unknown"))
 
 
 @functools.lru_cache
@@ -32,9 +46,30 @@ def room(seed, num_points=NUM_POINTS):
     return world, Cloud(points[order], colors[order], origin_world)
 
 
+def make_once(name, make):
+    """A file or folder in the folder of all workers, made by the first that asks for it; returns its path."""
+    path = SHARED[0] / name
+    with Path(f"{path}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            make(path)
+    return path
+
+
+def make_map(seed, num_points=NUM_POINTS):
+    """The map of a room, prepared anew."""
+    return replace(prepare_map(room(seed, num_points)[1], Workers(2)), scan_sha256=64 * "0")
+
+
+def map_path(seed, num_points=NUM_POINTS):
+    """The file of a room's map."""
+    return make_once(f"{seed}-{num_points}.map", lambda path: save_map(make_map(seed, num_points), path))
+
+
 @functools.lru_cache
 def scan_map(seed, num_points=NUM_POINTS):
-    return replace(prepare_map(room(seed, num_points)[1], Workers(2)), scan_sha256=64 * "0")
+    """The map of a room, which one worker prepares for all."""
+    return load_map(map_path(seed, num_points))
 
 
 @functools.lru_cache
@@ -43,9 +78,25 @@ def query(seed, variant="clean", index=0, width=WIDTH):
     return make_query(room(seed)[0], index, variant, width, Workers(2))
 
 
+@functools.lru_cache
+def scan(seed, num_threads=2):
+    """A room as it is after it was opened."""
+    return Scan(OpenedScan(scan_map(seed), "room", CloudSettings(), AUTO, Workers(num_threads), {}))
+
+
 def as_panorama(rgb):
     """An image (H, W, 3) as it is read, all pixels valid."""
     return Panorama(rgb, np.ones(rgb.shape[:2], dtype=bool))
+
+
+def ask(panorama, scan_map, settings=AUTO, num_threads=2):
+    """The query of a panorama in a map."""
+    return prepare_query(panorama, scan_map, settings, Workers(num_threads))
+
+
+def locate(panorama, scan_map, settings=AUTO, num_threads=2):
+    """A panorama localized in a map."""
+    return localize(scan_map, panorama, settings, Workers(num_threads), Stopwatch())
 
 
 def errors(pose, true_pose):
@@ -54,9 +105,22 @@ def errors(pose, true_pose):
     return distance, np.degrees(angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world))
 
 
+def assert_near(pose, true_pose, most, most_deg):
+    """A pose is less than so far [m, deg] from another."""
+    distance, angle_deg = errors(pose, true_pose)
+    assert distance < most, f"{1000.0 * distance:.1f} mm"
+    assert angle_deg < most_deg, f"{angle_deg:.2f} deg"
+
+
 def local(seed, pose, num_points=NUM_POINTS):
     """A pose of the world near a room's local origin."""
     return Pose(pose.R_cam_from_world, pose.center_world - room(seed, num_points)[1].origin_world)
+
+
+def points_world(seed, num_points=NUM_POINTS):
+    """The points (N, 3) of a room in the world, float64."""
+    cloud = room(seed, num_points)[1]
+    return cloud.points.astype(np.float64) + cloud.origin_world
 
 
 def packed(seed):
@@ -75,8 +139,16 @@ def view(octree, center_map, config, shown):
     return normalize_view(average_view(octree, center_map, config), center_map, config, shown)
 
 
+def write_cloud(path, seed, num_points=NUM_POINTS, flip=(1.0, 1.0, 1.0)):
+    """A room's points as a PLY, as they are or mirrored; returns its path as text."""
+    rows = vertex_rows(points_world(seed, num_points) * flip, room(seed, num_points)[1].colors)
+    write_ply(path, rows)
+    return str(path)
+
+
 def write_room(folder, words):
     """A room's files by tools/make_room.py with its options in one string; returns the folder."""
     size = ["--size", *map(str, SIZE)]
-    assert make_room.main(["--out", str(folder), *size, "--quiet", *words.split()]) == 0
+    with contextlib.redirect_stdout(io.StringIO()):
+        assert make_room.main(["--out", str(folder), *size, "--quiet", *words.split()]) == 0
     return folder

@@ -248,9 +248,8 @@ def test_true_poses_go_along(run, tilted, tmp_path):
     queries = [Query(tmp_path / "raw" / f"{k}.jpg", "robot", pose) for k, pose in enumerate(poses)]
     write_queries(tmp_path / "raw", queries)
     out = tmp_path / "aligned.ply"
-    code, report, _ = run(
-        "--cloud", tilted, "--queries", tmp_path / "raw" / "queries.json", "--out", out, FREE
-    )
+    listed = ("--queries", tmp_path / "raw" / "queries.json")
+    code, report, _ = run("--cloud", tilted, *listed, "--out", out, FREE)
     assert code == 0
     T = np.array(report["T_aligned_from_scan"])
     scene = read_scene(tmp_path)

@@ -7,18 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import assert_input_error
 
 from piccolo.cli.checks import UsageError, check_distinct, check_outputs, check_suffix
 from piccolo.cli.command import command
 from piccolo.errors import InputError
 from piccolo.files import atomic
-from piccolo.files.atomic import (
-    check_output,
-    check_output_folder,
-    replacing,
-    replacing_folder,
-    write_atomically,
-)
 from piccolo.geometry.pose import Pose
 from piccolo.scene import Query, write_queries
 
@@ -32,7 +26,7 @@ def names(folder):
 def test_content_replaces_and_nothing_else_is_left(tmp_path):
     path = tmp_path / ("with space " + "ä" * 110)  # 231 of the 255 bytes that a name may have
     path.write_bytes(b"old")
-    write_atomically(path, b"new")
+    atomic.write_atomically(path, b"new")
     assert path.read_bytes() == b"new"
     assert names(tmp_path) == [path.name]
 
@@ -46,7 +40,7 @@ def test_failure_leaves_the_old_file_and_no_other(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "replace", fail)
     with pytest.raises(OSError, match="disk"):
-        write_atomically(path, b"new")
+        atomic.write_atomically(path, b"new")
     assert path.read_bytes() == b"old"
     assert names(tmp_path) == ["a.json"]
 
@@ -59,7 +53,7 @@ def test_permissions_follow_the_umask_or_the_file_that_is_replaced(tmp_path):
     before = os.umask(0o027)
     try:
         for path, mode in ((tmp_path / "new", 0o640), (private, 0o600), (shared, 0o664)):
-            write_atomically(path, b"x")
+            atomic.write_atomically(path, b"x")
             assert path.stat().st_mode & 0o777 == mode
     finally:
         os.umask(before)
@@ -80,7 +74,7 @@ def test_the_owner_stays_where_that_is_allowed(tmp_path, monkeypatch, is_allowed
         fchown(handle, uid, gid)
 
     monkeypatch.setattr(os, "fchown", give)
-    write_atomically(path, b"x")
+    atomic.write_atomically(path, b"x")
     assert given == [owner]
     assert path.read_bytes() == b"x"
     assert ((path.stat().st_uid, path.stat().st_gid) == owner) == (is_allowed or os.getuid() != 0)
@@ -95,16 +89,16 @@ def test_a_link_stays_and_its_target_is_replaced(tmp_path, is_there):
     second.symlink_to("../files/a")
     if is_there:
         target.write_bytes(b"old")
-    check_output(link)
-    write_atomically(link, b"new")
+    atomic.check_output(link)
+    atomic.write_atomically(link, b"new")
     assert (str(link.readlink()), str(second.readlink())) == ("b", "../files/a")
     assert target.read_bytes() == b"new"
     assert not target.is_symlink()
     assert (names(tmp_path / "links"), names(tmp_path / "files")) == (["a", "b"], ["a"])
     folder = tmp_path / "links" / "folder"
     folder.symlink_to(tmp_path / "files" / "made")
-    check_output_folder(folder)
-    with replacing_folder(folder) as unfinished:
+    atomic.check_output_folder(folder)
+    with atomic.replacing_folder(folder) as unfinished:
         (unfinished / "x").touch()
     assert folder.is_symlink()
     assert names(tmp_path / "files" / "made") == ["x"]
@@ -115,8 +109,8 @@ def test_a_fifo_is_written_to_and_stays(tmp_path):
     os.mkfifo(fifo)
     reader = threading.Thread(target=lambda: read.append(fifo.read_bytes()))
     reader.start()
-    check_output(fifo)
-    write_atomically(fifo, b"new" * 100_000)
+    atomic.check_output(fifo)
+    atomic.write_atomically(fifo, b"new" * 100_000)
     reader.join()
     assert read == [b"new" * 100_000]
     assert fifo.is_fifo()
@@ -125,9 +119,9 @@ def test_a_fifo_is_written_to_and_stays(tmp_path):
 
 @pytest.mark.parametrize("name", ["-", "/dev/stdout"])
 def test_stdout_gets_bytes(name, capfdbinary):
-    check_output(Path(name))
+    atomic.check_output(Path(name))
     sys.stdout.write("before\n")
-    write_atomically(Path(name), b"\0\xff")
+    atomic.write_atomically(Path(name), b"\0\xff")
     assert capfdbinary.readouterr().out == b"before\n\0\xff"
     assert not Path("-").exists()
 
@@ -142,17 +136,15 @@ def test_stdout_redirected_keeps_what_is_printed_around_it(tmp_path, redirection
 
 def test_devices_are_written_to_and_a_full_one_is_named():
     before = Path("/dev/null").stat().st_rdev
-    write_atomically(Path("/dev/null"), b"x")
+    atomic.write_atomically(Path("/dev/null"), b"x")
     assert Path("/dev/null").stat().st_rdev == before
     with pytest.raises(OSError, match=r"No space left on device: '/dev/full'"):
-        write_atomically(Path("/dev/full"), b"x")
+        atomic.write_atomically(Path("/dev/full"), b"x")
     assert Path("/dev/full").is_char_device()
 
 
-@pytest.mark.parametrize(
-    ("out", "reason"), [("link.csv", "File too large"), ("-", "No space left on device")]
-)
-def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, reason):
+@pytest.mark.parametrize(("out", "why"), [("link.csv", "File too large"), ("-", "No space left on device")])
+def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, why):
     """A limit to the size of files stands for the disk, /dev/full for stdout."""
     (tmp_path / "p.csv").write_bytes(b"old")
     (tmp_path / "link.csv").symlink_to("p.csv")
@@ -161,7 +153,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, reason
     tool = f'"{sys.executable}" "{ROOT}/tools/export_poses.py" --scenes r --format csv'
     command = f"(ulimit -f {1 if out == '-' else 0}; {tool} --out {out} > /dev/full)"
     done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
-    line = f"export_poses.py: {out}: cannot be used ({reason})\n"
+    line = f"export_poses.py: {out}: cannot be used ({why})\n"
     assert (done.returncode, done.stderr) == (3, line)
     assert (tmp_path / "p.csv").read_bytes() == b"old"
     assert names(tmp_path) == ["link.csv", "p.csv", "r"]
@@ -170,7 +162,7 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, reason
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_nothing(tmp_path, number, code):
     def run(arguments):
-        with replacing_folder(tmp_path / "folder") as folder, replacing(folder / "a") as file:
+        with atomic.replacing_folder(tmp_path / "folder") as folder, atomic.replacing(folder / "a") as file:
             file.write(b"half")
             signal.raise_signal(number)
         return 0
@@ -195,17 +187,14 @@ def test_outputs_that_can_not_be_are_refused(tmp_path, monkeypatch):
         (tmp_path, "found a folder"),
         (loop, "found a link that leads to itself"),
     ):
-        with pytest.raises(InputError, match=message):
-            check_output(path)
+        assert_input_error(message, atomic.check_output, path)
     with pytest.raises(InputError, match="found stdout or a device, wanted a folder"):
-        check_output_folder(Path("/dev/null"))
-    with pytest.raises(InputError, match="that leads to itself"):
-        write_atomically(loop, b"")
-    check_output(tmp_path / "new.json")
+        atomic.check_output_folder(Path("/dev/null"))
+    assert_input_error("that leads to itself", atomic.write_atomically, loop, b"")
+    atomic.check_output(tmp_path / "new.json")
     monkeypatch.setattr(atomic.os, "access", lambda path, mode: path not in (source, Path("/dev/full")))
     for path in (source, Path("/dev/full")):
-        with pytest.raises(InputError, match="write permission"):
-            check_output(path)
+        assert_input_error("write permission", atomic.check_output, path)
     assert names(tmp_path) == ["dangling", "in.jpg", "loop"]
 
 
@@ -231,9 +220,8 @@ def test_two_outputs_that_are_one_and_inputs_are_refused(tmp_path):
         with pytest.raises(UsageError, match="found an input as the output, wanted another name"):
             check_outputs({"--out": new, "--depth": output}, [tmp_path / "none", source])
     nothing = Path("/dev/null")
-    check_outputs(
-        {"a": new, "b": folder / "poses.jsonl", "c": nothing, "d": nothing, "e": None}, [folder, there]
-    )
+    outputs = {"a": new, "b": folder / "poses.jsonl", "c": nothing, "d": nothing, "e": None}
+    check_outputs(outputs, [folder, there])
     check_suffix("--overlay", nothing, (".png",))
     check_suffix("--overlay", Path("A.PNG"), (".png",))
     for name in ("x.jpg", "x", ".png"):

@@ -50,12 +50,24 @@ def counted(monkeypatch):
 
 def _run(scene, out, *more, pano=None):
     cloud, panos = str(scene / "cloud.ply"), pano or [str(scene / "images")]
-    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", "none", *more])
+    cache = str(scene.parent / "maps")
+    return localize.main(["--cloud", cloud, "--pano", *panos, "--out", str(out), "--cache", cache, *more])
 
 
 def _lines(out):
     """The lines of a file of results without what differs from run to run."""
     return [json.loads(line) | {"seconds": None} for line in out.read_text().splitlines()]
+
+
+@pytest.fixture(scope="module")
+def two(scene, tmp_path_factory):
+    """Two photos, the second of which lies elsewhere, and the content of their file of results."""
+    folder = tmp_path_factory.mktemp("two")
+    photo, out = folder / "clean_1.jpg", folder / "poses.jsonl"
+    photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
+    panos = [str(scene / "images" / "clean_0.jpg"), str(photo)]
+    assert _run(scene, out, "--quiet", pano=panos) == 0
+    return panos, out.read_bytes()
 
 
 def test_folders_lists_and_standard_input_name_panoramas(scene, tmp_path):
@@ -118,22 +130,17 @@ def test_a_batch_goes_on_where_it_was_stopped(scene, tmp_path, out, counted, cap
         (b'{"format": "piccolo-pose/3"}\n', "line 1: found format 'piccolo-pose/3'"),
     ],
 )
-def test_a_file_of_another_run_is_refused_with_both_ways(
-    scene, tmp_path, out, images, change, message, capsys
-):
-    photo = tmp_path / "clean_1.jpg"
-    photo.write_bytes(images[1])
-    panos = [str(scene / "images" / "clean_0.jpg"), str(photo)]
-    assert _run(scene, out, "--quiet", pano=panos) == 0
+def test_a_file_of_another_run_is_refused_with_both_ways(scene, tmp_path, out, two, change, message, capsys):
+    panos, before = two
     (tmp_path / "other.ply").write_bytes((scene / "cloud.ply").read_bytes() + b"\0")
     more = []
     if isinstance(change, bytes):
-        out.write_bytes(change)
+        before = change
     elif change[0] == "--pano":
         panos = [str(scene / "images" / change[1])]
     else:
         more = [word.replace("other", str(tmp_path / "other.ply")) for word in change]
-    before = out.read_bytes()
+    out.write_bytes(before)
     assert _run(scene, out, "--quiet", *more, pano=panos) == 3
     err = capsys.readouterr().err
     assert message in err

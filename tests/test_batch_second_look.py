@@ -1,4 +1,8 @@
-"""A second look at photos of a batch that are not sure, beside those that are."""
+"""A second look at photos of a batch that are not sure, beside those that are.
+
+The first test takes one as a whole; where many are needed, which photos are sure alone or beside others is
+made up by their names, and what a batch asks for and keeps is looked at.
+"""
 
 import errno
 import json
@@ -9,20 +13,28 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+import rooms
+from pictures import encoded, write
+from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, opened_scan
 from piccolo.batch.localizer import Localizer
 from piccolo.batch.results_file import StreamOutput
 from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks_beside
 from piccolo.camera import Mount
+from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli import localize
+from piccolo.cloud.settings import CloudSettings
 from piccolo.confidence.covariance import describe_errors
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
+from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan
 from piccolo.photo import Photo
-from piccolo.result import Result
+from piccolo.result import Beside, Result, read_results
+from research.synthetic.world import render_picture
 
 CAMERA = {"model": "PINHOLE"}
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
@@ -33,6 +45,34 @@ def _text(pano, status="localized", beside=None, camera=CAMERA, confidence=0.95)
     fields = {"pano": pano, "pano_sha256": "1", "status": status, "confidence": confidence}
     size = {"image_size": [1024, 512], "focal_length": None}
     return json.dumps({**fields, **size, "beside": beside, "camera": camera})
+
+
+def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
+    """A narrow photo of what a wide one shows, which is added to the run; a copy of itself is none."""
+    room, pose = place(1)
+    near = Pose(yaw_rotation(0.2) @ pose.R_cam_from_world, pose.center_world + np.array([0.15, 0.1, 0.05]))
+    photos, cameras, out = tmp_path / "photos", tmp_path / "cameras", tmp_path / "poses.jsonl"
+    photos.mkdir()
+    cameras.mkdir()
+    for name, focal, at in (("narrow", 180.0, near), ("wide", 100.0, pose)):
+        camera = Mount(pinhole(320, 240, focal))
+        write(photos / f"{name}.png", encoded(render_picture(camera, room, at, Workers(2)), ".png"))
+        write(cameras / f"{name}.camera.json", json.dumps(document_of((camera,))).encode())
+    words = ["--cloud", str(rooms.map_path(SEED)), "--camera", str(cameras), "--quiet"]
+    assert localize.main([*words, "--pano", str(photos / "narrow.png"), "--out", str(out)]) == 1
+    (before,) = read_results([out])
+    assert localize.main([*words, "--pano", str(photos), "--out", str(out)]) == 0
+    narrow, wide = sorted(read_results([out]), key=lambda result: result.pano)
+    assert before.status != "localized"
+    assert (wide.status, wide.beside) == ("localized", None)
+    assert (narrow.status, narrow.beside.photos) == ("localized", (wide.pano,))
+    assert before.confidence < narrow.confidence <= wide.confidence
+    assert narrow.pose.distance(near) < 0.05
+    localizer = Localizer((Path("room"),), rooms.AUTO, CloudSettings(), Photo("", camera=cameras), None)
+    look = Look(0, before.status, narrow.pano, before.to_json(), (narrow.to_json(),), "1")
+    task = localizer.task(photos / "narrow.png")
+    again = localizer.answer_in(rooms.scan(SEED)._opened)(task._replace(look=look))
+    assert again.result == replace(before, beside=Beside((), "1"))
 
 
 def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
@@ -119,12 +159,12 @@ def looked(monkeypatch):
 
     monkeypatch.setattr(OpenedScan, "localize", localize)
     monkeypatch.setattr(OpenedScan, "localize_again", localize_again)
-    monkeypatch.setattr(Localizer, "locate", lambda self, scan, line: line)
+    monkeypatch.setattr(Localizer, "place_keypoints", lambda self, scan, line: line)
     return looked
 
 
 def _run(scene, photos, *more):
-    cloud, cache = str(scene / "cloud.ply"), scene.parent / "cache of second looks"
+    cloud, cache = str(scene / "cloud.ply"), scene.parent / "maps"
     return localize.main(["--cloud", cloud, "--pano", str(photos), "--cache", str(cache), *map(str, more)])
 
 
@@ -290,7 +330,7 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     opened = scan._opened
     settings = opened.settings, opened.cloud_settings
     localizer = Localizer((scene / "cloud.ply",), *settings, Photo(""), None)
-    located, confidence, gaussian = localizer.locate(opened, text)
+    located, confidence, gaussian = localizer.place_keypoints(opened, text)
     assert confidence == json.loads(text)["confidence"]
     in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix
     np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
@@ -299,15 +339,15 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     assert (located.ranges > 0.0).all()
     asked = []
     with monkeypatch.context() as patch:
-        patch.setattr(Localizer, "locate", lambda self, scan, line: asked.append(line))
+        patch.setattr(Localizer, "place_keypoints", lambda self, scan, line: asked.append(line))
         patch.setattr(OpenedScan, "localize_again", lambda self, path, first, found, *_: (first, (*found(),)))
         answer = localizer.answer_in(opened)
         for beside in ((text, " " + text), (" " + text, "  " + text)):
             answer(localizer.task(photo)._replace(look=Look(0, "ambiguous", str(photo), text, beside, "1")))
     assert [line.count(" {") - text.count(" {") for line in asked] == [0, 1, 1]
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
-    assert localizer.locate(opened, text) is None
+    assert localizer.place_keypoints(opened, text) is None
     photo.unlink()
-    assert localizer.locate(opened, text) is None
+    assert localizer.place_keypoints(opened, text) is None
     with pytest.raises(InputError, match="photos beside others: not available with the preset paper"):
         opened.require_default_method("photos beside others", None)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from test_verification import NUM_POINTS, SETTINGS, _beside, _narrow, _query, _true_pose
+from test_verification import NUM_POINTS, _beside, _narrow, _query, _true_pose
 
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import Pose
@@ -29,7 +29,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     ask = functools.partial(localize_beside, rooms.scan_map(1, NUM_POINTS), panorama, [])
     found, names = ask(
         {"bare": SurePhoto(nothing, 0.99, None), "beside": SurePhoto(_beside(), 0.97, None)},
-        SETTINGS,
+        rooms.UNKNOWN,
         Workers(2),
         Stopwatch(),
     )
@@ -39,7 +39,7 @@ def test_a_photo_is_localized_beside_one_that_shows_the_same():
     assert found.probability_none == pytest.approx(1.0 - found.confidence, abs=0.01)
     assert found.evidence.num_matches >= 20
     assert rooms.errors(found.pose, _narrow()[1])[0] < 0.03
-    assert ask({"bare": SurePhoto(nothing, 0.99, None)}, SETTINGS, Workers(2), Stopwatch()) == (
+    assert ask({"bare": SurePhoto(nothing, 0.99, None)}, rooms.UNKNOWN, Workers(2), Stopwatch()) == (
         Localization(),
         (),
     )
@@ -84,7 +84,7 @@ def _at(pose, std):
     return PoseGaussian(pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
 
 
-def _fused(judged, of_photo, settings=SETTINGS, fit=None):
+def _fused(judged, of_photo, settings=rooms.UNKNOWN, fit=None):
     """The mean of a result's pose and that by a photo beside, at the true pose."""
     matches = _matches_of(_true_pose(), 1e-3, np.random.default_rng(1))
     located = verification.Located(_beside().keypoints, _beside().ranges, of_photo.pose)
@@ -108,7 +108,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert _fused(replace(judged, is_ruled_out=True), _at(true, 0.01)) is None
     assert _fused(replace(judged, gaussian=None), _at(true, 0.01)) is None
     here = rooms.scan_map(1, NUM_POINTS).to_world(true).center_world
-    away = replace(SETTINGS, prior=Prior(near=(*(here[:2] + 5.0), None), radius=0.5))
+    away = replace(rooms.UNKNOWN, prior=Prior(near=(*(here[:2] + 5.0), None), radius=0.5))
     assert _fused(judged, _at(true, 0.01), away) is None
     motion = np.zeros((6, 1))
     motion[3] = 1.0

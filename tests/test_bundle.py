@@ -2,6 +2,8 @@
 
 import functools
 import math
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,42 +15,40 @@ from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.bundle import CONTRADICTS, NOT_FOUND, UNSEEN, compare_errors, localize_bundle
-from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
-from piccolo.localization.bundle_search import (
-    Member,
-    Support,
-    is_same_bundle,
-    move_origin_near,
-    propose_with_scale,
-    weigh_bundles,
+from piccolo.localization import bundle_search
+from piccolo.localization.bundle import (
+    CONTRADICTS,
+    NOT_FOUND,
+    UNSEEN,
+    compare_errors,
+    judge_member,
+    localize_bundle,
 )
-from piccolo.localization.localize import localize
+from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.localization.selection import Selection
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import Panorama
 from research.synthetic.photos import mask_outside_field
 from research.synthetic.world import photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5
-SETTINGS = CoarseToFineSettings(gravity="known")
 ERRORS = RelativeErrors()
 WHERE = (1, 2, 7)  # eighths of a turn; the first photo shows a bare wall
 
 
 def _support(odds, elsewhere=0.0, is_found=True):
-    return Support(at(0.0, 0.5), None, is_found, odds, elsewhere, 100)
+    return bundle_search.Support(at(0.0, 0.5), None, is_found, odds, elsewhere, 100)
 
 
 def _alone(*probabilities):
     """A photo with poses of its own."""
     poses = [at(float(k), 0.5) for k in range(len(probabilities))]
-    alternatives = tuple(
-        Alternative(h.pose, h.score, None, p) for h, p in zip(poses, probabilities, strict=True)
+    likely = list(zip(poses, probabilities, strict=True))
+    alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
+    alone = Localization(pose=poses[0].pose, confidence=probabilities[0], alternatives=alternatives)
+    return bundle_search.Member(
+        None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0]
     )
-    alone = Localization(confidence=probabilities[0], alternatives=alternatives[1:])
-    return Member(None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0])
 
 
 MISSES = _support(0.0, is_found=False)
@@ -58,34 +58,34 @@ TEN = [_alone(0.1, 0.1, 0.1)] * 10  # 30 poses proposed, none of them likely
 
 def test_one_sure_photo_is_enough_beside_misses():
     bundles = [[SURE, MISSES, MISSES], [_support(1e-3), MISSES, MISSES]]
-    probabilities = weigh_bundles(bundles, TEN[:3])
+    probabilities = bundle_search.weigh_bundles(bundles, TEN[:3])
     assert probabilities[0] > 0.98
     assert probabilities.sum() == pytest.approx(1.0)
-    many = weigh_bundles(
+    many = bundle_search.weigh_bundles(
         [[*bundles[0], *[MISSES] * 20]], TEN[:3]
-    )  # bare walls lie together: they count as one
-    assert many[0] == pytest.approx(weigh_bundles(bundles[:1], TEN[:3])[0])
+    )  # bare walls: they count as one
+    assert many[0] == pytest.approx(bundle_search.weigh_bundles(bundles[:1], TEN[:3])[0])
 
 
 def test_weak_photos_that_coincide_beat_a_stronger_one():
     weak = [_support(0.43)] * 4
     strong = [_support(4.0), MISSES, MISSES, MISSES]
-    together, alone, _ = weigh_bundles([weak, strong], TEN)
+    together, alone, _ = bundle_search.weigh_bundles([weak, strong], TEN)
     assert together > 0.99
     assert alone < 0.01
-    assert weigh_bundles([weak[:1]], TEN)[0] < 0.5
+    assert bundle_search.weigh_bundles([weak[:1]], TEN)[0] < 0.5
 
 
 def test_two_poses_that_coincide_among_many_may_do_so_by_chance():
     pair = [_support(0.02), _support(0.02), MISSES]
-    assert weigh_bundles([pair], TEN * 2)[0] < 0.5
-    assert weigh_bundles([pair], [_alone(0.02)])[0] > 0.9
+    assert bundle_search.weigh_bundles([pair], TEN * 2)[0] < 0.5
+    assert bundle_search.weigh_bundles([pair], [_alone(0.02)])[0] > 0.9
 
 
 def test_where_nothing_is_found_none_is_likely():
-    assert weigh_bundles([], []).tolist() == [1.0]
-    assert weigh_bundles([[MISSES] * 3], TEN)[-1] > 0.9
-    assert np.isfinite(weigh_bundles([[_support(1e6)] * 300, [MISSES] * 300], TEN)).all()
+    assert bundle_search.weigh_bundles([], []).tolist() == [1.0]
+    assert bundle_search.weigh_bundles([[MISSES] * 3], TEN)[-1] > 0.9
+    assert np.isfinite(bundle_search.weigh_bundles([[_support(1e6)] * 300, [MISSES] * 300], TEN)).all()
 
 
 def test_sure_photos_elsewhere_speak_against_the_relative_poses():
@@ -93,8 +93,23 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
     out = _support(0.0, 30.0, is_found=False)
     members = [_alone(0.97)] * 3
     own = _support(30.0)
-    assert weigh_bundles([[own, out, out]], members)[-1] > 0.9
-    assert weigh_bundles([[own, own, out]], members)[0] > 0.9
+    assert bundle_search.weigh_bundles([[own, out, out]], members)[-1] > 0.9
+    assert bundle_search.weigh_bundles([[own, own, out]], members)[0] > 0.9
+
+
+@pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])
+def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
+    query = SimpleNamespace(given=SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured)))
+    fit = conflict and SimpleNamespace(conflict=conflict)
+    alone = Localization(is_ruled_out=True, warnings=("mirrored",), confidence=0.0)
+    member = _alone(0.9)
+    member = replace(member, query=query, fit=fit, alone=alone)
+    assert member.own_poses == []
+    assert member.is_misplaced == (conflict == 5.0 and is_measured)
+    if not member.is_misplaced:
+        agreed = SimpleNamespace(warnings=("scale",))
+        result = judge_member(member, 0, SURE, agreed, [], np.array([1.0, 0.0]))
+        assert result == replace(alone, warnings=("mirrored", "scale"))
 
 
 def test_a_photo_belongs_to_the_others_or_does_not():
@@ -122,7 +137,7 @@ def test_an_own_pose_far_from_the_one_expected_is_doubted():
 def _members(far):
     """Two photos whose common frame begins `far` [m] from them."""
     cams = [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in tilted_poses(2, NEAR)]
-    return [Member(None, None, None, Localization(), cam) for cam in cams]
+    return [bundle_search.Member(None, None, None, Localization(), cam) for cam in cams]
 
 
 @pytest.mark.parametrize("far", [0.0, 1e3])
@@ -133,23 +148,21 @@ def test_bundles_are_the_same_where_the_photos_are(far):
     own = bundle.place(members[0].cam_from_bundle)
     turned = Pose(exp_so3(np.array([0.0, 0.0, 0.02])) @ own.R_cam_from_world, own.center_world)
     about_photo = Bundle(members[0].cam_from_bundle.inverse() @ turned)
-    assert is_same_bundle(members, bundle, bundle)
-    assert is_same_bundle(members, bundle, about_photo)
+    assert bundle_search.is_same_bundle(members, bundle, bundle)
+    assert bundle_search.is_same_bundle(members, bundle, about_photo)
     about_origin = Bundle(add(bundle.pose, np.array([0.0, 0.0, 0.02, 0.0, 0.0, 0.0])))
-    assert is_same_bundle(members, bundle, about_origin) == (far == 0.0)
+    assert bundle_search.is_same_bundle(members, bundle, about_origin) == (far == 0.0)
     moved = Bundle(add(bundle.pose, np.array([0.0, 0.0, 0.0, 0.6, 0.0, 0.0])))
-    assert not is_same_bundle(members, bundle, moved)
+    assert not bundle_search.is_same_bundle(members, bundle, moved)
 
 
 def test_the_common_frame_is_moved_near():
     cams = [member.cam_from_bundle for member in _members(1e6)]
-    moved = move_origin_near(cams)
+    moved = bundle_search.move_origin_near(cams)
     assert np.linalg.norm(np.mean([pose.center_world for pose in moved], axis=0)) < 1e-9
     there = moved[1].center_world - moved[0].center_world
     np.testing.assert_allclose(there, cams[1].center_world - cams[0].center_world, atol=1e-9)
-    assert all(
-        np.array_equal(a.R_cam_from_world, b.R_cam_from_world) for a, b in zip(cams, moved, strict=True)
-    )
+    assert all((a.R_cam_from_world == b.R_cam_from_world).all() for a, b in zip(cams, moved, strict=True))
 
 
 @pytest.mark.parametrize("free", [False, True])
@@ -161,13 +174,13 @@ def test_two_photos_propose_the_scale(free):
     for scale, is_tried in ((1.3, True), (5.0, free)):
         true = Bundle(here, math.log(scale))
         pair = [true.place(m.cam_from_bundle) for m in (one, other)]
-        found = propose_with_scale(one, pair[0], other, pair[1], errors)
+        found = bundle_search.propose_with_scale(one, pair[0], other, pair[1], errors)
         assert len(found) == is_tried
         for bundle in found:
             assert bundle.log_scale == pytest.approx(math.log(scale))
             assert pose_errors(bundle.pose, here)[0] < 1e-9
     turned = Pose(yaw_rotation(0.3) @ pair[1].R_cam_from_world, pair[1].center_world)
-    assert propose_with_scale(one, pair[0], other, turned, errors) == []
+    assert bundle_search.propose_with_scale(one, pair[0], other, turned, errors) == []
 
 
 @functools.lru_cache
@@ -207,14 +220,17 @@ def _relative(poses, far=0.0):
     return [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in noisy]
 
 
+def _together(photos, poses, num_threads=2):
+    """Results in room SEED of photos with relative poses."""
+    how = rooms.KNOWN, Workers(num_threads), Stopwatch(), ERRORS
+    return localize_bundle(rooms.scan_map(SEED), photos, poses, *how)
+
+
 @functools.lru_cache
 def _localized(seed, num_threads=2, far=0.0, eighths=WHERE):
     """Results in room SEED of photos of a room."""
     photos, poses = zip(*_taken(seed, eighths), strict=True)
-    workers = Workers(num_threads)
-    return localize_bundle(
-        rooms.scan_map(SEED), photos, _relative(poses, far), SETTINGS, workers, Stopwatch(), ERRORS
-    )
+    return _together(photos, _relative(poses, far), num_threads)
 
 
 def _bits(found):
@@ -223,7 +239,7 @@ def _bits(found):
 
 def test_photos_are_localized_together_of_which_one_is_not_alone():
     photos, poses = zip(*_taken(SEED), strict=True)
-    alone = localize(rooms.scan_map(SEED), photos[0], SETTINGS, Workers(2), Stopwatch())
+    alone = rooms.locate(photos[0], rooms.scan_map(SEED), rooms.KNOWN)
     assert alone.status == "not_localized"
     assert pose_errors(alone.pose, poses[0])[0] > 1.0
     found = _localized(SEED)
@@ -238,17 +254,19 @@ def test_photos_are_localized_together_of_which_one_is_not_alone():
 
 
 def test_photos_of_another_room_are_not_localized():
-    for found in _localized(6):
+    for found in _localized(6, eighths=WHERE[:2]):
         assert found.status == "not_localized"
         assert found.confidence < 0.5
 
 
 def test_bundles_are_the_same_bits_at_any_number_of_threads():
-    assert _bits(_localized(SEED, 1)) == _bits(_localized(SEED, 2))
+    one, two = (_localized(SEED, num_threads, 0.0, WHERE[:2]) for num_threads in (1, 2))
+    assert _bits(one) == _bits(two)
 
 
 def test_it_does_not_matter_where_the_common_frame_begins():
-    for near, far in zip(_localized(SEED), _localized(SEED, far=1e6), strict=True):
+    both = (_localized(SEED, 2, far, WHERE[:2]) for far in (0.0, 1e6))
+    for near, far in zip(*both, strict=True):
         assert pose_errors(near.pose, far.pose)[0] < 1e-5
         assert near.confidence == pytest.approx(far.confidence, abs=1e-4)
 
@@ -260,17 +278,11 @@ def test_photos_that_fit_nowhere_have_no_pose():
     assert found.warnings == (NOT_FOUND,)
 
 
-def _together(photos, poses):
-    """Results in room SEED of photos with relative poses."""
-    scan_map = rooms.scan_map(SEED)
-    return localize_bundle(scan_map, photos, poses, SETTINGS, Workers(2), Stopwatch(), ERRORS)
-
-
 def test_a_stranger_is_named_and_lowers_nobody():
     photos, poses = zip(*_taken(SEED), strict=True)
-    stranger = _taken(6)[2][0]
+    ((stranger, _),) = _taken(6, WHERE[2:])
     *right, other = _together([*photos[:2], stranger], _relative(poses))
-    pair = _together(photos[:2], _relative(poses)[:2])
+    pair = _localized(SEED, 2, 0.0, WHERE[:2])
     assert other.status == "not_localized"
     assert other.warnings in ((UNSEEN,), (CONTRADICTS,))
     for with_stranger, without in zip(right, pair, strict=True):
@@ -292,14 +304,6 @@ def test_a_photo_that_shows_nothing_is_not_localized():
     """The others are."""
     photos, poses = zip(*_taken(SEED), strict=True)
     nothing = Panorama(photos[0].rgb, np.zeros_like(photos[0].is_valid))
-    found = localize_bundle(
-        rooms.scan_map(SEED),
-        [nothing, *photos[1:]],
-        _relative(poses),
-        SETTINGS,
-        Workers(2),
-        Stopwatch(),
-        ERRORS,
-    )
+    found = _together([nothing, *photos[1:]], _relative(poses))
     assert [f.status for f in found] == ["not_localized", "localized", "localized"]
     assert found[0].pose is None

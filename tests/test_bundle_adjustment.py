@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from poses import tilted_poses
 from scipy.stats import chi2
-from test_pose_gaussian import covariance
+from test_pose import covariance
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add, subtract
@@ -41,9 +41,8 @@ def _estimates(seed, number=5, scale=1.0, turn=0.3, move=0.01, own=0.005):
         true = Bundle(here, math.log(scale)).place(cam)
         drawn = np.repeat([math.radians(turn), move], 3) * rng.normal(size=6)
         given = add(cam, drawn)
-        found.append(
-            Estimate(PoseGaussian(add(true, std * rng.normal(size=6)), np.diag(std**2), NONE), given)
-        )
+        noisy = add(true, std * rng.normal(size=6))
+        found.append(Estimate(PoseGaussian(noisy, np.diag(std**2), NONE), given))
     return found, Bundle(here)
 
 

@@ -14,9 +14,8 @@ import numpy as np
 import pytest
 
 from piccolo.cli import terminal
-from piccolo.files import cache, temporary
-from piccolo.files.atomic import replacing
-from piccolo.files.temporary import PREFIX, temporary_folder
+from piccolo.files import atomic, cache
+from piccolo.files.atomic import PREFIX, replacing, temporary_folder
 from piccolo.kernels import jit
 from piccolo.kernels.jit import kernel
 from piccolo.optimize.channel_loss import add_channels
@@ -135,13 +134,7 @@ def test_only_stale_files_of_ours_go_and_only_from_a_folder_that_is_marked(tmp_p
     cache.own_folder(folder, jit.NAME)
     tag = (folder / "CACHEDIR.TAG").read_bytes()
     assert tag.startswith(b"Signature: 8a477f597d28d172789f06886806bc55\n")
-    names = [
-        f"{key}.kernel",
-        f".{key}.kernel.{16 * 'a'}",
-        f"{key[1:]}.kernel",
-        "a.txt",
-        "1" + f"{key[1:]}.kernel",
-    ]
+    names = [f"{key}.kernel", f".{key}.kernel.{16 * 'a'}", f"{key[1:]}.kernel", "a.txt", f"1{key[1:]}.kernel"]
     for foreign in (folder, tmp_path / "foreign"):
         foreign.mkdir(exist_ok=True)
         for name in names:
@@ -285,7 +278,7 @@ def test_importing_writes_nothing(tmp_path):
 
 HOLD = """
 import sys, time
-from piccolo.files.temporary import temporary_folder
+from piccolo.files.atomic import temporary_folder
 with temporary_folder() as folder:
     (folder / "frame.jpg").touch()
     print(folder, flush=True)
@@ -296,7 +289,7 @@ with temporary_folder() as folder:
 @pytest.fixture
 def temporary_folders(tmp_path, monkeypatch):
     """A function that lists the temporary folders there are."""
-    monkeypatch.setattr(temporary.tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(atomic.tempfile, "tempdir", str(tmp_path))
     return lambda: [path for path in tmp_path.iterdir() if path.name.startswith(PREFIX)]
 
 
@@ -321,8 +314,5 @@ def test_what_a_killed_process_left_is_removed_and_what_a_living_one_has_stays(t
     (tmp_path / f"{PREFIX}12345678").symlink_to(tmp_path)
     (tmp_path / f"{PREFIX}87654321").mkdir()  # made a moment ago
     with temporary_folder() as own:
-        assert {path.name for path in temporary_folders()} == {
-            own.name,
-            f"{PREFIX}12345678",
-            f"{PREFIX}87654321",
-        }
+        others = {f"{PREFIX}12345678", f"{PREFIX}87654321"}
+        assert {path.name for path in temporary_folders()} == {own.name, *others}

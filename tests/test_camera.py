@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 from cameras import calibrated, four_sides
 from pictures import encoded, write
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 from rooms import room
 
 from piccolo.camera import Camera, Mount
@@ -20,13 +20,7 @@ from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
-from research.synthetic.world import (
-    make_query,
-    photograph,
-    picture_of_all,
-    pose_of_query,
-    render_picture,
-)
+from research.synthetic.world import make_query, photograph, picture_of_all, pose_of_query, render_picture
 
 SIZE = (1000, 800)
 TOLERANCE = 1e-6  # px
@@ -150,9 +144,8 @@ def test_scaled_keeps_rays():
         this = camera(model)
         half = this.scale_to_size(500, 400)
         rays, is_seen = this.rays(points())
-        np.testing.assert_allclose(
-            half.pixels(rays)[0][is_seen], this.pixels(rays)[0][is_seen] / 2.0, atol=1e-9
-        )
+        halved = half.pixels(rays)[0][is_seen]
+        np.testing.assert_allclose(halved, this.pixels(rays)[0][is_seen] / 2.0, atol=1e-9)
     with pytest.raises(InputError, match="found a picture of 500 x 300 and a calibration for 1000 x 800"):
         camera("PINHOLE").scale_to_size(500, 300)
 
@@ -182,8 +175,7 @@ def test_resolution_is_the_focal_length():
     ],
 )
 def test_what_is_no_camera_is_refused(values, message):
-    with pytest.raises(InputError, match=message):
-        Camera(*values)
+    assert_input_error(message, Camera, *values)
 
 
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))

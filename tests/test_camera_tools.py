@@ -10,7 +10,7 @@ from pictures import write
 from rooms import write_room
 
 from piccolo.camera import Camera, Mount
-from piccolo.camera.files import document_of
+from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole
 from piccolo.cli import export_poses, localize, render_pose
 from piccolo.geometry.pose import exp_so3
@@ -44,9 +44,8 @@ def test_the_same_pose_is_photographed_as_a_sphere_and_by_a_camera():
     room, pose, _ = pose_of_query(world, 0, "tilt")
     full = photograph(room, pose, 2048, Workers(2))
     mount = Mount(WIDE, TURN)
-    difference = np.abs(
-        cut(full, WIDE, mount.rotation).astype(int) - render_picture(mount, room, pose, Workers(2))
-    )
+    drawn = render_picture(mount, room, pose, Workers(2))
+    difference = np.abs(cut(full, WIDE, mount.rotation).astype(int) - drawn)
     assert np.median(difference) <= 2
     assert difference.mean() < 4
 

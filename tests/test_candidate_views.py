@@ -9,8 +9,7 @@ import rooms
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.settings import METHOD
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.views import candidate_views, points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
@@ -115,7 +114,7 @@ def _pose(*center):
 
 
 def _query():
-    return prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(1))
+    return rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
 
 
 def test_poses_near_one_place_share_what_is_drawn_and_no_others(monkeypatch):

@@ -7,16 +7,7 @@ import numpy as np
 import pytest
 
 from piccolo.geometry.pose import Pose, exp_so3, step
-from piccolo.optimize.channel_loss import (
-    CHANCE,
-    FLAT,
-    NUM_BLOCKS,
-    NUM_MOMENTS,
-    ChannelProblem,
-    channel_equations,
-    correlate,
-    score,
-)
+from piccolo.optimize import channel_loss
 from piccolo.optimize.levenberg_marquardt import levenberg_marquardt, retract, solve_damped
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
 from piccolo.panorama.texels import pack_texels
@@ -47,8 +38,8 @@ def _loss(problem, pose):
 def _sums(problem, pose, is_valid=None):
     points, levels, weights, rgb = problem
     sums, texels = np.empty(NUM_SUMS), pack_texels(rgb, is_valid)
-    arguments = ChannelProblem(points, levels, weights, texels.rgbx, texels.width, SCALE)
-    channel_equations(arguments, pose.R_cam_from_world, pose.center_world, sums)
+    arguments = channel_loss.ChannelProblem(points, levels, weights, texels.rgbx, texels.width, SCALE)
+    channel_loss.channel_equations(arguments, pose.R_cam_from_world, pose.center_world, sums)
     return sums
 
 
@@ -90,13 +81,13 @@ def test_a_point_on_masked_pixels_costs_half_of_the_most_it_could():
 
 def test_moments_of_each_block_are_over_what_both_show():
     arguments, (shown, levels, w, blocks) = _blockwise()
-    sums = np.empty((NUM_BLOCKS, NUM_MOMENTS))
-    correlate(*arguments, sums)
+    sums = np.empty((channel_loss.NUM_BLOCKS, channel_loss.NUM_MOMENTS))
+    channel_loss.correlate(*arguments, sums)
     a = levels - 127.5
     b = shown - 127.5
     products = np.stack([(a * b).sum(axis=0), (a * a).sum(axis=0), (b * b).sum(axis=0)])
     terms = w * np.concatenate([products, np.ones((1, len(w))), a, b])
-    expected = [[term[blocks == block].sum() for term in terms] for block in range(NUM_BLOCKS)]
+    expected = [[term[blocks == block].sum() for term in terms] for block in range(channel_loss.NUM_BLOCKS)]
     np.testing.assert_allclose(sums, expected, rtol=1e-3, atol=0.5)
     np.testing.assert_allclose(sums[:, 3], np.array(expected)[:, 3], rtol=1e-5)
     np.testing.assert_allclose(sums[:, 4:], np.array(expected)[:, 4:], atol=2e-3)
@@ -107,7 +98,7 @@ def test_a_pose_scores_what_its_blocks_correlate_beyond_chance():
     """Channels around their means over the block."""
     arguments, of_twin = _blockwise()
     total = _score(*of_twin)
-    assert score(*arguments) == pytest.approx(total, abs=1e-4)
+    assert channel_loss.score(*arguments) == pytest.approx(total, abs=1e-4)
     assert 0.2 < total < 0.7
 
 
@@ -115,7 +106,7 @@ def test_plain_blocks_do_not_correlate_whatever_their_colours_are():
     """Nor does noise below the least deviation; but an edge as strong as it does."""
     points, _, weights, rgb = _problem()
     weights = (weights / weights.sum()).astype(np.float32)
-    blocks = (np.arange(len(weights)) * NUM_BLOCKS // len(weights)).astype(np.int32)
+    blocks = (np.arange(len(weights)) * channel_loss.NUM_BLOCKS // len(weights)).astype(np.int32)
     plain = np.full_like(rgb, (200, 90, 180))
     step_up = np.where(np.arange(rgb.shape[1])[None, :, None] < rgb.shape[1] // 2, 100, 160).astype(np.uint8)
     step_up = np.ascontiguousarray(np.broadcast_to(step_up, rgb.shape))
@@ -129,7 +120,7 @@ def test_plain_blocks_do_not_correlate_whatever_their_colours_are():
         levels = levels + noise * np.random.default_rng(1).normal(size=levels.shape)
         texels = pack_texels(image)
         how = texels.rgbx, texels.width, TILTED.R_cam_from_world, TILTED.center_world
-        found = score(points, levels.astype(np.float32), weights, blocks, *how)
+        found = channel_loss.score(points, levels.astype(np.float32), weights, blocks, *how)
         assert least <= found <= most + 1e-6
         w = weights.astype(float)
         assert found == pytest.approx(_score(naive.sample(image, pixels).T, levels, w, blocks), abs=1e-4)
@@ -145,7 +136,7 @@ def _blockwise():
     noise = np.linspace(0, 200, points.shape[1]).astype(np.float32)
     levels = np.clip(shown + noise * (levels - 130) / 70, 0, 255).astype(np.float32)
     w = weights * (naive.sample(is_valid[..., None], pixels)[:, 0] > 1 - 1e-9) / weights.sum()
-    blocks = (np.arange(points.shape[1]) * NUM_BLOCKS // points.shape[1]).astype(np.int32)
+    blocks = (np.arange(points.shape[1]) * channel_loss.NUM_BLOCKS // points.shape[1]).astype(np.int32)
     texels = pack_texels(rgb, is_valid)
     how = texels.rgbx, texels.width, TILTED.R_cam_from_world, TILTED.center_world
     arguments = points, levels, (weights / weights.sum()).astype(np.float32), blocks, *how
@@ -159,9 +150,9 @@ def _score(shown, levels, weights, blocks):
         w, a, b = weights[blocks == block], levels[:, blocks == block], shown[:, blocks == block]
         a = a - np.average(a, axis=1, weights=w)[:, None]
         b = b - np.average(b, axis=1, weights=w)[:, None]
-        variances = [max((w * x * x).sum() / w.sum(), FLAT**2) for x in (a, b)]
+        variances = [max((w * x * x).sum() / w.sum(), channel_loss.FLAT**2) for x in (a, b)]
         correlation = (w * a * b).sum() / w.sum() / math.sqrt(variances[0] * variances[1])
-        total += max(correlation - CHANCE, 0) / (1 - CHANCE) * w.sum()
+        total += max(correlation - channel_loss.CHANCE, 0) / (1 - channel_loss.CHANCE) * w.sum()
     return total
 
 

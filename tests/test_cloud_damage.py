@@ -1,14 +1,20 @@
-"""Files of points with bytes changed at random: read, or refused in one line, and nothing else."""
+"""Files of points and meshes that are damaged, cut off or hostile: read, or refused in one line."""
 
 import io
+import json
+import struct
+import sys
+import zlib
 
+import meshes as made
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from las_files import las_bytes, laz_bytes
+from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf, write_obj, write_ply
 from plyfile import PlyData
-from refusals import assert_refused, mutated, read_or_refused
+from refusals import assert_input_error, assert_refused, mutated, read_or_refused
 from test_cloud_las import RAW
 from test_cloud_morton import read
 from test_cloud_npz import PAIR, WHOLE
@@ -17,7 +23,9 @@ from test_cloud_ply import vertices
 from test_cloud_ptx import TWO_SCANS, pts
 from test_cloud_text import lines_of
 
-from piccolo.cloud import open_source
+from piccolo.cloud import open_cloud, open_source, read_cloud
+from piccolo.cloud.readers import mesh_files
+from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.reader import RawCloud
 
 SMALL = RawCloud(RAW.points_world[:60], RAW.colors[:60])
@@ -58,9 +66,14 @@ def test_mutated_files_are_read_or_refused(name, data, tmp_path_factory):
     head = mutated(data.draw, st.integers, content[:cut])
     path = tmp_path_factory.getbasetemp() / f"mutated {name}"
     path.write_bytes(head + mutated(data.draw, st.integers, content[cut:]))
-    result, message = read_or_refused(lambda path: read(path) if path.stat().st_size > 8 else None, path)
-    assert result is None or result[0].shape == result[1].shape
-    assert message or result or path.stat().st_size <= 8
+    if path.stat().st_size <= 8:  # a text of one line, perhaps
+        return
+    result, message = read_or_refused(read, path)
+    assert (result is None) == bool(message)
+    if result is not None:
+        points, colors = result
+        assert points.shape == colors.shape
+        assert (points.dtype.kind, colors.dtype) == ("f", np.uint8)
 
 
 @pytest.mark.parametrize("name", ["a.las", "7.laz"])
@@ -70,3 +83,265 @@ def test_a_file_cut_while_it_is_read_is_refused(tmp_path, name):
     source = open_source(path)
     path.write_bytes(CONTENTS[name][:-300])
     assert_refused("the file was cut while it was read", lambda _: list(source.read_chunks()), path)
+
+
+def refusal(path, read=read_cloud):
+    _, message = read_or_refused(read, path)
+    assert message
+    return message
+
+
+ELSEWHERE = ["../wall.png", "/etc/hostname", "https://example.com/wall.png", "file:///etc/hostname"]
+
+
+@pytest.mark.parametrize("name", [*ELSEWHERE, "..\\wall.png", "C:\\wall.png", "gone.png", "a" * 5000])
+def test_references_are_held_to_the_folder(tmp_path, name):
+    folder = tmp_path / "mesh"
+    folder.mkdir()
+    (tmp_path / "wall.png").write_bytes(made.png())
+    gltf = made.textured_gltf()
+    gltf.tree["images"] = [{"uri": name}]
+    paths = [
+        made.write_obj(folder, mtl=f"newmtl wall\nmap_Kd {name}\n"),
+        gltf.glb(folder / "a.glb"),
+        made.textured_gltf().gltf(folder / "a.gltf", name, is_written=False),
+        made.write_ply(
+            folder / "a.ply", uv=made.UV_FROM_BELOW, options={"comments": [f"TextureFile {name}"]}
+        ),
+    ]
+    for path in paths:
+        assert f"names the file {name[:100]!a}" in refusal(path)
+
+
+def test_a_link_out_of_the_folder_is_refused_and_missing_materials_are_named(tmp_path):
+    folder = tmp_path / "mesh"
+    folder.mkdir()
+    path = made.write_obj(folder)
+    (folder / "wall.png").rename(tmp_path / "wall.png")
+    (folder / "wall.png").symlink_to(tmp_path / "wall.png")
+    assert "names the file 'wall.png', wanted names in the mesh's own folder or below" in refusal(path)
+    assert "names the file 'room.mtl', which is not in its" in refusal(made.write_obj(tmp_path, mtl=""))
+
+
+def test_a_texture_that_says_it_is_huge_is_refused(tmp_path):
+    texture = bytearray(made.png())
+    texture[16:24] = struct.pack(">II", 40_000, 40_000)
+    texture[29:33] = struct.pack(">I", zlib.crc32(texture[12:29]))
+    options = {"comments": ["TextureFile wall.png"]}
+    ply = made.write_ply(tmp_path / "a.ply", uv=made.UV_FROM_BELOW, options=options)
+    glb = made.textured_gltf(bytes(texture)).glb(tmp_path / "a.glb")
+    for mesh in (made.write_obj(tmp_path, texture=texture), ply, glb):
+        assert "a texture of 40000 x 40000 texels, wanted at most 268435456" in refusal(mesh)
+
+
+@pytest.mark.parametrize("cut", [20, 60, -30])
+def test_broken_textures_are_refused(tmp_path, cut):
+    noise = np.random.default_rng(1).integers(0, 256, (64, 64, 3), np.uint8)
+    texture = made.png(noise)[:cut]
+    glb = made.textured_gltf(texture).glb(tmp_path / "a.glb")
+    for path in (made.write_obj(tmp_path, texture=texture), glb):
+        assert "can't be read" in refusal(path)
+
+
+def test_a_missing_library_is_named(tmp_path, monkeypatch):
+    path = made.textured_gltf().glb(tmp_path / "a.glb")
+    monkeypatch.setitem(sys.modules, "trimesh", None)
+    assert_input_error(r"needs trimesh.*-r requirements-formats\.txt", open_cloud, [path])
+
+
+@pytest.mark.parametrize(
+    "face", ["1/1 2/2 9/3", "-1/1 -2/2 -3/3", "0/1 1/1 2/2", "1/1 2/0 3/3", f"1/1 2/2 {10**11}/3"]
+)
+def test_wrong_indices_in_obj_are_refused(tmp_path, face):
+    path = made.write_obj(tmp_path)
+    path.write_text(path.read_text() + f"f {face}" + "\n")
+    refusal(path, open_mesh)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "# nothing\n", "v 0 0 0\n", "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2\n", "f 1 2 3\n"]
+)
+def test_empty_meshes_are_refused(tmp_path, text):
+    path = tmp_path / "a.obj"
+    path.write_text(text)
+    refusal(path)
+
+
+def test_float_colors_beyond_1_are_refused_not_cut_off(tmp_path):
+    colors = made.CORNER_COLORS.astype(float)
+    obj = tmp_path / "a.obj"
+    vertices = np.concatenate([made.SQUARE, colors], axis=1)
+    obj.write_text(made.obj_text(vertices, None, library="", material=""))
+    ply = made.write_wedges(tmp_path / "a.ply", colors=colors, kind="float")
+    assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(obj)
+    assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(ply)
+
+
+def test_several_textures_and_colors_of_other_types_of_a_ply_are_refused(tmp_path):
+    for name in ("a.png", "b.png"):
+        (tmp_path / name).write_bytes(made.png())
+    path = made.write_wedges(tmp_path / "a.ply", textures=("a.png", "b.png"))
+    assert "names 2 textures, wanted one" in refusal(path)
+    path = made.write_ply(tmp_path / "a.ply", colors=made.CORNER_COLORS, options={"text": True})
+    path.write_text(path.read_text().replace("uchar green", "ushort green"))
+    assert "'green' is of type u2" in refusal(path)
+
+
+PRIMITIVE = ("meshes", 0, "primitives", 0)
+BASE = ("materials", 0, "pbrMetallicRoughness")
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("accessors", 0, "count"), 10**12),
+        (("accessors", 0, "byteOffset"), 8),
+        (("accessors", 0, "componentType"), 5123),
+        (("accessors", 0, "bufferView"), None),
+        (("accessors", 0, "sparse"), {"count": 1}),
+        (("bufferViews", 0, "byteLength"), 10**9),
+        (("bufferViews", 1, "byteStride"), 0),
+        (("bufferViews", 0, "buffer"), 7),
+        (("nodes", 0, "children"), [0]),
+        (("scenes", 0, "nodes"), [0, 0]),
+        (("scenes", 0, "nodes"), []),
+        (("nodes", 0, "mesh"), 3),
+        (("nodes", 0, "scale"), [0, 0, 0]),
+        ((*PRIMITIVE, "mode"), 6),
+        ((*PRIMITIVE, "material"), 1),
+        ((*PRIMITIVE, "attributes", "TEXCOORD_0"), None),
+        ((*BASE, "baseColorTexture", "texCoord"), 1),
+        ((*BASE, "baseColorTexture", "index"), 4),
+        ((*BASE, "baseColorTexture", "extensions"), {"KHR_texture_transform": {}}),
+        (("materials", 0, "extensions"), {"KHR_materials_pbrSpecularGlossiness": {}}),
+        ((*BASE, "baseColorFactor"), [2, 0, 0, 1]),
+        (("extensionsRequired",), ["KHR_draco_mesh_compression"]),
+        (("asset", "version"), "1.0"),
+        (("asset",), None),
+        (("meshes",), 5),
+    ],
+)
+def test_broken_gltf_is_refused(tmp_path, path, value):
+    gltf = made.textured_gltf()
+    made.change(path, value)(gltf.tree)
+    message = refusal(gltf.glb(tmp_path / "a.glb"), open_mesh)
+    assert path != ("extensionsRequired",) or f"requires the extensions {value[0]!r}, wanted" in message
+
+
+def test_gltf_with_wrong_indices_or_colors_says_so(tmp_path):
+    gltf = made.Gltf()
+    gltf.node(mesh=gltf.mesh(triangles=made.TRIANGLES + 2, colors=made.CORNER_COLORS, uv=None))
+    assert "a face names vertex 5 " in refusal(gltf.glb(tmp_path / "a.glb"))
+    gltf = made.Gltf()
+    gltf.node(mesh=gltf.mesh(uv=None, colors=np.eye(3, dtype=np.float32)))
+    assert "a primitive with [3, 4] rows" in refusal(gltf.glb(tmp_path / "a.glb"))
+
+
+@pytest.mark.parametrize("kind", ["bufferViews", "accessors"])
+def test_data_that_are_promised_many_times_are_refused(tmp_path, kind):
+    gltf = made.textured_gltf()
+    view = gltf.view(bytes(10_000))
+    entry = {
+        "bufferViews": {"buffer": 0, "byteLength": 10_000},
+        "accessors": {"bufferView": view, "componentType": 5121, "type": "SCALAR", "count": 10_000},
+    }[kind]
+    gltf.tree[kind] += [entry] * 5000
+    assert "bytes of data promised in" in refusal(gltf.glb(tmp_path / "a.glb"))
+
+
+def test_data_that_primitives_share_without_end_are_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(mesh_files, "MAX_ROWS", 9999)
+    gltf = made.Gltf()
+    uv = np.tile(made.UV_FROM_ABOVE, (500, 1))
+    gltf.node(mesh=gltf.mesh(np.tile(made.SQUARE, (500, 1)), uv, material=gltf.material(made.png())))
+    [primitive] = gltf.tree["meshes"][0]["primitives"]
+    gltf.tree["meshes"][0]["primitives"] = 10 * [primitive]  # as some exporters do
+    assert open_mesh(gltf.glb(tmp_path / "a.glb")).num_points == 100_000
+    gltf.tree["meshes"][0]["primitives"] = 1000 * [primitive]
+    assert "over 9999 vertices and indices in" in refusal(gltf.glb(tmp_path / "a.glb"))
+
+
+def test_deep_json_and_deep_nodes_are_refused(tmp_path):
+    path = tmp_path / "a.gltf"
+    path.write_text("[" * 200_000)
+    assert "broken JSON" in refusal(path)
+    gltf = made.textured_gltf()
+    for i in range(300):
+        gltf.node(is_root=False, children=[i])
+    gltf.tree["scenes"][0]["nodes"] = [300]
+    assert "over 200 nodes below each other" in refusal(gltf.glb(path))
+
+
+@pytest.mark.parametrize("size", [4, 15, 30, 300, -1, -500])
+def test_cut_glb_files_are_refused(tmp_path, size):
+    path = made.textured_gltf().glb(tmp_path / "a.glb")
+    path.write_bytes(path.read_bytes()[:size])
+    assert "wanted a whole glTF 2.0 mesh" in refusal(path)
+
+
+def test_cut_gltf_buffers_are_refused(tmp_path):
+    path = made.textured_gltf().gltf(tmp_path / "a.gltf", "a b.bin")
+    content = (tmp_path / "a b.bin").read_bytes()
+    (tmp_path / "a b.bin").write_bytes(content[:-1])
+    assert f"the buffer 'a b.bin' has {len(content) - 1} of {len(content)} bytes" in refusal(path)
+
+
+def write_colored_obj(folder):
+    path = folder / "colored.obj"
+    vertices = np.concatenate([SQUARE, CORNER_COLORS / 255], axis=1)
+    path.write_text(obj_text(vertices, None, library="", material=""))
+    return path
+
+
+def write_colored_glb(folder):
+    colored = Gltf()
+    colored.node(mesh=colored.mesh(uv=None, colors=CORNER_COLORS), rotation=[0.5, 0.5, 0.5, 0.5])
+    return colored.glb(folder / "colored.glb")
+
+
+MESHES = {
+    "textured.obj": write_obj,
+    "colored.obj": write_colored_obj,
+    "textured.glb": lambda folder: textured_gltf().glb(folder / "a.glb"),
+    "colored.glb": write_colored_glb,
+    "textured.gltf": lambda folder: textured_gltf().gltf(folder / "a.gltf"),
+    "binary.ply": lambda folder: write_ply(folder / "a.ply", colors=CORNER_COLORS),
+    "text.ply": lambda folder: write_ply(folder / "a.ply", colors=CORNER_COLORS, options={"text": True}),
+}
+
+
+@pytest.fixture(scope="module")
+def few_points():
+    """Few points of a mesh that a flipped bit has made huge."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("piccolo.cloud.readers.mesh.MAX_POINTS", 20_000)
+        yield
+
+
+@pytest.mark.usefixtures("few_points")
+@pytest.mark.parametrize("name", MESHES)
+@settings(deadline=None, max_examples=40, derandomize=True)
+@given(data=st.data())
+def test_mutated_meshes_raise_nothing_but_input_error(name, data, tmp_path_factory):
+    path = MESHES[name](tmp_path_factory.getbasetemp())
+    path.write_bytes(mutated(data.draw, st.integers, path.read_bytes()))
+    cloud, message = read_or_refused(read_cloud, path)
+    assert message or len(cloud.points) >= 1000
+
+
+def test_one_changed_number_of_the_json(tmp_path):
+
+    def entries(part, path=()):
+        for key, entry in list(part.items() if isinstance(part, dict) else enumerate(part)):
+            yield (*path, key)
+            if isinstance(entry, dict | list):
+                yield from entries(entry, (*path, key))
+
+    refusals = 0
+    for way in entries(json.loads(json.dumps(textured_gltf().tree))):
+        for value in (None, -1, 3, 10**20, 1.5, "x", [], {}, [[0]], True):
+            gltf = textured_gltf()
+            change(way, value)(gltf.tree)
+            _, message = read_or_refused(open_mesh, gltf.glb(tmp_path / "a.glb"))
+            refusals += bool(message)
+    assert refusals > 200

@@ -1,5 +1,7 @@
 """Intensity taken for a gray."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from e57_files import ScanToWrite
@@ -15,9 +17,8 @@ from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
-from piccolo.cloud.readers.ptx import open_ptx
-from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, intensity_reader
-from piccolo.cloud.readers.text import open_text
+from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, make_source
+from piccolo.cloud.readers.text import open_ptx, open_text
 from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.geometry.pose import exp_so3
 
@@ -39,7 +40,7 @@ def _in_gray(intensity, points=POINTS, chunk=701):
         for lo in range(0, len(points), chunk):
             yield points[lo : lo + chunk], intensity[lo : lo + chunk]
 
-    return np.concatenate([raw.colors for raw in intensity_reader(read)()])
+    return np.concatenate([raw.colors for raw in make_source(Path("a"), read, "intensity").read_chunks()])
 
 
 def assert_gray(open_file, path, intensity, points_world=POINTS, atol=1e-9):
@@ -183,9 +184,8 @@ def test_ptx_scan_with_colors_after_one_without_is_read_by_its_intensity(tmp_pat
 def test_pcd(tmp_path, encoding):
     intensity = _measured(11, "decibels").astype(np.float32)
     table = np.column_stack([POINTS, intensity]).astype("<f4")
-    fields = [
-        (name, "f4", 1, column) for name, column in zip(("x", "y", "z", "intensity"), table.T, strict=True)
-    ]
+    names = ("x", "y", "z", "intensity")
+    fields = [(name, "f4", 1, column) for name, column in zip(names, table.T, strict=True)]
     path = tmp_path / "a.pcd"
     path.write_bytes(content_of(fields, encoding, 3000))
     assert_gray(open_pcd, path, intensity.astype(float), table[:, :3])

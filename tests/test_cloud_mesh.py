@@ -351,9 +351,8 @@ def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
     decode, calls = mesh_files.Texture.texels, []
     monkeypatch.setattr(mesh_files.Texture, "texels", lambda self: calls.append(self) or decode(self))
     gltf = made.Gltf()
-    first, other = (
-        gltf.material(made.png(pixels)) for pixels in (made.QUADRANTS, made.QUADRANTS[::-1].copy())
-    )
+    pictures = made.QUADRANTS, made.QUADRANTS[::-1].copy()
+    first, other = (gltf.material(made.png(pixels)) for pixels in pictures)
     rows = [gltf.mesh(made.SQUARE + np.float32(i), material=other if i == 2 else first) for i in range(5)]
     gltf.tree["meshes"] = [{"primitives": [gltf.tree["meshes"][i]["primitives"][0] for i in rows]}]
     gltf.node(mesh=0)

@@ -1,5 +1,4 @@
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import naive
@@ -7,8 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from piccolo.cloud import Cloud, open_source, stream_points
-from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud import Cloud, CloudStream, open_source
+from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.voxels import morton_codes, morton_order
 
@@ -26,7 +25,7 @@ def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
 
 def clean(path, raw, scale):
     """The cloud of points in memory as if they had been read from a file."""
-    return replace(stream_points(path, raw), scale=scale).read()
+    return CloudStream([PointSource(path, lambda: iter([raw]))], scale).read()
 
 
 def whole(open_file, path, options=IN_COLORS, *channel):
@@ -122,9 +121,8 @@ def test_millimetres_and_far_outliers_are_warned_of():
     raw = seeded_cloud(16)
     raw.points_world[0] = 5e6
     (warning,) = clean(A, raw, 1.0).warnings
-    assert (
-        warning == "a: points 5000004 m apart limit the precision of the rest to 0.25 m; remove the outliers"
-    )
+    words = "points 5000004 m apart limit the precision of the rest to 0.25 m; remove the outliers"
+    assert warning == f"a: {words}"
 
 
 def test_points_that_are_not_finite_are_dropped_and_counted():

@@ -39,9 +39,7 @@ def content_of(fields, encoding, num_points=1200, **lines):
         "DATA": encoding,
     } | lines
     text = "".join(f"{name} {value}\n" for name, value in header.items() if value is not None)
-    columns = [
-        np.asarray(values).reshape(num_points, -1).astype("<" + type_) for _, type_, _, values in fields
-    ]
+    columns = [np.asarray(v).reshape(num_points, -1).astype("<" + type_) for _, type_, _, v in fields]
     if encoding == "ascii":
         types = [type_ for _, type_, *_ in fields]
         rows = zip(*columns, strict=True)

@@ -5,13 +5,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 from test_cloud_morton import seeded_cloud, whole
 
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.ply_writer import coordinate_type, vertex_rows, write_ply, writing_ply
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.writers import coordinate_type, vertex_rows, write_ply, writing_ply
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -151,8 +151,7 @@ def test_paths_that_are_no_cloud_and_unreadable_files_are_refused(tmp_path, monk
 
 @pytest.mark.parametrize("scale", [0.0, -1.0, np.nan, np.inf])
 def test_scales_are_above_zero(scale):
-    with pytest.raises(InputError, match=r"`units`: found .*, wanted a number above 0"):
-        CloudSettings(scale)
+    assert_input_error(r"`units`: found .*, wanted a number above 0", CloudSettings, scale)
 
 
 def _cloud(num_points, dtype):
@@ -189,17 +188,13 @@ def test_chunks_make_the_same_bytes_as_all_at_once(tmp_path):
 
 def test_an_error_leaves_nothing(tmp_path):
     rows = vertex_rows(*_cloud(10, np.float32)[:2])
-    with (
-        pytest.raises(AttributeError, match="dtype"),
-        writing_ply(tmp_path / "a.ply") as writer,
-    ):
+    with pytest.raises(AttributeError, match="dtype"), writing_ply(tmp_path / "a.ply") as writer:
         writer.add(rows.tolist())
     assert list(tmp_path.iterdir()) == []
 
 
 def test_float32_is_kept_where_it_holds_a_tenth_of_a_millimetre():
     for size, is_double in ((500.0, False), (5000.0, True)):
-        assert (
-            coordinate_type(np.array([np.zeros(3), np.full(3, size)]), np.eye(4), 1.0) == np.float64
-        ) == is_double
+        box = np.array([np.zeros(3), np.full(3, size)])
+        assert (coordinate_type(box, np.eye(4), 1.0) == np.float64) == is_double
     assert coordinate_type(np.array([np.zeros(3), np.full(3, 500.0)]), np.eye(4), 0.001) == np.float32

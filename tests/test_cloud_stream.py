@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rooms
 from plyfile import PlyData, PlyElement
-from rooms import as_panorama, errors, query, room
+from refusals import assert_input_error
+from rooms import as_panorama, query, room
 from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud import CloudStream, open_cloud
@@ -20,8 +22,6 @@ from piccolo.cloud.voxels import Voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opening import open_files
 from piccolo.paper.settings import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
@@ -178,8 +178,7 @@ def test_a_broken_disk_is_one_line():
         raise OSError(5, "Input/output error")
 
     cloud = CloudStream([PointSource(Path("a.xyz"), read_chunks)])
-    with pytest.raises(InputError, match=r"^a\.xyz: cannot be read \(Input/output error\), wanted"):
-        cloud.voxels(LEVEL)
+    assert_input_error(r"^a\.xyz: cannot be read \(Input/output error\), wanted", cloud.voxels, LEVEL)
 
 
 def _lying(turn):
@@ -202,10 +201,8 @@ def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
     assert np.linalg.det(scan_map.R_map_from_world) == 1.0
     assert scan_map.warnings == ()
     panorama = as_panorama(query(1).rgb)
-    found = localize(scan_map, panorama, CoarseToFineSettings(gravity="known"), Workers(2), Stopwatch())
-    distance, angle_deg = errors(found.pose, truth)
-    assert distance < 0.01
-    assert angle_deg < 0.2
+    found = rooms.locate(panorama, scan_map, rooms.KNOWN)
+    rooms.assert_near(found.pose, truth, 0.01, 0.2)
 
 
 @pytest.mark.parametrize("up", ["auto", "z", "-y"])
@@ -292,7 +289,7 @@ def test_memory_grows_with_the_scene_and_not_with_the_points():
     assert peaks_mb[1] - peaks_mb[0] < 30
 
 
-@pytest.mark.parametrize("preset", [CoarseToFineSettings(), PaperSettings()])
+@pytest.mark.parametrize("preset", [rooms.AUTO, PaperSettings()])
 def test_a_wrong_unit_is_told_before_the_long_work_begins(tmp_path, monkeypatch, preset):
     heard = []
 

@@ -15,22 +15,23 @@ from piccolo.cli import color_scan as tool
 from piccolo.cli import localize as command_line
 from piccolo.cli.together import steps_file
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.colored_writer import write_colored, writing_e57
 from piccolo.cloud.octree import build_octree, recolor
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_colored, write_ply, writing_e57
 from piccolo.coloring import alignment, color_scan
-from piccolo.coloring.alignment import Anchor, add_pairs, align
-from piccolo.coloring.color_scan import PAINTED, localize_by_colors, make_aligned_brushes
-from piccolo.coloring.exposure import balance
-from piccolo.coloring.painting import find_medians, make_brushes, paint_points
-from piccolo.coloring.sight import look, weigh_points
+from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
+from piccolo.coloring.color_scan import (
+    PAINTED,
+    find_medians,
+    localize_by_colors,
+    make_aligned_brushes,
+    make_brushes,
+    paint_points,
+)
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.errors import InputError, ResourceError
-from piccolo.files.journal import Journal
+from piccolo.files.line_file import Journal
 from piccolo.geometry.pose import Pose, pose_errors, step
-from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.jobs.threads import Workers
 from piccolo.panorama import Panorama
 from piccolo.result import Result
 from piccolo.scan_map.scan_map import prepare_map
@@ -120,7 +121,7 @@ def test_a_photo_sees_what_is_in_front_and_nothing_behind_walls():
     points = np.concatenate([leaves, leaves + 0.5 * away / np.linalg.norm(away, axis=1, keepdims=True)])
     found = np.empty(len(points), np.float32)
     R, t = poses[0].R_cam_from_world, poses[0].center_world
-    weigh_points(np.ascontiguousarray(points, np.float32), *sight, R, t, found)
+    weigh_points(np.ascontiguousarray(points, np.float32), sight, R, t, found)
     assert (found[: len(leaves)] > 0.0).mean() > 0.5
     assert (found[len(leaves) :] > 0.0).mean() < 0.1
 
@@ -193,7 +194,7 @@ def test_a_photo_sees_the_paint_of_others_alone(tmp_path, monkeypatch, num_folds
 def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
     monkeypatch.setattr(color_scan, "NUM_ROUNDS", 1)
     scan_map = _gray_map(rooms.room(SEED, NUM_POINTS)[1])
-    settings = CoarseToFineSettings(gravity="known")
+    settings = rooms.KNOWN
     right = [rooms.query(SEED, index=k, width=WIDTH) for k in range(3)]
     there = step(right[0].pose, np.array([0.0, 0.0, 0.7, 0.9, 0.5, 0.0]))
     photos = [(one.rgb, one.pose) for one in right] + [(rooms.query(2, width=WIDTH).rgb, there)]
@@ -201,7 +202,7 @@ def test_a_stranger_is_not_localized_by_its_own_paint(tmp_path, monkeypatch):
 
     def localize_one(painted, k):
         panorama = rooms.as_panorama(photos[k][0])
-        found = localize(painted, panorama, settings, Workers(2), Stopwatch())
+        found = rooms.locate(panorama, painted, settings)
         about = {name: getattr(found, name) for name in ("status", "confidence", "covariance")}
         return replace(by_shape[k], best_pose=found.pose, **about)
 
@@ -215,10 +216,10 @@ def test_the_photos_that_see_a_point_best_are_kept(monkeypatch):
     rng = np.random.default_rng(5)
     weights = np.maximum(rng.normal(size=(20, 50)), 0.0).astype(np.float32)
 
-    def weigh(points, ranges, sight, R_cam_from_map, center_map, found):
+    def weigh(points, sight, R_cam_from_map, center_map, found):
         found[:] = weights[int(center_map[0])]
 
-    monkeypatch.setattr(alignment, "look", lambda octree, pose: (None, None))
+    monkeypatch.setattr(alignment, "look", lambda octree, pose: None)
     monkeypatch.setattr(alignment, "weigh_points", weigh)
     poses = [Pose(np.eye(3), np.array([k, 0.0, 0.0])) for k in range(20)]
     sightings = alignment.find_sightings(None, np.zeros((50, 3), np.float32), poses, Workers(2))
@@ -285,12 +286,11 @@ def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
 def files(tmp_path_factory):
     """Options of a scan in a file and its cache, and two photos of it."""
     folder = tmp_path_factory.mktemp("coloring")
-    scan = rooms.room(SEED, NUM_POINTS)[1]
-    write_ply(folder / "scan.ply", vertex_rows(scan.points + scan.origin_world, scan.colors))
+    cloud = rooms.write_cloud(folder / "scan.ply", SEED, NUM_POINTS)
     photos = [str(folder / f"photo {k}.png") for k in range(2)]
     for k, path in enumerate(photos):
         cv2.imwrite(path, rooms.query(SEED, index=k, width=WIDTH).rgb[..., ::-1])
-    return ["--cloud", str(folder / "scan.ply"), "--cache", str(folder / "cache")], photos
+    return ["--cloud", cloud, "--cache", str(folder / "cache")], photos
 
 
 def test_the_commands_colour_a_scan(files, tmp_path, capsys):
@@ -329,13 +329,8 @@ def test_a_colouring_that_was_stopped_goes_on_with_the_same_bits(files, tmp_path
             steps.append(step)
             append(self, step, text)
 
-        words = [
-            *given,
-            "--color-scan",
-            str(tmp_path / f"{name}.ply"),
-            "--out",
-            str(tmp_path / f"{name}.jsonl"),
-        ]
+        out = str(tmp_path / name)
+        words = [*given, "--color-scan", f"{out}.ply", "--out", f"{out}.jsonl"]
         with monkeypatch.context() as patched:
             patched.setattr(Journal, "append", count)
             assert command_line.main(words) == (0 if limit == 99 else 3)

@@ -1,9 +1,10 @@
-"""The options that say what a cloud is, and what all commands share."""
+"""The options that say what a cloud is, what all commands share, and progress."""
 
 import ctypes
 import json
 import runpy
 import signal
+import sys
 import time
 from importlib import import_module
 from types import SimpleNamespace
@@ -14,7 +15,7 @@ import pytest
 from batches import ROOT
 from rooms import errors, query, room
 
-from piccolo.cli import localize, prepare_map
+from piccolo.cli import localize, prepare_map, terminal
 from piccolo.cli.checks import UsageError, checking_options
 from piccolo.cli.command import command, new_parser, parse
 from piccolo.cli.options import add_arguments, cloud_settings_from
@@ -183,3 +184,23 @@ def test_help_of_a_script_names_no_installed_commands(monkeypatch, capsys, scrip
     text = _help(monkeypatch, capsys, script.name, lambda: runpy.run_path(str(script), run_name="__main__"))
     assert "  python " in text
     assert "piccolo-" not in text
+
+
+def test_progress_says_step_and_time_left(capsys, monkeypatch):
+    monkeypatch.setattr(terminal, "DELAY", 0.0)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    show = terminal.progress_bar(is_quiet=False)
+    for label, title in (("find features", "prepare, 3 of 4: find features: "), ("write", "write: ")):
+        shown = show(iter([1, 2]), 2, label)
+        next(shown)
+        time.sleep(0.2)
+        next(shown)
+        assert list(shown) == []
+        printed = capsys.readouterr().err
+        assert title in printed
+        assert " left" in printed
+    assert list(show(iter([1]), None, "read")) == [1]
+    assert "read: 0 in 00:00" in capsys.readouterr().err
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: False)
+    assert list(show(iter([1, 2]), 2, "write")) == [1, 2]
+    assert capsys.readouterr().err == ""

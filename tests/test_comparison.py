@@ -10,21 +10,9 @@ import rooms
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
-from piccolo.jobs.threads import Workers
+from piccolo.localization import comparison
 from piccolo.localization import judge as judging
-from piccolo.localization.comparison import (
-    CONTRADICTS,
-    Comparison,
-    compare,
-    compare_from,
-    correlate_blocks,
-    mask_occluders,
-    sample_photo,
-    score_pose,
-)
 from piccolo.localization.judge import is_mirrored
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
@@ -38,13 +26,13 @@ AREAS = solid_angles(WIDTH)[:, None] / (4 * np.pi) * np.ones(WIDTH)
 
 def _query(rgb, is_hidden=None):
     is_valid = np.ones(rgb.shape[:2], bool) if is_hidden is None else ~is_hidden
-    return prepare_query(Panorama(rgb, is_valid), rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    return rooms.ask(Panorama(rgb, is_valid), rooms.scan_map(1))
 
 
 @functools.lru_cache
 def _clean():
     true_pose = rooms.scene(1)[2]
-    return compare(_query(rooms.query(1).rgb), true_pose), true_pose
+    return comparison.compare(_query(rooms.query(1).rgb), true_pose), true_pose
 
 
 @functools.lru_cache
@@ -72,7 +60,7 @@ def test_a_photo_is_sampled_as_its_twin():
     weights = rng.uniform(0.5, 1.5, 900).astype(np.float32)
     colors, shared, rays = (np.empty(shape, np.float32) for shape in ((3, 900), 900, (3, 900)))
     center = np.array([0.01, -0.02, 0.03])
-    sample_photo(offsets, weights, texels, TILTED, center, colors, shared, rays)
+    comparison.sample_photo(offsets, weights, texels, TILTED, center, colors, shared, rays)
     pixels = naive.project(offsets.T, TILTED, center, 256)
     r, g, b = naive.sample(rgb, pixels).T / 255
     np.testing.assert_allclose(colors, [(r + g + b) / 3, (r - b) / 2, (2 * g - r - b) / 4], atol=2e-3)
@@ -88,7 +76,7 @@ def test_blocks_correlate_as_their_twin():
     blocks = rng.integers(NUM_BLOCKS - 2, size=2000).astype(np.int32)  # the last two show nothing
     shared = (rng.uniform(size=2000) * (rng.uniform(size=2000) < 0.8)).astype(np.float32)
     correlation, area = np.empty(NUM_BLOCKS), np.empty(NUM_BLOCKS)
-    correlate_blocks(first, second, shared, blocks, correlation, area)
+    comparison.correlate_blocks(first, second, shared, blocks, correlation, area)
     expected = naive.block_correlation(first, second, shared, blocks, NUM_BLOCKS)
     np.testing.assert_allclose(correlation, expected[0], atol=1e-5)
     np.testing.assert_allclose(area, expected[1], rtol=1e-5)
@@ -99,14 +87,14 @@ def test_score_and_ratio_by_hand():
     """Blocks below chance give nothing; only what both poses show is compared."""
     half = CHANCE + 0.5 * (1 - CHANCE)
     area = np.array([0.2, 0.1, 0.1])
-    a = Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
+    a = comparison.Comparison(np.array([half, 0.1, -0.9]), area, area, 0.5)
     assert a.score == pytest.approx(0.5 * 0.2 / 0.5)
-    b = Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
+    b = comparison.Comparison(np.array([1.0, 1.0, half]), area, np.array([0.1, 0.0, 0.1]), 0.5)
     assert a.compute_ratio(b) == pytest.approx((0.5 * 0.1) / (1.0 * 0.1 + 0.5 * 0.1))
     assert b.compute_ratio(a) == pytest.approx(1 / a.compute_ratio(b))
     assert a.compute_ratio(a) == 1.0
-    elsewhere = Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
-    other = Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
+    elsewhere = comparison.Comparison(np.ones(3), area, np.array([0.01, 0.0, 0.3]), 0.5)
+    other = comparison.Comparison(np.ones(3), area, np.array([0.3, 0.0, 0.02]), 0.5)
     assert elsewhere.compute_ratio(other) == 0.0
 
 
@@ -116,10 +104,10 @@ def test_the_true_pose_explains_more_than_others():
     assert seen.compute_ratio(seen) == 1.0
     assert seen.valid_area == pytest.approx(1.0, abs=1e-3)
     query = _query(rooms.query(1).rgb)
-    turned = compare(query, Pose(yaw_rotation(1.0) @ true_pose.R_cam_from_world, true_pose.center_world))
-    moved = compare(
-        query, Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.3, 0.0, 0.0]))
-    )
+    R = yaw_rotation(1.0) @ true_pose.R_cam_from_world
+    turned = comparison.compare(query, Pose(R, true_pose.center_world))
+    beside = true_pose.center_world + np.array([0.3, 0.0, 0.0])
+    moved = comparison.compare(query, Pose(true_pose.R_cam_from_world, beside))
     for wrong in (turned, moved):
         assert wrong.score < 0.5 * seen.score
         assert wrong.compute_ratio(seen) < 0.5
@@ -131,18 +119,18 @@ def test_what_is_seen_from_a_pose_near_is_placed_as_it_is():
     beside = Pose(true_pose.R_cam_from_world, true_pose.center_world + np.array([0.015, -0.012, 0.0]))
     query = _query(rooms.query(1).rgb)
     query.view_at(beside, "fine")
-    found = compare_from(query, true_pose, beside)
+    found = comparison.compare_from(query, true_pose, beside)
     assert query.cache.views.averages.cache_info().misses == 1
     assert found.score == pytest.approx(seen.score, abs=0.02)
     assert found.score != seen.score
-    assert compare(query, true_pose).score == seen.score  # whoever asked before
+    assert comparison.compare(query, true_pose).score == seen.score  # whoever asked before
 
 
 @pytest.mark.parametrize("fraction", [0.2, 0.5])
 def test_an_occluder_costs_what_it_hides(fraction):
     seen, true_pose = _clean()
     rgb, is_hidden = _hidden(fraction)
-    behind = compare(_query(rgb), true_pose)
+    behind = comparison.compare(_query(rgb), true_pose)
     touched = _blocks_of(is_hidden)
     lost = ((touched > 0.02) * seen.area * np.maximum(seen.correlation - CHANCE, 0) / (1 - CHANCE)).sum()
     assert behind.score >= seen.score - lost - 0.02
@@ -156,7 +144,7 @@ def test_an_occluder_costs_what_it_hides(fraction):
 def test_blocks_outside_a_narrow_photo_count_nothing():
     seen, true_pose = _clean()
     outside = mask_outside_field(WIDTH, 90.0, 0.5)
-    narrow = compare(_query(rooms.query(1).rgb, outside), true_pose)
+    narrow = comparison.compare(_query(rooms.query(1).rgb, outside), true_pose)
     shown = _blocks_of(~outside)
     assert (narrow.visible_area[shown == 0.0] == 0.0).all()
     assert (narrow.area[shown == 0.0] == 0.0).all()
@@ -164,7 +152,7 @@ def test_blocks_outside_a_narrow_photo_count_nothing():
     assert narrow.visible_area.sum() <= narrow.valid_area + 0.01
     assert narrow.score > 0.7 * seen.score
     black = np.where(outside[..., None], 0, rooms.query(1).rgb).astype(np.uint8)
-    again = compare(_query(black, outside), true_pose)
+    again = comparison.compare(_query(black, outside), true_pose)
     np.testing.assert_array_equal(again.correlation, narrow.correlation)
 
 
@@ -172,22 +160,21 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     true_pose = rooms.scene(1)[2]
     rgb, is_hidden = _hidden(0.4)
     query = _query(rgb)
-    shown = mask_occluders(query, compare(query, true_pose))
+    shown = comparison.mask_occluders(query, comparison.compare(query, true_pose))
     masked = _blocks_of(~shown.photo.panorama.is_valid[::2, ::2])
     covered = _blocks_of(is_hidden)
     assert masked[covered > 0.9].mean() > 0.8
     assert masked[covered == 0.0].mean() < 0.15
     assert shown.settings is query.settings
     assert query.photo.panorama.is_valid.all()  # as it was
-    after = compare(shown, true_pose)
-    seen = compare(query, true_pose)
+    after = comparison.compare(shown, true_pose)
+    seen = comparison.compare(query, true_pose)
     assert after.score > seen.score
-    assert after.valid_area == pytest.approx(
-        1.0 - (AREAS * ~shown.photo.panorama.is_valid[::2, ::2]).sum(), abs=0.02
-    )
+    left = 1.0 - (AREAS * ~shown.photo.panorama.is_valid[::2, ::2]).sum()
+    assert after.valid_area == pytest.approx(left, abs=0.02)
     clean = _query(rooms.query(1).rgb)
-    fits = (compare(clean, true_pose).correlation >= CONTRADICTS).all()
-    assert (mask_occluders(clean, compare(clean, true_pose)) is clean) == fits
+    fits = (comparison.compare(clean, true_pose).correlation >= comparison.CONTRADICTS).all()
+    assert (comparison.mask_occluders(clean, comparison.compare(clean, true_pose)) is clean) == fits
 
 
 @pytest.mark.parametrize("fov_deg", [None, 90.0])
@@ -203,8 +190,8 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg):
     plain = Hypothesis(doubtful.pose, 0.7)  # it explains nearly all of the photo
     assert is_mirrored(turned_over, doubtful)
     assert not is_mirrored(right, doubtful)
-    assert score_pose(right, doubtful.pose).score > 0.9
-    assert score_pose(turned_over, doubtful.pose).score < 0.05
+    assert comparison.score_pose(right, doubtful.pose).score > 0.9
+    assert comparison.score_pose(turned_over, doubtful.pose).score < 0.05
     assert not is_mirrored(turned_over, plain)
     assert not is_mirrored(turned_over.by_views(), doubtful)
 

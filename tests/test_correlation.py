@@ -8,17 +8,8 @@ import rooms
 from piccolo.geometry.rotations import uniform_rotations
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
-from piccolo.localization.correlation import (
-    FLAT,
-    LEAST_SEEN,
-    TurnedPanorama,
-    correlate_pairs,
-    masked_correlation,
-    weigh_by_area,
-)
-from piccolo.localization.query import prepare_query
+from piccolo.localization import correlation
 from piccolo.localization.search import turn_panorama
-from piccolo.localization.settings import CoarseToFineSettings
 
 AREA = make_grid(24).solid_angle
 WIDE_AREA = wider_cells(12)[1]
@@ -26,18 +17,18 @@ WIDE_AREA = wider_cells(12)[1]
 
 def test_scores_equal_correlations_one_by_one():
     rng, scan_map = np.random.default_rng(0), rooms.scan_map(1)
-    query = prepare_query(rooms.scene(1)[1], scan_map, CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.scene(1)[1], scan_map)
     samples, validity = turn_panorama(query.photo.images.search(), uniform_rotations(50))
     validity[:, rng.random(validity.shape[1]) < 0.2] = 0
     samples *= validity[:, None]
-    panorama = weigh_by_area(samples, validity, AREA, 1)
+    panorama = correlation.weigh_by_area(samples, validity, AREA, 1)
     candidate, rotation = rng.integers(0, len(scan_map.centers), 40), rng.integers(0, 50, 40)
     row, views = scan_map.views.at(candidate, Workers(2))
     pairs = np.empty(40, np.float32)
     features, seen = views.features.reshape(len(views.features), -1), views.is_seen.view(np.uint8)
-    scores = masked_correlation(features, seen, panorama, Workers(2))
+    scores = correlation.masked_correlation(features, seen, panorama, Workers(2))
     how = whole_areas(24), panorama, row, rotation
-    correlate_pairs(views.features, views.is_seen, *how, pairs)
+    correlation.correlate_pairs(views.features, views.is_seen, *how, pairs)
     twin = []
     for c, r in zip(row, rotation, strict=True):
         w = AREA * views.is_seen[c] * validity[r]
@@ -52,7 +43,7 @@ def test_sums_of_a_search_are_exact():
     """No partial sum of what features and samples can be at most reaches 2^24, so no order changes a bit."""
     for area, most_seen in ((AREA, 1), (wider_cells(12)[1], 255)):
         one = np.ones((1, 3, len(area)), np.float32)
-        panorama = weigh_by_area(127.5 * one, one[:, 0], area, most_seen)
+        panorama = correlation.weigh_by_area(127.5 * one, one[:, 0], area, most_seen)
         assert 127 * panorama.samples.sum(dtype=float) < 2**24
         assert most_seen * panorama.energy.sum(dtype=float) < 2**24
         assert 127 * panorama.samples.sum(dtype=float) > 2**22  # the room is used
@@ -63,13 +54,14 @@ def test_sums_of_a_search_are_exact():
     validity = (rng.random((20, len(AREA))) < 0.8).astype(np.float32)
     features = rng.choice(np.array([-127, 127, 126], np.int8), (50, 3, len(AREA)))
     seen = rng.integers(0, 2, (50, len(AREA)), dtype=np.uint8)
-    panorama = weigh_by_area(samples * validity[:, None], validity, AREA, 1)
-    expected = masked_correlation(features.reshape(50, -1), seen, panorama, Workers(1))
+    panorama = correlation.weigh_by_area(samples * validity[:, None], validity, AREA, 1)
+    expected = correlation.masked_correlation(features.reshape(50, -1), seen, panorama, Workers(1))
     cells, views = rng.permutation(len(AREA)), rng.permutation(50)
-    shuffled = TurnedPanorama(*(values[..., cells] for values in panorama[:4]), panorama.most_seen)
+    parts = (values[..., cells] for values in panorama[:4])
+    shuffled = correlation.TurnedPanorama(*parts, panorama.most_seen)
     features = features[views][..., cells].reshape(50, -1)
     seen = seen[views][:, cells]
-    found = masked_correlation(features, seen, shuffled, Workers(1))
+    found = correlation.masked_correlation(features, seen, shuffled, Workers(1))
     np.testing.assert_array_equal(found, expected[views])
 
 
@@ -97,12 +89,12 @@ def _views(seed, has_edges=True, num_views=60, num_rotations=25):
 @pytest.mark.parametrize("seed", [0, 1])
 def test_centered_correlations_equal_their_twin(seed, has_edges):
     features, seen, samples, validity = _views(seed, has_edges)
-    panorama = weigh_by_area(samples, validity, WIDE_AREA, 255)
-    found = masked_correlation(
+    panorama = correlation.weigh_by_area(samples, validity, WIDE_AREA, 255)
+    found = correlation.masked_correlation(
         features.reshape(len(features), -1), seen, panorama, Workers(2), is_centered=True
     )
     expected = naive.centered_correlation(
-        features, seen / 255, samples, validity, WIDE_AREA, FLAT, LEAST_SEEN
+        features, seen / 255, samples, validity, WIDE_AREA, correlation.FLAT, correlation.LEAST_SEEN
     )
     np.testing.assert_allclose(found, expected, atol=0.02)
     own = np.arange(20)  # the views with the least noise
@@ -115,12 +107,12 @@ def test_plain_surfaces_do_not_correlate_whatever_their_brightness():
     """Uncentered they do, wherever both are bright or both are dark."""
     validity = (make_grid(12).directions[None, :, 0] > 0.5).astype(np.float32)
     samples = 60.0 * np.ones((1, 3, 1), np.float32) * validity[:, None]
-    panorama = weigh_by_area(samples, validity, WIDE_AREA, 255)
+    panorama = correlation.weigh_by_area(samples, validity, WIDE_AREA, 255)
     features = np.repeat(np.int8([60, -60, 10])[:, None], 3 * len(WIDE_AREA), axis=1)
     seen = np.full((3, len(WIDE_AREA)), 255, np.uint8)
-    centered = masked_correlation(features, seen, panorama, Workers(1), is_centered=True)
+    centered = correlation.masked_correlation(features, seen, panorama, Workers(1), is_centered=True)
     np.testing.assert_allclose(centered, 0.0, atol=0.02)
-    plain = masked_correlation(features, seen, panorama, Workers(1))
+    plain = correlation.masked_correlation(features, seen, panorama, Workers(1))
     np.testing.assert_allclose(plain[1] / plain[0], -1.0, atol=1e-3)
     assert plain[0] > 0.0
 
@@ -138,8 +130,8 @@ def test_of_a_view_the_root_of_what_it_sees_of_the_photo_counts():
         seen[k, shown[rank <= fraction]] = 255
     parts = (seen / 255 * validity) @ WIDE_AREA / (validity[0] @ WIDE_AREA)
     features = np.rint(samples[0] * (seen > 0)[:, None]).astype(np.int8).reshape(len(seen), -1)
-    panorama = weigh_by_area(samples, validity, WIDE_AREA, 255)
-    found = masked_correlation(features, seen, panorama, Workers(1), is_centered=True)[:, 0]
+    panorama = correlation.weigh_by_area(samples, validity, WIDE_AREA, 255)
+    found = correlation.masked_correlation(features, seen, panorama, Workers(1), is_centered=True)[:, 0]
     expected = np.sqrt(parts) * (parts > 0.3)
     assert expected[-1] == 0.0 < expected[-2]
     np.testing.assert_allclose(found, expected, atol=0.03)
@@ -148,16 +140,16 @@ def test_of_a_view_the_root_of_what_it_sees_of_the_photo_counts():
 def test_centered_correlations_are_the_same_bits_in_any_order_and_by_any_threads():
     """Sums are exact, though cells and views are shuffled and blocks are of other sizes."""
     features, seen, samples, validity = _views(2, num_views=700)
-    panorama = weigh_by_area(samples, validity, WIDE_AREA, 255)
+    panorama = correlation.weigh_by_area(samples, validity, WIDE_AREA, 255)
     flat = features.reshape(len(features), -1)
-    expected = masked_correlation(flat, seen, panorama, Workers(1), is_centered=True)
-    by_two = masked_correlation(flat, seen, panorama, Workers(2), is_centered=True)
+    expected = correlation.masked_correlation(flat, seen, panorama, Workers(1), is_centered=True)
+    by_two = correlation.masked_correlation(flat, seen, panorama, Workers(2), is_centered=True)
     np.testing.assert_array_equal(by_two, expected)
     rng = np.random.default_rng(3)
     cells, views = rng.permutation(len(WIDE_AREA)), rng.permutation(len(features))
     values = (np.ascontiguousarray(each[..., cells]) for each in panorama[:4])
-    shuffled = TurnedPanorama(*values, panorama.most_seen)
+    shuffled = correlation.TurnedPanorama(*values, panorama.most_seen)
     flat = np.ascontiguousarray(features[views][..., cells]).reshape(len(features), -1)
     mixed = np.ascontiguousarray(seen[views][:, cells])
-    found = masked_correlation(flat, mixed, shuffled, Workers(2), is_centered=True)
+    found = correlation.masked_correlation(flat, mixed, shuffled, Workers(2), is_centered=True)
     np.testing.assert_array_equal(found, expected[views])

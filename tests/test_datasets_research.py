@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from plyfile import PlyData, PlyElement
 
-from piccolo.cloud.ply_writer import vertex_rows
+from piccolo.cloud.writers import vertex_rows
 from piccolo.scene import read_scene
 
 # 360loc

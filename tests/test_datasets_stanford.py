@@ -135,10 +135,7 @@ def test_a_damaged_file_costs_its_room_only(dataset, tmp_path, capsys):
     write_room(dataset, "1", "office_2")
     path = write_panorama(dataset, 20, made.cameras(1)[0], "1", "office_2")
     for text, message in (
-        (
-            '{"camera_location": [1, 2], "final_camera_rotation": [0, 0, 0]}',
-            "camera_location: found the shape (2,)",
-        ),
+        ('{"camera_location": [1, 2], "final_camera_rotation": [0, 0, 0]}', "location: found the shape (2,)"),
         ('{"camera_location": [0, 0, "x"], "final_camera_rotation": [0, 0, 0]}', "found ValueError"),
         ("[]", "wanted JSON with camera_location"),
     ):

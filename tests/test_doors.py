@@ -10,12 +10,12 @@ import pytest
 import rooms
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import assert_input_error
 from test_result import RESULT
 
 import piccolo
-from piccolo import InputError, Pose, Result
+from piccolo import Pose, Result
 from piccolo.cli import localize as localize_command
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.kernels.jit import whole
@@ -48,18 +48,12 @@ BAD = {
 }
 
 
-@pytest.fixture(scope="module")
+REFINED = piccolo.Photo(np.zeros((64, 128, 3), np.uint8), refine_focal=True)
+
+
+@pytest.fixture
 def scan():
-    cloud = rooms.room(1)[1]
-    return piccolo.open_scan(
-        piccolo.Cloud(cloud.points + cloud.origin_world, colors=cloud.colors), num_threads=2
-    )
-
-
-def _assert_refused(message, function, *arguments, **options):
-    with pytest.raises(InputError, match=message) as error:
-        function(*arguments, **options)
-    assert "\n" not in str(error.value)
+    return rooms.scan(1)
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -67,22 +61,22 @@ def test_what_is_no_pose_is_refused_at_every_door(scan, name):
     """Before any work: there are no such pictures."""
     pose, message = BAD[name]
     good = Pose(I, HERE)
-    _assert_refused("^`pose`: ", scan.occlusion_mask, "none.jpg", pose)
-    _assert_refused("^`pose`: ", scan.from_world, pose)
-    _assert_refused("^`relative_poses`: ", scan.localize_bundle, ["a.jpg", "b.jpg"], [good, pose])
-    _assert_refused(f"^it: {message}", check_pose, pose, "it")
+    assert_input_error("^`pose`: ", scan.occlusion_mask, "none.jpg", pose)
+    assert_input_error("^`pose`: ", scan.from_world, pose)
+    assert_input_error("^`relative_poses`: ", scan.localize_bundle, ["a.jpg", "b.jpg"], [good, pose])
+    assert_input_error(f"^it: {message}", check_pose, pose, "it")
     if pose is None:  # a frame may be without one
         return
-    _assert_refused("^`odometry`: ", scan.localize_walk, ["a", "b"], odometry=[good, pose])
+    assert_input_error("^`odometry`: ", scan.localize_walk, ["a", "b"], odometry=[good, pose])
     walk = scan.track()
-    _assert_refused("^`odometry`: ", walk.add, "a.jpg", odometry=pose)
+    assert_input_error("^`odometry`: ", walk.add, "a.jpg", odometry=pose)
     assert not walk.blanks
 
 
-@given(
-    st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3),
-    st.lists(st.floats(-9e7, 9e7), min_size=3, max_size=3),
-)
+THREE = {"min_size": 3, "max_size": 3}
+
+
+@given(st.lists(st.floats(-3.0, 3.0), **THREE), st.lists(st.floats(-9e7, 9e7), **THREE))
 def test_a_pose_passes_with_every_bit_and_is_a_copy(w, center):
     pose = Pose(exp_so3(np.array(w)), np.array(center))
     passed = check_pose(pose, "it")
@@ -97,20 +91,18 @@ def test_a_pose_passes_with_every_bit_and_is_a_copy(w, center):
 
 def test_a_left_handed_scan_is_named_at_the_end_of_a_batch(tmp_path, capsys):
     """Its photos are localized mirrored; where one is localized as it is, nothing is tried."""
-    cloud = rooms.room(1)[1]
-    points = cloud.points.astype(np.float64) + cloud.origin_world
     photos = []
     for k in range(3):
         photos.append(str(tmp_path / f"{k}.png"))
         cv2.imwrite(photos[-1], rooms.query(1, index=k).rgb[..., ::-1])
-    for name, flip in (("right", 1.0), ("left", -1.0)):
-        write_ply(tmp_path / f"{name}.ply", vertex_rows(points * [1.0, flip, 1.0], cloud.colors))
-        words = ["--cloud", str(tmp_path / f"{name}.ply"), "--cache", str(tmp_path), "--gravity", "known"]
+    left = rooms.write_cloud(tmp_path / "left.ply", 1, flip=(1.0, -1.0, 1.0))
+    for name, cloud in (("right", rooms.map_path(1)), ("left", left)):
+        words = ["--cloud", str(cloud), "--cache", "none", "--gravity", "known"]
         words += ["--jobs", "1", "--out", str(tmp_path / name), "--pano", *photos]
         code = localize_command.main(words)
         err = capsys.readouterr().err
         notes = [line for line in err.splitlines() if "are left-handed" in line]
-        assert (code, len(notes)) == ((0, 0) if flip > 0.0 else (1, 1)), err
+        assert (code, len(notes)) == ((0, 0) if name == "right" else (1, 1)), err
     assert "which --up can't mend" in notes[0]
     assert len(read_results([tmp_path / "left"])) == 3
 
@@ -147,6 +139,11 @@ def test_the_whole_part_of_a_pixel_is_as_before(u):
         (lambda s: piccolo.open_scan(np.full((2000, 3), "x")), "^points: found <U1, wanted numbers"),
         (lambda s: piccolo.open_scan(np.full((2000, 3), None)), "^points: found object, wanted numbers"),
         (lambda s: s.localize(None), "^`picture`: found None, wanted a path or an array"),
+        (
+            lambda s: s.localize(np.zeros((300, 400, 3), np.uint8)),
+            "found uint8 of shape .300, 400, 3., wanted",
+        ),
+        (lambda s: s.localize(REFINED), "found a sphere or a part of one, wanted the photo of one"),
         (lambda s: s.localize_many(None), "^`photos`: found None, wanted a list"),
         (lambda s: piccolo.Motion(max_acceleration=None), "^`max_acceleration`: found None"),
         (lambda s: s.track().add(None), "^`picture`: found None, wanted a path or an array"),
@@ -159,7 +156,7 @@ def test_the_whole_part_of_a_pixel_is_as_before(u):
     ],
 )
 def test_other_input_is_refused_in_one_line(scan, call, message):
-    _assert_refused(message, call, scan)
+    assert_input_error(message, call, scan)
 
 
 def test_a_heading_has_a_tolerance():
@@ -171,9 +168,8 @@ def test_a_heading_has_a_tolerance():
 def test_times_are_given_for_all_frames_or_for_none(scan, times):
     walk = scan.track()
     walk.add("missing.jpg", times[0])
-    _assert_refused(
-        rf"^`time`: found {times[1]} at frame 1, wanted it of all frames", walk.add, "b.jpg", times[1]
-    )
+    message = rf"^`time`: found {times[1]} at frame 1, wanted it of all frames"
+    assert_input_error(message, walk.add, "b.jpg", times[1])
     assert len(walk.blanks) == len(walk.tracker.frames) == 1
     walk.add("c.jpg", None if times[0] is None else 1.0)
 
@@ -248,4 +244,4 @@ def test_a_pose_in_a_file_of_results_is_checked(place, center):
     document = json.loads(_changed(status="ambiguous" if place == "best_guess" else "localized").to_json())
     part = document[place] if place else document
     (part[0] if place == "alternatives" else part)["center_world"] = center
-    _assert_refused("^result: found", Result.from_json, json.dumps(document))
+    assert_input_error("^result: found", Result.from_json, json.dumps(document))

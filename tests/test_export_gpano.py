@@ -10,13 +10,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import encoded, smooth_rgb, write
 from poses import jpeg, result, tilted_poses
-from refusals import mutated, read_or_refused
+from refusals import assert_input_error, mutated, read_or_refused
 from test_export_tables import rotation
 
 from piccolo.errors import InputError
 from piccolo.export import Options, export
-from piccolo.export.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
 from piccolo.panorama import panorama_size
+from piccolo.panorama.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
 
 ANGLES = (123.25, -10.5, 7.0)
 XMP_MARK = b"http://ns.adobe.com/xap/1.0/\0"
@@ -135,8 +135,7 @@ def test_refusals(tmp_path):
     data = jpeg(path)
     scan = next(s for s in jpeg_segments(data) if s.marker == SCAN)
     for damaged in (b"", b"\x89PNG", data[: scan.begin], data[:30], b"\xff\xd8" + b"\xff" * 1000):
-        with pytest.raises(InputError, match=r"a\.jpg: no JPEG, or a damaged one"):
-            with_pose(path, damaged, ANGLES)
+        assert_input_error(r"a\.jpg: no JPEG, or a damaged one", with_pose, path, damaged, ANGLES)
     full = EMPTY_PACKET + b" " * 65_200
     with pytest.raises(InputError, match="leaves no room for the pose"):
         with_pose(path, _with_segments(data, _segment(XMP_MARK + full)), ANGLES)

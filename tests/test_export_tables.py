@@ -8,6 +8,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from poses import json_of, lines_of, result, tilted_poses
+from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.export import Options, export
@@ -179,8 +180,7 @@ def test_tum_has_the_times_of_a_walk(tmp_path):
 )
 def test_geojson_refuses_systems_and_places_that_do_not_fit(tmp_path, crs, center, message):
     one = result("a.jpg", Pose(POSES[0].R_cam_from_world, np.array(center, float)))
-    with pytest.raises(InputError, match=message):
-        export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs))
+    assert_input_error(message, lambda: export([one], "geojson", tmp_path / "p.geojson", Options(crs=crs)))
     assert list(tmp_path.iterdir()) == []
 
 

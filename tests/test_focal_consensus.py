@@ -15,8 +15,7 @@ from piccolo.batch.second_look import list_changed_by_consensus, list_looks_by_f
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
-from piccolo.confidence.focal_length import SLIPS, Consensus, Opinion
+from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
 from piccolo.confidence.localization import FocalLength
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
@@ -31,7 +30,7 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
     pose = Pose(np.eye(3), np.zeros(3))
     told = {"picture_px": GIVEN * picture, "picture_std_px": GIVEN * picture * std} if picture else {}
     used = GIVEN * picture if picture and std < given_std else GIVEN
-    about = {"doubt": SLIPS, "source": "`camera`", **told, **more}
+    about = {"doubt": WRONG_SHARE, "source": "`camera`", **told, **more}
     focal = FocalLength(used, GIVEN * min(std, given_std), GIVEN, GIVEN * given_std, **about)
     camera = (Mount(pinhole(1024, 768, GIVEN)),)
     source = Source(None, None, (1024, 768), None)
@@ -42,7 +41,7 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
 def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
     """One in fifty is wrong; a sharp picture confirms or contradicts it, a blurred one says little."""
     assert Opinion(0.0, 0.004**2).doubt(0.003) < 0.005
-    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(SLIPS, abs=0.015)
+    assert Opinion(0.0, 0.05**2).doubt(0.003) == pytest.approx(WRONG_SHARE, abs=0.015)
     assert Opinion(0.05, 0.02**2).doubt(0.003) > 0.05
     assert Opinion(-0.05, 0.009**2).doubt(0.003) > 0.99
     rising = [Opinion(off, 0.02**2).doubt(0.003) for off in (0.0, 0.02, 0.04, 0.06, 1.0)]
@@ -124,17 +123,15 @@ def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
     for k in range(4):
         turned = yaw_rotation(0.5 * k) @ pose.R_cam_from_world
         poses.append(Pose(turned, pose.center_world + np.array([0.05 * k, 0.03, 0.0])))
-        picture = render_picture(Mount(pinhole(320, 240, 0.5 * TRUE)), room, poses[k], Workers(2))
+        picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, poses[k], Workers(2))
         write(photos / f"{k}.png", encoded(picture, ".png"))
-    cloud = rooms.room(SEED)[1]
-    write_ply(tmp_path / "scan.ply", vertex_rows(cloud.points + cloud.origin_world, cloud.colors))
-    words = ["--cloud", str(tmp_path / "scan.ply"), "--pano", str(photos), "--focal", str(0.515 * TRUE)]
+    words = ["--cloud", str(rooms.map_path(SEED)), "--pano", str(photos), "--focal", str(1.03 * TRUE)]
     out = tmp_path / "poses.jsonl"
     main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
     results = read_results([out])
     told = [r.focal_length.others_px for r in results if r.focal_length.others_px]
     assert told
-    assert told == pytest.approx([0.5 * TRUE] * len(told), rel=0.01)
+    assert told == pytest.approx([TRUE] * len(told), rel=0.01)
     for result, true in zip(results, poses, strict=True):
         if result.status == "localized":
             assert result.pose.distance(true) < 0.05

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rooms
 from pictures import encoded, write
-from rooms import scan_map
-from test_localize_cameras import place, scan
+from test_localize_cameras import SEED, place, scan
 
 import piccolo
 from piccolo.camera import Calibration, Camera, Mount
@@ -20,15 +20,13 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import focal_length as focal
 from piccolo.localization import localize as module
 from piccolo.localization.comparison import score_pose
-from piccolo.localization.localize import localize, select_likeliest
-from piccolo.localization.query import prepare_query
+from piccolo.localization.localize import select_likeliest
 from piccolo.localization.selection import Selection
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
 
-TRUE = 320.0  # [px] of the photos here, 640 x 480
+TRUE = 160.0  # [px] of the photos here, 320 x 240
 
 
 def _photo(camera):
@@ -42,7 +40,7 @@ def _panorama(rgb, **options):
 
 def _fit(rgb, pose, **options):
     panorama = _panorama(rgb, **options)
-    query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(panorama, rooms.scan_map(SEED))
     return panorama, focal.fit_focal(query, scan().from_world(pose))
 
 
@@ -76,7 +74,7 @@ def test_a_loss_of_few_blocks_or_without_a_crest_tells_nothing():
 
 def test_the_picture_tells_the_focal_length_within_its_deviation():
     given = 1.015
-    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
     panorama, fit = _fit(rgb, pose, focal_px=given * TRUE)
     off = fit.change[0] + math.log(given)
     assert abs(off) < 3.0 * fit.deviation
@@ -88,8 +86,8 @@ def test_the_picture_tells_the_focal_length_within_its_deviation():
 
 def test_matches_with_photos_beside_follow_the_focal_length():
     """A ray goes to the same pixel of the picture, by the new focal length."""
-    panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE)
-    query = prepare_query(panorama, scan_map(5), CoarseToFineSettings(), Workers(2))
+    panorama = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE)
+    query = rooms.ask(panorama, rooms.scan_map(SEED))
     rays = np.float32([[1.0, 0.0, 0.0], [0.8, 0.6, 0.0]])
     beside = NO_MATCHES._replace(rays=rays)
     (turned,) = focal.recalibrate(replace(query, beside=(beside,)), np.array([0.02])).beside
@@ -99,8 +97,8 @@ def test_matches_with_photos_beside_follow_the_focal_length():
 
 
 def test_k1_is_fitted_with_the_focal_length_of_a_guess():
-    rgb, pose = _photo(Camera("SIMPLE_RADIAL", 640, 480, (TRUE, 320.0, 240.0, -0.04)))
-    mount = Mount(Camera("SIMPLE_RADIAL", 640, 480, (1.03 * TRUE, 320.0, 240.0, 0.0)))
+    rgb, pose = _photo(Camera("SIMPLE_RADIAL", 320, 240, (TRUE, 160.0, 120.0, -0.04)))
+    mount = Mount(Camera("SIMPLE_RADIAL", 320, 240, (1.03 * TRUE, 160.0, 120.0, 0.0)))
     _, fit = _fit(rgb, pose, camera=Calibration("guess", (mount,)), refine_focal=True)
     f, k1 = mount.camera.change(*fit.change).params[::3]
     assert f == pytest.approx(TRUE, rel=0.02)
@@ -108,45 +106,43 @@ def test_k1_is_fitted_with_the_focal_length_of_a_guess():
 
 
 def test_the_focal_length_of_a_bare_part_of_a_wall_stays_open():
-    rgb, pose = _photo(pinhole(640, 480, TRUE))
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
     blank = np.full_like(rgb, 128)
-    blank[200:260, 280:360] = rgb[200:260, 280:360]
+    blank[100:130, 140:180] = rgb[100:130, 140:180]
     panorama, fit = _fit(blank, pose, focal_px=TRUE, refine_focal=True)
     assert fit.deviation > 0.05
     assert fit.conflict < 3.0
-    assert fit.focal_length(panorama).std_px > 15.0
+    assert fit.focal_length(panorama).std_px > 7.5
 
 
 def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found():
-    rgb, pose = _photo(pinhole(640, 480, TRUE))
-    result = scan().localize(Photo(rgb, focal_px=290.0, refine_focal=True), gravity="known")
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    result = scan().localize(Photo(rgb, focal_px=145.0, refine_focal=True), gravity="known")
     assert result.status == "localized"
     found = result.focal_length
     assert abs(found.px - TRUE) < 3.0 * found.std_px
     assert found.px == pytest.approx(TRUE, rel=0.02)
-    assert (found.given_px, found.given_std_px) == (290.0, pytest.approx(58.0))
+    assert (found.given_px, found.given_std_px) == (145.0, pytest.approx(29.0))
     assert result.cameras[0].camera.focal[0] == found.px
     assert np.linalg.norm(result.pose.center_world - pose.center_world) < 0.03
     assert piccolo.Result.from_json(result.to_json()).focal_length == found
 
 
 def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
-    rgb, _ = _photo(pinhole(640, 480, TRUE))
-    result = scan().localize(Photo(rgb, focal_px=290.0), gravity="known")
-    assert result.status == "not_localized"
-    assert result.warnings[-1].endswith(" px, not 290: check `focal_px`")
-    assert result.focal_length.px == pytest.approx(TRUE, rel=0.03)
-    wrong = Calibration("of another zoom", (Mount(pinhole(640, 480, 1.15 * TRUE)),))
-    panorama = _panorama(rgb, camera=wrong)
-    far = localize(scan_map(5), panorama, CoarseToFineSettings(), Workers(2), Stopwatch())
-    assert far.status == "not_localized"
-    assert far.warnings[-1].endswith(" px, not 368: check `camera`")
-    assert far.focal_length.px == pytest.approx(TRUE, rel=0.03)
+    """Nor does a bundle of one photo, which keeps what that rules out."""
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    photo = Photo(rgb, focal_px=145.0)
+    alone = scan().localize(photo, gravity="known")
+    (together,) = scan().localize_bundle([photo], [pose], gravity="known")
+    for result in (alone, together):
+        assert result.status == "not_localized"
+        assert any(line.endswith(" px, not 145: check `focal_px`") for line in result.warnings)
+    assert alone.focal_length.px == pytest.approx(TRUE, rel=0.03)
 
 
 def test_each_source_of_a_focal_length_has_its_deviation():
-    rgb, _ = _photo(pinhole(640, 480, TRUE))
-    of_file = _panorama(rgb, camera=Calibration("a", (Mount(pinhole(640, 480, TRUE)),))).focal_prior
+    rgb, _ = _photo(pinhole(320, 240, TRUE))
+    of_file = _panorama(rgb, camera=Calibration("a", (Mount(pinhole(320, 240, TRUE)),))).focal_prior
     assert (of_file.deviation, of_file.source) == (0.003, "`camera`")
     of_field = _panorama(rgb, projection="fisheye", fov_deg=90.0).focal_prior
     assert (of_field.deviation, of_field.source) == (0.03, "`fov_deg`")
@@ -195,8 +191,8 @@ def test_a_crest_is_that_of_the_design_that_tells_most(monkeypatch):
 )
 def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, crest, share, std):
     """Beyond four deviations the picture alone says where to look next."""
-    rgb, pose = _photo(pinhole(640, 480, TRUE))
-    query = prepare_query(_panorama(rgb, focal_px=TRUE), scan_map(5), CoarseToFineSettings(), Workers(2))
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
     found = focal.Crest(np.array([crest]), np.array([[0.01**-2]]), np.ones((6, 1)))
     monkeypatch.setattr(focal, "find_crest", lambda *args: found)
     monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
@@ -211,10 +207,8 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
 
 
 def test_matches_lead_to_a_focal_length_that_is_far_off():
-    rgb, pose = _photo(pinhole(640, 480, TRUE))
-    query = prepare_query(
-        _panorama(rgb, focal_px=0.8 * TRUE), scan_map(5), CoarseToFineSettings(), Workers(2)
-    )
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    query = rooms.ask(_panorama(rgb, focal_px=0.8 * TRUE), rooms.scan_map(SEED))
     found = Selection(score_pose(query, scan().from_world(pose)), ())
     query, found = focal.follow_matches(query, found)
     assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
@@ -225,7 +219,7 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
 
 
 def test_other_poses_with_other_guesses_share_the_probability():
-    settings = CoarseToFineSettings()
+    settings = rooms.AUTO
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     here, elsewhere = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
     sure = Localization("localized", 0.95, 0.05, here, evidence=evidence)
@@ -241,7 +235,7 @@ def test_other_poses_with_other_guesses_share_the_probability():
 
 
 def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_listed_twice():
-    settings = CoarseToFineSettings()
+    settings = rooms.AUTO
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     ahead, aside = Pose(np.eye(3), np.array([1.0, 0.1, 0.0])), Pose(np.eye(3), np.array([0.0, 1.0, 0.0]))
     first = replace(
@@ -261,37 +255,31 @@ def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_li
 
 def test_the_first_sure_guess_ends_the_search(monkeypatch):
     statuses = iter(["not_localized", "localized"])
-    monkeypatch.setattr(
-        module, "localize", lambda *args: Localization(next(statuses), pose=Pose(np.eye(3), np.zeros(3)))
-    )
-    panorama = _panorama(_photo(pinhole(640, 480, TRUE))[0], focal_px=TRUE, refine_focal=True)
-    module.localize_guessed(scan_map(5), panorama, CoarseToFineSettings(), Workers(1), Stopwatch())
+    here = Pose(np.eye(3), np.zeros(3))
+    monkeypatch.setattr(module, "localize", lambda *_: Localization(next(statuses), pose=here))
+    panorama = _panorama(_photo(pinhole(320, 240, TRUE))[0], focal_px=TRUE, refine_focal=True)
+    module.localize_guessed(rooms.scan_map(SEED), panorama, rooms.AUTO, Workers(1), Stopwatch())
     assert not list(statuses)
 
 
 def test_a_retaken_sphere_is_the_one_of_that_calibration_and_keeps_its_mask(tmp_path):
-    rgb, _ = _photo(pinhole(640, 480, TRUE))
+    rgb, _ = _photo(pinhole(320, 240, TRUE))
     path = write(tmp_path / "a.png", encoded(rgb, ".png"))
     panorama = read_panorama(Photo(path, focal_px=TRUE, mask_nadir_deg=80.0))
-    found = panorama.resample(pinhole(640, 480, 1.1 * TRUE), 1024)
+    found = panorama.resample(pinhole(320, 240, 1.1 * TRUE), 1024)
     pixels = np.dstack([rgb, np.full(rgb.shape[:2], 255, np.uint8)])
-    wanted, is_wanted = make_sphere([View(Mount(pinhole(640, 480, 1.1 * TRUE)), pixels)], 1024)
+    wanted, is_wanted = make_sphere([View(Mount(pinhole(320, 240, 1.1 * TRUE)), pixels)], 1024)
     assert not found.is_valid[300:].any()
     assert is_wanted[300:].any()
     assert (found.is_valid == is_wanted)[:270].mean() > 0.998
     np.testing.assert_array_equal(found.rgb, wanted)
 
 
-def test_only_the_photo_of_one_camera_has_a_focal_length_to_refine():
-    with pytest.raises(piccolo.InputError, match="found a sphere or a part of one, wanted the photo of one"):
-        scan().localize(Photo(np.zeros((64, 128, 3), np.uint8), refine_focal=True))
-
-
 def test_pictures_of_a_result_are_made_with_the_camera_found():
-    found = (Mount(pinhole(640, 480, 321.5)),)
+    found = (Mount(pinhole(320, 240, 321.5)),)
     options = Photo("a.jpg", focal_px=300.0, refine_focal=True).with_refined_camera(found)
     assert (options.focal_px, options.calibration.mounts) == (None, found)
-    turned = Mount(pinhole(640, 480, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
+    turned = Mount(pinhole(320, 240, 300.0), ((0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, 1.0)))
     given = Photo("a.jpg", camera=Calibration("a.json", (turned,)), refine_focal=True)
     assert given.with_refined_camera(found).calibration.mounts == (turned.with_camera(found[0].camera),)
     plain = Photo("a.jpg")

@@ -8,17 +8,8 @@ from scans import bare_room
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.geometry.pose import exp_so3, rotation_to_z, yaw_rotation
-from piccolo.gravity.alignment import (
-    Planes,
-    estimate_normals,
-    find_levels,
-    find_up,
-    furniture_cue,
-    level,
-    passage_cue,
-    ransac_planes,
-    wall_yaw,
-)
+from piccolo.gravity import alignment
+from piccolo.gravity.alignment import Planes
 
 Z = np.array([0.0, 0.0, 1.0])
 TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [2.9, -0.5, 0.4])]
@@ -28,7 +19,7 @@ def up_of(points, w=(0.0, 0.0, 0.0)):
     """Up (3,) of points (N, 3) turned by a rotation vector, None if it is not known, and why."""
     points = (points @ exp_so3(np.asarray(w)).T).astype(np.float32)
     octree = build_octree(Cloud(points, np.full(points.shape, 99, np.uint8), np.zeros(3)).voxels(np.eye(3)))
-    axis, sense, reason, _ = find_up(octree)
+    axis, sense, reason, _ = alignment.find_up(octree)
     assert np.linalg.norm(axis) == pytest.approx(1.0)
     assert "\n" not in reason
     return sense * axis if sense else None, reason
@@ -100,15 +91,15 @@ def test_levels_are_a_person_apart_and_tables_are_none():
         centers = np.array([[0, 0, 0.0], [0, 0, 2.5], [0, 0, 0.5], [0, 0, 5.0], [3, 0, 1.0]])
         areas = np.array([0.3, 0.25, 0.2, 0.05, 0.15])
 
-    np.testing.assert_array_equal(find_levels(Planes, Z), [0.0, 2.5])
-    np.testing.assert_array_equal(find_levels(Planes, -Z), [-2.5, 0.0])
+    np.testing.assert_array_equal(alignment.find_levels(Planes, Z), [0.0, 2.5])
+    np.testing.assert_array_equal(alignment.find_levels(Planes, -Z), [-2.5, 0.0])
 
 
 def test_tables_stand_on_floors_and_what_is_higher_says_nothing():
     levels = np.array([0.0, 2.6])
     for height, sign in ((0.75, 1.0), (1.3, 0.0), (2.1, -1.0), (0.1, 0.0)):
         heights = np.append(np.repeat(levels, 500), np.full(60, height))
-        cue = furniture_cue(heights, np.ones(1060, bool), levels)
+        cue = alignment.furniture_cue(heights, np.ones(1060, bool), levels)
         assert np.sign(cue) == sign
         assert abs(cue) < np.log(62.0)
 
@@ -123,9 +114,8 @@ def two_rooms(door_height):
 @pytest.mark.parametrize(("door_height", "least"), [(2.0, 0.4), (2.6, -0.1), (0.0, -0.1)])
 def test_people_walk_through_doors_and_below_lintels_only(door_height, least):
     points = two_rooms(door_height)
-    cue = passage_cue(
-        points[:, 2], np.isin(points[:, 2], [0.0, 2.6]), np.array([0.0, 2.6]), points[:, :2].copy()
-    )
+    is_level = np.isin(points[:, 2], [0.0, 2.6])
+    cue = alignment.passage_cue(points[:, 2], is_level, np.array([0.0, 2.6]), points[:, :2].copy())
     assert least < cue < least + 0.4
 
 
@@ -162,11 +152,11 @@ def hut():
         rectangle(rng, [3, 0, 2.5], [3, 0, 1.5], [0, 4, 0]),
         rectangle(rng, [2, 1.5, 0.8], [2, 0, 0], [0, 1.5, 0]),
     ]
-    return estimate_normals((np.concatenate(parts) @ TURN.T + [7.0, -3.0, 2.0]).astype(np.float32))
+    return alignment.estimate_normals((np.concatenate(parts) @ TURN.T + [7.0, -3.0, 2.0]).astype(np.float32))
 
 
 def test_every_plane_is_found_the_largest_first(hut):
-    planes = ransac_planes(hut)
+    planes = alignment.ransac_planes(hut)
     assert (np.diff(planes.areas) <= 0.0).all()
     assert planes.areas.sum() == pytest.approx(1.0, abs=0.1)
     sines = np.abs(planes.normals @ UP)
@@ -185,7 +175,7 @@ def planes_of(*normals, areas=None):
 @pytest.mark.parametrize("sense", [1.0, -1.0])
 def test_the_vertical_near_what_is_said_keeps_its_sense(hut, lean_deg, sense):
     lean = exp_so3(np.radians(lean_deg) * np.array([0.6, 0.8, 0.0]))
-    found = level(ransac_planes(hut), sense * lean @ UP)
+    found = alignment.level(alignment.ransac_planes(hut), sense * lean @ UP)
     assert np.linalg.norm(found - sense * UP) < 0.002
 
 
@@ -199,7 +189,7 @@ def test_the_vertical_near_what_is_said_keeps_its_sense(hut, lean_deg, sense):
     ],
 )
 def test_what_is_said_is_kept_where_no_vertical_is_near(planes, said):
-    np.testing.assert_array_equal(level(planes, np.array(said, float)), said)
+    np.testing.assert_array_equal(alignment.level(planes, np.array(said, float)), said)
 
 
 @pytest.mark.parametrize("azimuth_deg", [-170, -100, -46, -44, -1, 0, 30, 44, 46, 91, 179])
@@ -208,12 +198,12 @@ def test_the_smallest_turn_puts_walls_along_the_axes(azimuth_deg):
     angles = [a, a + 0.5 * np.pi, a + 0.001, a + 0.6]
     R = rotation_to_z(UP)
     normals = np.array([[np.cos(b), np.sin(b), 0.0] for b in angles])
-    turn = wall_yaw(planes_of(*(normals @ R), areas=[0.2, 0.2, 0.2, 0.3]), R)
+    turn = alignment.wall_yaw(planes_of(*(normals @ R), areas=[0.2, 0.2, 0.2, 0.3]), R)
     assert -np.pi / 4 < turn <= np.pi / 4
     assert np.abs(yaw_rotation(-turn) @ normals[0]).max() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_walls_at_45_degrees_turn_one_way_and_none_none():
-    assert wall_yaw(planes_of([1, 1, 0]), np.eye(3)) == pytest.approx(np.pi / 4)
-    assert wall_yaw(planes_of([1, -1, 0]), np.eye(3)) == pytest.approx(np.pi / 4)
-    assert wall_yaw(planes_of([0, 0, 1]), np.eye(3)) is None
+    assert alignment.wall_yaw(planes_of([1, 1, 0]), np.eye(3)) == pytest.approx(np.pi / 4)
+    assert alignment.wall_yaw(planes_of([1, -1, 0]), np.eye(3)) == pytest.approx(np.pi / 4)
+    assert alignment.wall_yaw(planes_of([0, 0, 1]), np.eye(3)) is None

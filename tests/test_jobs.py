@@ -43,7 +43,8 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
             path.mkdir(parents=True)
         words = ["--cloud", str(scene / "cloud.ply"), "--pano", str(bad), str(scene / "images")]
         words += ["--out", str(folder / "out"), "--overlay", str(pictures[0]), "--priors", str(table)]
-        words += ["--occlusion-mask", str(pictures[1]), "--cache", "none", "--max-memory", "8"]
+        words += ["--occlusion-mask", str(pictures[1]), "--max-memory", "8"]
+        words += ["--cache", str(scene.parent / "maps")]
         assert localize.main([*words, "--jobs", jobs]) == 3
         err = re.sub(r" in [0-9.]+ s", "", capsys.readouterr().err)
         lines = [line for line in err.splitlines() if re.search("clean|bad|names", line)]
@@ -56,10 +57,10 @@ def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
 class Deadly(Localizer):
     """Localizes; one photo kills the process at work on it."""
 
-    def answer(self, scan, task):
+    def answer(self, scan, place_keypoints, task):
         if task.photo.path.name == "deadly.jpg":
             os.kill(os.getpid(), signal.SIGKILL)
-        return super().answer(scan, task)
+        return super().answer(scan, place_keypoints, task)
 
 
 def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path, monkeypatch, capsys):

@@ -58,9 +58,8 @@ def test_turning_the_sphere_turns_the_keypoints():
             assert (cKDTree(turned.rays).query(wrong_way)[0] < most_off * PIXEL).mean() < 0.3
         cosines = np.sum(tangents[is_same] * own.tangents[nearest[is_same]], axis=1)
         assert np.median(cosines) > np.cos(np.radians(8.0))
-        np.testing.assert_allclose(
-            np.median(turned.sizes[is_same] / own.sizes[nearest[is_same]]), 1, atol=0.05
-        )
+        ratios = turned.sizes[is_same] / own.sizes[nearest[is_same]]
+        np.testing.assert_allclose(np.median(ratios), 1, atol=0.05)
 
 
 def test_what_views_share_counts_once():

@@ -10,23 +10,12 @@ from scipy.spatial import cKDTree
 
 from piccolo.jobs.threads import Workers
 from piccolo.local_features import feature_map
-from piccolo.local_features.feature_map import (
-    LIST_SIZE,
-    NUM_COMPONENTS,
-    list_middles,
-    make_feature_map,
-    nearest_middle,
-    principal_components,
-    project,
-)
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 
 
 def _descriptors(rng, count):
-    return rng.integers(-127, 128, (count, NUM_COMPONENTS)).astype(np.int8)
+    return rng.integers(-127, 128, (count, feature_map.NUM_COMPONENTS)).astype(np.int8)
 
 
 def _centers():
@@ -41,7 +30,8 @@ def test_lists_equal_a_search_of_all_where_all_are_looked_through():
     points = np.stack([places, 0 * places, 0 * places], axis=1) + rng.uniform(-0.08, 0.08, (300, 3))
     in_map, descriptors = _descriptors(rng, 300), _descriptors(rng, 25)
     in_map[::3] = np.clip(
-        descriptors[rng.integers(25, size=100)].astype(int) + rng.integers(-9, 10, (100, NUM_COMPONENTS)),
+        descriptors[rng.integers(25, size=100)].astype(int)
+        + rng.integers(-9, 10, (100, feature_map.NUM_COMPONENTS)),
         -127,
         127,
     )
@@ -69,7 +59,7 @@ def test_nearest_lists_and_middles_by_brute_force():
     probes, nearest = np.empty((90, 6), np.int32), np.empty(90, np.int32)
     nearest_lists(descriptors, middles, probes)
     np.testing.assert_array_equal(probes, np.argsort(squares, axis=1, kind="stable")[:, :6])
-    nearest_middle(descriptors, middles, nearest)
+    feature_map.nearest_middle(descriptors, middles, nearest)
     np.testing.assert_array_equal(nearest, squares.argmin(axis=1))
 
 
@@ -77,23 +67,22 @@ def test_components_keep_distances_and_middles_are_of_clusters(monkeypatch):
     rng = np.random.default_rng(8)
     axes = rng.normal(size=(10, 128))
     values = np.clip(np.rint(120 + 4 * rng.normal(size=(500, 10)) @ axes), 0, 255).astype(np.uint8)
-    mean, components = principal_components(values)
+    mean, components = feature_map.principal_components(values)
     np.testing.assert_allclose(mean, values.mean(axis=0), atol=0.5)
     gram = components[:, :8].T.astype(float) @ components[:, :8] / 127**2
     np.testing.assert_allclose(gram, np.eye(8), atol=0.03)
-    projected = project(values, mean, components).astype(float)
+    projected = feature_map.project(values, mean, components).astype(float)
     monkeypatch.setattr(feature_map, "BLOCK", 7)
-    np.testing.assert_array_equal(project(values, mean, components), projected)
+    np.testing.assert_array_equal(feature_map.project(values, mean, components), projected)
     gaps = np.linalg.norm(values[:-1].astype(float) - values[1:], axis=1)
     is_unclipped = np.abs(projected).max(axis=1) < 127
     both = is_unclipped[:-1] & is_unclipped[1:]
     assert both.sum() > 200
-    np.testing.assert_allclose(
-        np.linalg.norm(projected[:-1] - projected[1:], axis=1)[both], gaps[both], rtol=0.05
-    )
+    found = np.linalg.norm(projected[:-1] - projected[1:], axis=1)
+    np.testing.assert_allclose(found[both], gaps[both], rtol=0.05)
     clusters = np.repeat(_descriptors(rng, 3) // 2, 50, axis=0)
     noisy = (clusters + rng.integers(-2, 3, clusters.shape)).astype(np.int8)
-    middles = list_middles(noisy, 3)
+    middles = feature_map.list_middles(noisy, 3)
     distance = np.abs(middles[:, None].astype(int) - clusters[::50].astype(int)).max(axis=2)
     assert (np.sort(distance.min(axis=1)) <= 2).all()
 
@@ -109,9 +98,9 @@ def test_the_maps_features_lie_on_its_surfaces_and_in_one_list_each():
     assert start[0] == 0
     assert start[-1] == len(found.points) == len(found.descriptors)
     assert (np.diff(start) >= 0).all()
-    assert abs(len(found.middles) * LIST_SIZE - len(found.points)) < LIST_SIZE
+    assert abs(len(found.middles) * feature_map.LIST_SIZE - len(found.points)) < feature_map.LIST_SIZE
     nearest = np.empty(len(found.points), np.int32)
-    nearest_middle(found.descriptors, found.middles, nearest)
+    feature_map.nearest_middle(found.descriptors, found.middles, nearest)
     np.testing.assert_array_equal(nearest, np.repeat(np.arange(len(found.middles)), np.diff(start)))
     for directions in (found.directions, found.tangents):
         np.testing.assert_allclose(np.linalg.norm(directions / 127.0, axis=1), 1.0, atol=0.01)
@@ -121,15 +110,15 @@ def test_the_maps_features_lie_on_its_surfaces_and_in_one_list_each():
 
 def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
     octree = rooms.scan_map(1).octree
-    one, two = (make_feature_map(octree, _centers(), Workers(k)) for k in (1, 2))
+    one, two = (feature_map.make_feature_map(octree, _centers(), Workers(k)) for k in (1, 2))
     for own, other in zip(one, two, strict=True):
         assert own.dtype == other.dtype
         np.testing.assert_array_equal(own, other)
     assert len(one.points) > 300
-    nothing = make_feature_map(octree, np.empty((0, 3)), Workers())
+    nothing = feature_map.make_feature_map(octree, np.empty((0, 3)), Workers())
     assert [len(values) for values in nothing] == [0, 0, 0, 0, 0, 0, 0, 128, 128, 1, 2]
     gray = octree._replace(nodes=np.where(np.arange(6) < 3, octree.nodes, np.float32(128 / 255)))
-    flat = make_feature_map(gray, _centers(), Workers())
+    flat = feature_map.make_feature_map(gray, _centers(), Workers())
     assert len(flat.points) < 5  # at the edges of what was scanned
     found = rooms.scan_map(1).local_features
     some = Keypoints(
@@ -141,12 +130,12 @@ def test_same_bits_for_any_number_of_threads_and_none_where_nothing_is():
 
 @pytest.fixture(scope="module")
 def matches():
-    query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
     return query.matches
 
 
 def test_matches_of_halves_are_those_of_the_whole_numbered_on():
-    query = prepare_query(rooms.scene(1)[1], rooms.scan_map(1), CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
     halves = [half() for half in query.features]
     joined, keypoints = query.matches, query.keypoints
     assert len(joined.query) == sum(len(half.matches.query) for half in halves)

@@ -13,6 +13,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+import rooms
 from batches import command_of, start_localize
 from rooms import errors, query
 from test_result import RESULT
@@ -29,7 +30,7 @@ PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_p
 
 def _arguments(scene, *more):
     pano = str(scene / "images" / "clean_0.jpg")
-    return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--cache", "none", *more]
+    return ["--cloud", str(scene / "cloud.ply"), "--pano", pano, "--cache", str(scene.parent / "maps"), *more]
 
 
 def _truth(scene):
@@ -40,9 +41,7 @@ def test_pose_on_stdout_and_a_summary_on_stderr(scene, capsys):
     assert localize.main(_arguments(scene)) == 0
     out, err = capsys.readouterr()
     result = Result.from_json(out)
-    distance, angle_deg = errors(result.pose, _truth(scene))
-    assert distance < 0.03
-    assert angle_deg < 0.5
+    rooms.assert_near(result.pose, _truth(scene), 0.03, 0.5)
     assert set(result.seconds) == {"read", "search", "refine"}  # a clear photo: no features are matched
     assert "localized at" in err
     assert out.count("\n") == 1
@@ -105,13 +104,6 @@ def test_files_are_written_and_look_right(scene, tmp_path, capsys):
     assert (checkerboard[tile[1]] == cloud[tile[1]]).all()
 
 
-def test_panorama_from_elsewhere_exits_with_one(scene, tmp_path, capsys):
-    elsewhere = tmp_path / "elsewhere.png"
-    cv2.imwrite(str(elsewhere), query(1).rgb)
-    assert localize.main(_arguments(scene, "--pano", str(elsewhere), *PAPER, "--quiet")) == 1
-    assert json.loads(capsys.readouterr().out)["status"] == "not_localized"
-
-
 GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
 
 
@@ -121,14 +113,11 @@ GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
         ({"status": "localized"}, []),
         ({"status": "ambiguous", "confidence": 0.05}, ["  to decide, give --near or --heading"]),
         ({"confidence": 0.1}, ["  to be sure, look at the --overlay, give --near"]),
-        (
-            {"status": "ambiguous", "confidence": 0.5, "focal_length": GUESSED},
-            ["  if other photos of this camera"],
-        ),
+        ({"status": "ambiguous", "confidence": 0.5, "focal_length": GUESSED}, ["  if other photos of this"]),
         ({"confidence": 0.09}, ["  it fits nowhere well: another scan, or bare walls?"]),
         (
             {"confidence": 0.09, "cameras": (Mount(pinhole(4, 3, 4.0)),)},
-            ["  it fits nowhere well: .* focal length"],
+            ["  it fits nowhere .* focal length"],
         ),
         ({"confidence": 0.0}, []),  # a warning says why
         ({"confidence": 0.5, "probability_none": None}, []),  # of the preset paper

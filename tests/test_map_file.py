@@ -1,17 +1,21 @@
-"""Prepared maps on disk: read back to the same bits, and nothing believed that a map can't be."""
+"""Prepared maps in files: round trips, damage and hostility; and the archives that hold their arrays."""
 
 import dataclasses
+import io
+import zipfile
 
 import naive
 import numpy as np
 import pytest
-from rooms import scan_map
+from refusals import assert_input_error
+from rooms import make_map, map_path, scan_map
 
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.voxels import LEAF_SIZE, PHASE, QUANTA_PER_METRE, VoxelTable
 from piccolo.errors import InputError
-from piccolo.files.array_archive import write_archive
+from piccolo.files import array_archive
+from piccolo.files.array_archive import ALIGNMENT, ArrayArchive, read_header, write_archive
 from piccolo.geometry.pose import exp_so3
 from piccolo.scan_map import map_file, open_map
 from piccolo.scan_map.map_file import is_map_file, load_map, save_map
@@ -19,11 +23,9 @@ from piccolo.scan_map.map_validation import first_misplaced
 from piccolo.scan_map.open_map import content_key
 
 
-@pytest.fixture(scope="module")
-def built(tmp_path_factory):
-    path = tmp_path_factory.mktemp("map") / "a.map"
-    save_map(scan_map(1), path)
-    return path
+@pytest.fixture
+def built():
+    return map_path(1)
 
 
 @pytest.fixture
@@ -41,22 +43,23 @@ def _save(path, arrays):
         write_archive(file, arrays)
 
 
-def test_round_trip_and_a_file_cut_short(built, tmp_path):
+def test_round_trip_and_a_file_cut_short(tmp_path):
+    made, built = make_map(1, 20_000), tmp_path / "a.map"
+    save_map(made, built)
     back = load_map(built)
     for field in dataclasses.fields(back):
         if field.name not in ("octree", "local_features", "views"):
-            np.testing.assert_array_equal(getattr(back, field.name), getattr(scan_map(1), field.name))
-    for own, other in zip(back.local_features, scan_map(1).local_features, strict=True):
+            np.testing.assert_array_equal(getattr(back, field.name), getattr(made, field.name))
+    for own, other in zip(back.local_features, made.local_features, strict=True):
         assert own.dtype == other.dtype
         np.testing.assert_array_equal(own, other)
-    assert len(back.local_features.points) > 1000
+    assert len(back.local_features.points) > 500
     np.testing.assert_array_equal(back.views.centers, back.centers)
     assert isinstance(back.scan_sha256, str)
     assert back.has_labels is False
-    np.testing.assert_array_equal(back.octree.nodes, scan_map(1).octree.nodes)
+    np.testing.assert_array_equal(back.octree.nodes, made.octree.nodes)
     (tmp_path / "b.map").write_bytes(built.read_bytes()[:-1000])
-    with pytest.raises(InputError, match=r"b\.map: "):
-        load_map(tmp_path / "b.map")
+    assert_input_error(r"b\.map: ", load_map, tmp_path / "b.map")
 
 
 def test_a_file_outlives_other_sources_but_the_cache_does_not(built, monkeypatch):
@@ -151,22 +154,17 @@ def test_members_are_those_of_a_map_and_not_compressed(arrays, tmp_path):
     np.savez_compressed(path.with_suffix(".npz"), **arrays)
     packed = path.with_suffix(".npz").read_bytes()
     path.write_bytes(packed)
-    with pytest.raises(InputError, match=r"damaged .'arrays of \d+ bytes'"):
-        load_map(path)
+    assert_input_error(r"damaged .'arrays of \d+ bytes'", load_map, path)
     path.write_bytes(bytes(10**7) + packed)  # what comes before an archive is no part of it
-    with pytest.raises(InputError, match=r"format.npy in another way than a prepared map has it"):
-        load_map(path)
+    assert_input_error(r"format.npy in another way than a prepared map has it", load_map, path)
     np.savez(path.with_suffix(".npz"), **arrays)
     path.write_bytes(path.with_suffix(".npz").read_bytes())
-    with pytest.raises(InputError, match=r"format.npy at byte \d+, no multiple of 64"):
-        load_map(path)
+    assert_input_error(r"format.npy at byte \d+, no multiple of 64", load_map, path)
     _save(path, {**arrays, "more": np.zeros(3)})
-    with pytest.raises(InputError, match=r"damaged .*'more'"):
-        load_map(path)
+    assert_input_error(r"damaged .*'more'", load_map, path)
     del arrays["sparse"]
     _save(path, arrays)
-    with pytest.raises(InputError, match=r"damaged .*sparse"):
-        load_map(path)
+    assert_input_error(r"damaged .*sparse", load_map, path)
 
 
 def test_no_objects_are_unpickled(arrays, tmp_path):
@@ -175,8 +173,7 @@ def test_no_objects_are_unpickled(arrays, tmp_path):
     content = path.read_bytes()
     assert content.count(b"'<u8'") == 1
     path.write_bytes(content.replace(b"'<u8'", b"'|O' "))
-    with pytest.raises(InputError, match=r"warnings.npy of 8 bytes, which promises object of shape \(1,\)"):
-        load_map(path)
+    assert_input_error(r"warnings.npy of 8 bytes, which promises object of shape \(1,\)", load_map, path)
 
 
 def test_warnings_are_lines_that_can_be_printed(arrays, tmp_path):
@@ -220,3 +217,79 @@ def test_nodes_are_in_their_parents_voxels():
         assert (first_misplaced(nodes, *args, 100.0) >= 0) == misplaced.any()
         num_found += misplaced.any()
     assert 10 < num_found < 40
+
+
+ARRAYS = {
+    "a": np.arange(7, dtype=np.int8),
+    "longer_name": np.linspace(0.0, 1.0, 300).reshape(100, 3),
+    "none": np.zeros((0, 4), np.float32),
+    "one": np.array("text"),
+    "flags": np.array([True, False]),
+}
+
+
+@pytest.fixture
+def path(tmp_path):
+    with (tmp_path / "a.npz").open("wb") as file:
+        write_archive(file, ARRAYS)
+    return tmp_path / "a.npz"
+
+
+@pytest.mark.parametrize("is_mapped", [False, True])
+@pytest.mark.parametrize("limit", [zipfile.ZIP64_LIMIT, 2000])
+def test_arrays_come_back_aligned_and_numpy_reads_them_too(tmp_path, monkeypatch, limit, is_mapped):
+    """Large members have a longer header in the archive."""
+    monkeypatch.setattr(zipfile, "ZIP64_LIMIT", limit)
+    with (tmp_path / "a.npz").open("wb") as file:
+        write_archive(file, ARRAYS)
+    archive = ArrayArchive(tmp_path / "a.npz", is_mapped)
+    assert list(archive.members) == list(ARRAYS)
+    with np.load(tmp_path / "a.npz") as loaded:
+        for name, array in ARRAYS.items():
+            archive.check(name)
+            found = archive.array(name)
+            assert (found.dtype, found.shape) == (array.dtype, array.shape)
+            np.testing.assert_array_equal(found, array)
+            np.testing.assert_array_equal(loaded[name], array)
+            assert found.ctypes.data % ALIGNMENT == 0 or found.size == 0
+
+
+def test_what_is_written_to_an_array_changes_no_file(path):
+    before = path.read_bytes()
+    ArrayArchive(path, is_mapped=True).array("longer_name")[:] = -1.0
+    assert path.read_bytes() == before
+    assert ArrayArchive(path).array("longer_name").min() == 0.0
+
+
+def test_each_changed_byte_of_an_array_is_noticed(path):
+    content = path.read_bytes()
+    first = content.index(ARRAYS["longer_name"].tobytes())
+    for k in range(first, first + ARRAYS["longer_name"].nbytes, 97):
+        path.write_bytes(content[:k] + bytes([content[k] ^ 1]) + content[k + 1 :])
+        with pytest.raises(ValueError, match=r"longer_name.npy with a wrong checksum"):
+            ArrayArchive(path).check("longer_name")
+
+
+def test_no_array_reaches_beyond_the_file(path, monkeypatch):
+    info = ArrayArchive(path).members["a"]
+    for offset in (len(path.read_bytes()) - 40, len(path.read_bytes())):
+        archive = ArrayArchive(path)
+        archive.members["a"].header_offset = offset
+        with pytest.raises((ValueError, array_archive.struct.error)):
+            archive.array("a")
+    archive = ArrayArchive(path)
+    archive.members["a"].header_offset, archive.members["a"].file_size = info.header_offset, 10**6
+    archive.members["a"].compress_size = 10**6
+    with pytest.raises(ValueError, match="in another way than a prepared map has it"):
+        archive.array("a")
+
+
+def test_a_header_that_numpy_would_have_to_mend_is_refused_without_a_warning():
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": (3, 6)})
+    head = file.getvalue()
+    assert read_header(head) == ((3, 6), False, np.dtype("<f8"), len(head))
+    with pytest.raises(ValueError, match="a header of Python 2"):
+        read_header(head.replace(b"(3, 6), }  ", b"(3L, 6L), }"))
+    with pytest.raises(ValueError, match=r"version 3.0, wanted 1.0 or 2.0"):
+        read_header(head.replace(b"NUMPY\x01", b"NUMPY\x03"))

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
+from refusals import assert_input_error
 from rooms import as_panorama, query, room, scan_map
 
 from piccolo.cloud import octree
@@ -50,8 +51,7 @@ def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(syst
     memory.limit_memory(500.0)
     assert memory.memory_left() == pytest.approx(8e9)
     for wrong in (0.0, -1.0, float("nan")):
-        with pytest.raises(InputError, match="`max_memory`: found"):
-            memory.limit_memory(wrong)
+        assert_input_error("`max_memory`: found", memory.limit_memory, wrong)
 
 
 V1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
@@ -158,8 +158,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
         ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("rotations needs .*num_yaws", lambda: search_poses(asked, "known")),
     ):
-        with pytest.raises(InputError, match=text):
-            ask()
+        assert_input_error(text, ask)
 
 
 def test_frames_of_a_video_are_asked_for_before_one_is_decoded(system, tmp_path):

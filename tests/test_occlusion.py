@@ -5,17 +5,7 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.confidence.occlusion import (
-    CONTRADICTED,
-    EXPLAINED,
-    FLAT_VARIANCE,
-    LEAST_COVERED,
-    MOST_DIFFERENCE,
-    NOT_SCANNED,
-    compare_occlusion,
-    occlusion_mask,
-    write_squares,
-)
+from piccolo.confidence import occlusion
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import pixel_rays, solid_angles
 from piccolo.panorama import Panorama
@@ -42,9 +32,8 @@ def _occluded(panorama, number, rng, contrast):
     rgb, (height, width) = panorama.rgb.copy(), number.shape
     for n in range(1, number.max() + 1):
         pattern = rng.integers(30, 226, 3) + rng.normal(0.0, contrast, (12, 24, 3))
-        image = cv2.resize(
-            pattern.clip(0, 255).astype(np.uint8), (width, height), interpolation=cv2.INTER_CUBIC
-        )
+        texture = pattern.clip(0, 255).astype(np.uint8)
+        image = cv2.resize(texture, (width, height), interpolation=cv2.INTER_CUBIC)
         rgb[number == n] = image[number == n]
     return rooms.as_panorama(rgb)
 
@@ -63,10 +52,11 @@ def test_occluders_are_where_the_mask_is_white(contrast):
             rng = np.random.default_rng([seed, int(100 * fraction)])
             number = _caps(rng, rooms.WIDTH, fraction)
             photo = _occluded(panorama, number, rng, contrast)
-            mask = occlusion_mask(points, photo, pose)
-            was_scanned = mask != NOT_SCANNED
-            overlaps.append(_intersection_over_union(mask == CONTRADICTED, (number > 0) & was_scanned))
-            explained, contradicted = compare_occlusion(points, photo, pose).fractions()
+            mask = occlusion.occlusion_mask(points, photo, pose)
+            was_scanned = mask != occlusion.NOT_SCANNED
+            is_contradicted = mask == occlusion.CONTRADICTED
+            overlaps.append(_intersection_over_union(is_contradicted, (number > 0) & was_scanned))
+            explained, contradicted = occlusion.compare_occlusion(points, photo, pose).fractions()
             assert contradicted / (explained + contradicted) == pytest.approx(fraction, abs=0.15)
             assert explained + contradicted <= 1.0
     assert np.median(overlaps) >= 0.75
@@ -78,7 +68,7 @@ def test_an_unchanged_room_contradicts_nothing_whatever_the_exposure(gains):
     for seed in SEEDS:
         points, panorama, pose = rooms.scene(seed)
         photo = rooms.as_panorama((panorama.rgb * np.array(gains)).clip(0, 255).astype(np.uint8))
-        explained, contradicted = compare_occlusion(points, photo, pose).fractions()
+        explained, contradicted = occlusion.compare_occlusion(points, photo, pose).fractions()
         assert contradicted < 0.02
         assert explained > 0.75
 
@@ -91,8 +81,8 @@ def test_turning_the_camera_turns_the_mask():
     turned = rooms.as_panorama(np.roll(photo.rgb, quarter, axis=1))
     R = exp_so3(np.array([0.0, 0.0, -np.pi / 2.0])) @ pose.R_cam_from_world
     masks = [
-        np.roll(occlusion_mask(points, photo, pose), quarter, axis=1),
-        occlusion_mask(points, turned, Pose(R, pose.center_world)),
+        np.roll(occlusion.occlusion_mask(points, photo, pose), quarter, axis=1),
+        occlusion.occlusion_mask(points, turned, Pose(R, pose.center_world)),
     ]
     assert np.mean(masks[0] != masks[1]) < 0.01
 
@@ -105,23 +95,24 @@ def test_what_was_not_scanned_or_not_photographed_is_grey():
     is_valid = np.ones(panorama.rgb.shape[:2], bool)
     is_valid[:, :256] = False  # the left half of the image centre, and behind it on that side
     photo = Panorama(panorama.rgb, is_valid)
-    mask = occlusion_mask(half, photo, pose)
+    mask = occlusion.occlusion_mask(half, photo, pose)
     assert mask.shape == panorama.rgb.shape[:2]
-    assert set(np.unique(mask)) <= {EXPLAINED, NOT_SCANNED, CONTRADICTED}
-    assert (mask[:, :256] == NOT_SCANNED).all()
+    assert set(np.unique(mask)) <= {occlusion.EXPLAINED, occlusion.NOT_SCANNED, occlusion.CONTRADICTED}
+    assert (mask[:, :256] == occlusion.NOT_SCANNED).all()
     forward = pixel_rays(rooms.WIDTH)[..., 0]
-    assert np.mean(mask[forward < -0.1] == NOT_SCANNED) > 0.99
-    assert np.mean(mask[(forward > 0.1) & is_valid] == EXPLAINED) > 0.9
-    explained, contradicted = compare_occlusion(half, photo, pose).fractions()
+    assert np.mean(mask[forward < -0.1] == occlusion.NOT_SCANNED) > 0.99
+    assert np.mean(mask[(forward > 0.1) & is_valid] == occlusion.EXPLAINED) > 0.9
+    explained, contradicted = occlusion.compare_occlusion(half, photo, pose).fractions()
     assert 0.4 < explained < 0.52
     assert contradicted < 0.02
 
 
 def test_nothing_in_common_is_neither_explained_nor_contradicted():
     points, panorama, pose = rooms.scene(1)
-    nothing = compare_occlusion(points, Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool)), pose)
+    hidden = Panorama(panorama.rgb, np.zeros(panorama.rgb.shape[:2], bool))
+    nothing = occlusion.compare_occlusion(points, hidden, pose)
     assert nothing.fractions() == (0.0, 0.0)
-    assert not (nothing.coverage > LEAST_COVERED).any()
+    assert not (nothing.coverage > occlusion.LEAST_COVERED).any()
 
 
 def test_squared_differences_are_as_their_formula_says():
@@ -134,10 +125,10 @@ def test_squared_differences_are_as_their_formula_says():
     value = (channels - means[0]) * per_deviation[0]
     outside = np.maximum(np.maximum(low - value, value - high), 0.0)
     variance = 1.0 / per_deviation.min(axis=0) ** 2
-    outside *= np.sqrt(variance / (variance + FLAT_VARIANCE))
-    expected = (np.minimum(outside, MOST_DIFFERENCE) ** 2).sum(axis=2)
+    outside *= np.sqrt(variance / (variance + occlusion.FLAT_VARIANCE))
+    expected = (np.minimum(outside, occlusion.MOST_DIFFERENCE) ** 2).sum(axis=2)
     statistics = (np.concatenate([m, d], axis=2) for m, d in zip(means, per_deviation, strict=True))
     squares = np.empty(shape[:2], np.float32)
-    write_squares(*(a.astype(np.float32) for a in (channels, *statistics, low, high)), squares)
+    occlusion.write_squares(*(a.astype(np.float32) for a in (channels, *statistics, low, high)), squares)
     np.testing.assert_allclose(squares, expected, rtol=1e-4, atol=1e-4)
-    assert 0.0 < np.median(squares) < 3.0 * MOST_DIFFERENCE**2
+    assert 0.0 < np.median(squares) < 3.0 * occlusion.MOST_DIFFERENCE**2

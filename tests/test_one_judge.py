@@ -1,44 +1,89 @@
-"""Photos that help each other never overrule what the judge has ruled out: each runs the real thing."""
+"""The judge's decisions; and photos that help each other never overrule what it has ruled out."""
 
-import json
+from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
+import pytest
 import rooms
-from pictures import encoded, write
-from test_focal_length import TRUE, _photo
-from test_localize_cameras import SEED, place, scan
+from test_focal_length import TRUE
+from test_localize_cameras import place, scan
 from test_walk import _walk_through
 
 import piccolo
 from piccolo.camera import Mount
-from piccolo.camera.files import document_of
 from piccolo.camera.model import pinhole
-from piccolo.cli.localize import main
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.confidence.alternatives import Hypothesis
+from piccolo.confidence.confidence import Standing
+from piccolo.confidence.localization import Alternative, FocalLength, Localization
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
-from piccolo.result import read_results
+from piccolo.localization import judge as judging
+from piccolo.localization.covariance import UNKNOWN_ERRORS
+from piccolo.localization.judge import MIRRORED
+from piccolo.localization.selection import Selection
 from research.synthetic.world import photograph, render_picture
 
+HERE, AWAY = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
+JUDGED = Localization(pose=HERE, alternatives=(Alternative(AWAY, 0.3, 4),))
 
-def test_a_bundle_of_one_keeps_what_its_photo_rules_out():
-    """A focal length that the picture contradicts."""
-    rgb, pose = _photo(pinhole(640, 480, TRUE))
-    photo = piccolo.Photo(rgb, focal_px=0.89 * TRUE)
-    alone = scan().localize(photo, gravity="known")
-    (together,) = scan().localize_bundle([photo], [pose], gravity="known")
-    for result in (alone, together):
-        assert result.status == "not_localized"
-        assert any("the picture has a focal length of" in warning for warning in result.warnings)
+
+@pytest.mark.parametrize(
+    ("probabilities", "status"),
+    [
+        ((0.9, 0.06, 0.04), "localized"),
+        ((0.89, 0.07, 0.04), "ambiguous"),
+        ((0.06, 0.89, 0.05), "ambiguous"),
+        ((0.5, 0.3, 0.2), "not_localized"),
+    ],
+)
+def test_a_status_is_that_of_its_probabilities_but_what_is_ruled_out_has_none(probabilities, status):
+    found = judging.decide(JUDGED, np.array(probabilities), 0.9)
+    told = found.confidence, found.alternatives[0].probability, found.probability_none
+    assert (found.status, told) == (status, probabilities)
+    again = judging.reconsider(found, 0.5, 0.9)
+    halves = [0.5 * p for p in probabilities[:2]]
+    assert [again.confidence, again.alternatives[0].probability] == pytest.approx(halves)
+    assert again.probability_none == pytest.approx(1.0 - sum(halves))
+    assert again.status == "not_localized"
+    refused = judging.decide(replace(JUDGED, is_ruled_out=True), np.array(probabilities), 0.9)
+    assert (refused.status, refused.confidence, refused.probability_none) == ("not_localized", 0.0, 1.0)
+    assert judging.reconsider(refused, 100.0, 0.9).confidence == 0.0
+
+
+@pytest.mark.parametrize(
+    ("probability", "doubt", "conflict", "is_mirrored", "status", "warns", "num_asked"),
+    [
+        (0.95, 0.0, 0.0, False, "localized", False, 1),
+        (0.95, 0.0, 0.0, True, "not_localized", True, 1),
+        (0.3, 0.0, 0.0, True, "not_localized", False, 0),  # nobody would believe it
+        (0.95, 0.1, 0.0, False, "not_localized", False, 0),  # no pose is surer than its focal length
+        (0.95, 0.0, 99.0, False, "not_localized", False, 1),
+    ],
+)
+def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
+    monkeypatch, probability, doubt, conflict, is_mirrored, status, warns, num_asked
+):
+    asked = []
+    monkeypatch.setattr(judging, "is_mirrored", lambda _, best: asked.append(best) or is_mirrored)
+    monkeypatch.setattr(judging, "explain_doubts", lambda *_: ())
+    query, focal = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1)), FocalLength(300.0, 3.0, 300.0, 3.0)
+    fit = SimpleNamespace(doubt=doubt, conflict=conflict, focal_length=lambda given: focal)
+    found = Selection(Hypothesis(HERE, 0.5), ())
+    measured = judging.Measured(HERE, UNKNOWN_ERRORS, 0.05, None)
+    standings = [Standing(1.0, 0.5, 60, "map features")]
+    p = np.array([probability, 1.0 - probability])
+    result = judging.conclude(query, found, fit, measured, standings, p)
+    assert (result.status, MIRRORED in result.warnings, len(asked)) == (status, warns, num_asked)
+    assert result.is_ruled_out == (warns or conflict > 0.0)
+    assert result.confidence == pytest.approx(0.0 if result.is_ruled_out else (1.0 - doubt) * probability)
 
 
 def test_photos_of_one_wrong_focal_length_are_not_sure_together():
     room, pose = place(1)
-    camera = Mount(pinhole(640, 480, TRUE))
-    poses = [pose]
-    for turn in (0.5, 1.0):
-        center = pose.center_world + np.array([0.05, 0.03, 0.0])
-        poses.append(Pose(yaw_rotation(turn) @ pose.R_cam_from_world, center))
+    camera = Mount(pinhole(320, 240, TRUE))
+    beside = pose.center_world + np.array([0.05, 0.03, 0.0])
+    poses = [pose, Pose(yaw_rotation(0.5) @ pose.R_cam_from_world, beside)]
     photos = [render_picture(camera, room, p, Workers(2)) for p in poses]
     given = [piccolo.Photo(photo, focal_px=0.89 * TRUE) for photo in photos]
     results = scan().localize_bundle(given, poses, gravity="known")
@@ -50,14 +95,12 @@ def test_photos_of_one_wrong_focal_length_are_not_sure_together():
 
 
 def test_a_frame_that_contradicts_the_prior_says_so_in_a_walk():
-    world, cloud = rooms.room(3)
+    world = rooms.room(3)[0]
     poses = _walk_through(world)[:4]
     frames = [photograph(world.rooms[0], p, rooms.WIDTH, Workers(2)) for p in poses]
-    points_world = cloud.points.astype(float) + cloud.origin_world
-    opened = piccolo.open_scan(piccolo.Cloud(points_world, colors=cloud.colors), num_threads=2)
     prior = piccolo.Prior(near=tuple(poses[0].center_world), radius=0.4)
     times = [0.5 * k for k in range(len(frames))]
-    results = opened.localize_walk(frames, times, prior=prior, gravity="known")
+    results = rooms.scan(3).localize_walk(frames, times, prior=prior, gravity="known")
     for result, pose in zip(results, poses, strict=True):
         distance = float(np.linalg.norm(pose.center_world - poses[0].center_world))
         if distance > 0.6:
@@ -65,31 +108,3 @@ def test_a_frame_that_contradicts_the_prior_says_so_in_a_walk():
             assert not result.best_pose or any("from the place given" in w for w in result.warnings)
         elif distance < 0.4:
             assert result.status == "localized"
-
-
-def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
-    """A whole second look: a narrow photo of what a wide one shows."""
-    room, pose = place(1)
-    near = Pose(yaw_rotation(0.2) @ pose.R_cam_from_world, pose.center_world + np.array([0.15, 0.1, 0.05]))
-    photos, cameras = tmp_path / "photos", tmp_path / "cameras"
-    photos.mkdir()
-    cameras.mkdir()
-    for name, focal, at in (("narrow", 360.0, near), ("wide", 200.0, pose)):
-        camera = Mount(pinhole(640, 480, focal))
-        write(photos / f"{name}.png", encoded(render_picture(camera, room, at, Workers(2)), ".png"))
-        write(cameras / f"{name}.camera.json", json.dumps(document_of((camera,))).encode())
-    cloud = rooms.room(SEED)[1]
-    write_ply(tmp_path / "scan.ply", vertex_rows(cloud.points + cloud.origin_world, cloud.colors))
-    words = ["--cloud", str(tmp_path / "scan.ply"), "--camera", str(cameras), "--quiet", "--threads", "2"]
-    alone = tmp_path / "alone.jsonl"
-    main([*words, "--pano", str(photos / "narrow.png"), "--out", str(alone)])
-    both = tmp_path / "both.jsonl"
-    main([*words, "--pano", str(photos), "--out", str(both)])
-    (before,), (narrow, wide) = read_results([alone]), read_results([both])
-    assert before.status != "localized"
-    assert wide.status == "localized"
-    assert wide.beside is None
-    assert narrow.beside.photos == (str(photos / "wide.png"),)
-    assert narrow.status == "localized"
-    assert before.confidence < narrow.confidence <= wide.confidence
-    assert narrow.pose.distance(near) < 0.05

@@ -1,18 +1,27 @@
-"""Maps in the cache: made once, made anew where damaged, and where none can be kept one warning."""
+"""Maps in the cache: made once, their features when they are needed; and what is known of files."""
 
+import errno
 import hashlib
 import os
 import resource
+import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+import rooms
+from refusals import assert_input_error
 from rooms import scan_map
 
 from piccolo.cloud.settings import IN_METRES
-from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.scan_map import open_map
-from piccolo.scan_map.map_file import save_map
+from piccolo.files import cache
+from piccolo.jobs.threads import Once, Stopwatch, Workers
+from piccolo.opening import Cloud, open_scan
+from piccolo.scan_map import map_file, open_map
+from piccolo.scan_map import scan_map as making
+from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.open_map import CachePolicy
 
 
@@ -103,3 +112,190 @@ def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch,
         ["CACHEDIR.TAG"],
         ["piccolo-maps"],
     )
+
+
+def _full(*_):
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.fixture
+def facts(tmp_path, monkeypatch):
+    folder = tmp_path / "facts"
+    for each in (folder, tmp_path / "maps"):
+        each.mkdir(mode=0o700)
+    monkeypatch.setattr(cache, "private_folder", lambda *_: folder)
+    monkeypatch.setattr(map_file, "private_folder", lambda *_: tmp_path / "maps")
+    return folder
+
+
+def test_a_fact_holds_until_its_file_changes_in_any_way(facts, tmp_path):
+    path = tmp_path / "a"
+    path.write_bytes(b"one")
+    before = path.stat()
+    assert cache.recall("what", before) is None
+    cache.remember("what", before, "a fact")
+    assert cache.recall("what", path.stat()) == "a fact"
+    assert cache.recall("another", path.stat()) is None
+    path.write_bytes(b"two")
+    os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))  # its time is put back, by who changed it
+    assert path.stat().st_mtime_ns == before.st_mtime_ns
+    assert cache.recall("what", path.stat()) is None
+
+
+def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatch):
+    status = tmp_path.stat()
+    cache.remember("what", status, "a fact")
+    (kept,) = facts.iterdir()
+    kept.write_bytes(b"\xff\xff")
+    assert cache.recall("what", status) is None
+    monkeypatch.setattr(cache, "write_atomically", _full)
+    cache.remember("other", status, "a fact")
+    monkeypatch.setattr(cache, "private_folder", lambda *_: None)
+    cache.remember("more", status, "a fact")
+    assert cache.recall("more", status) is None
+    assert [entry.name for entry in facts.iterdir()] == [kept.name]
+
+
+def test_facts_are_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
+    monkeypatch.setattr(cache, "cache_root", lambda: tmp_path)
+    kept = cache.private_folder.__wrapped__
+    assert kept("facts", cache.FACT_NAME) == tmp_path / "facts"
+    assert (tmp_path / "facts").stat().st_mode & 0o777 == 0o700
+    (tmp_path / "facts").chmod(0o777)
+    assert kept("facts", cache.FACT_NAME) is None
+    (tmp_path / "file").touch()
+    assert kept("file", cache.FACT_NAME) is None
+
+
+def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, monkeypatch):
+    path, read = tmp_path / "a.ply", []
+    path.write_bytes(b"one")
+    of_file = hashlib.file_digest
+    monkeypatch.setattr(hashlib, "file_digest", lambda *args: read.append(args) or of_file(*args))
+    monkeypatch.setattr(cache, "TICK_NS", 10**15)
+    assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+    assert list(facts.iterdir()) == []  # it has changed just now, and may once more
+    monkeypatch.setattr(cache, "TICK_NS", -(10**15))
+    for _ in range(2):
+        assert cache.sha256_of_files([path], True) == hashlib.sha256(b"one").hexdigest()
+    assert len(read) == 2
+    assert cache.sha256_of_files([path]) == hashlib.sha256(b"one").hexdigest()
+    assert len(read) == 3
+    path.write_bytes(b"two!")
+    assert cache.sha256_of_files([path], True) == hashlib.sha256(b"two!").hexdigest()
+
+
+def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch):
+    path, checked = tmp_path / "a.map", []
+    save_map(scan_map(1), path)
+    check = map_file.check_arrays
+    monkeypatch.setattr(map_file, "check_arrays", lambda *args: checked.append(args) or check(*args))
+    for remembers, count in ((False, 1), (True, 2), (True, 2), (False, 3)):
+        assert len(map_file.load_map(path, remembers).centers) == len(scan_map(1).centers)
+        assert len(checked) == count
+    content = bytearray(path.read_bytes())
+    content[-5000] ^= 1
+    path.write_bytes(content)
+    assert_input_error("damaged", map_file.load_map, path, remembers=True)
+
+
+@pytest.mark.parametrize("how", ["cut off", "overwritten", "removed"])
+@pytest.mark.parametrize("is_kept", [False, True])
+def test_a_map_in_memory_stays_as_it_was_whatever_becomes_of_its_file(facts, tmp_path, is_kept, how):
+    """Mapped as it is, a file cut off would kill this process."""
+    path = tmp_path / "a.map"
+    save_map(scan_map(1), path)
+    loaded = map_file.load_map(path, remembers=is_kept)
+    if how == "cut off":
+        os.truncate(path, 4096)
+    elif how == "overwritten":
+        path.write_bytes(np.random.default_rng(0).bytes(path.stat().st_size))
+    else:
+        path.unlink()
+    np.testing.assert_array_equal(loaded.octree.nodes, scan_map(1).octree.nodes)
+    np.testing.assert_array_equal(loaded.wide_features, scan_map(1).wide_features)
+    assert len(list((facts.parent / "maps").glob("*.piccolo-map"))) == is_kept
+
+
+def test_a_damaged_map_leaves_no_copy(facts, tmp_path):
+    path = tmp_path / "a.map"
+    save_map(scan_map(1), path)
+    os.truncate(path, path.stat().st_size - 1)
+    assert_input_error("damaged", map_file.load_map, path, remembers=True)
+    assert not list((facts.parent / "maps").glob("*.piccolo-map"))
+
+
+WORKERS = Workers(2)
+
+
+@pytest.fixture
+def finding(monkeypatch):
+    """Counts how often features are looked for; they are those of the room."""
+    asked = []
+    found = scan_map(1).local_features
+    monkeypatch.setattr(making, "find_local_features", lambda *_: asked.append(1) or found)
+    return asked
+
+
+@pytest.fixture
+def opened(tmp_path):
+    cache, cloud = CachePolicy(folder=tmp_path / "cache"), rooms.write_cloud(tmp_path / "cloud.ply", 1)
+    return lambda: open_map.open_map([Path(cloud)], IN_METRES, cache, WORKERS, Stopwatch())
+
+
+def test_they_are_made_once_and_threads_wait_for_them():
+    made = []
+
+    def make(workers):
+        made.append(workers)
+        time.sleep(0.2)
+        return "features"
+
+    late = Once(make)
+    with ThreadPoolExecutor(3) as pool:
+        assert list(pool.map(late, [WORKERS] * 3)) == ["features"] * 3
+    assert made == [WORKERS]
+
+
+def test_the_cache_keeps_them_for_the_next_process(opened, finding):
+    first = opened()
+    assert first.lacks_features
+    first.features_now(WORKERS)
+    assert finding == [1]
+    other = opened()
+    assert not other.lacks_features
+    np.testing.assert_array_equal(other.features_now(WORKERS).points, first.features_now(WORKERS).points)
+    assert finding == [1]
+
+
+def test_what_another_process_has_made_meanwhile_is_taken(opened, finding):
+    first, second = opened(), opened()
+    first.features_now(WORKERS)
+    second.features_now(WORKERS)
+    assert finding == [1]
+
+
+def test_where_they_can_not_be_kept_they_are_there_all_the_same(opened, finding, monkeypatch):
+    found = opened()
+    monkeypatch.setattr(open_map, "save_map", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
+    assert len(found.features_now(WORKERS).points) > 1000
+    assert opened().lacks_features
+
+
+def test_a_map_file_without_them_makes_them_too(tmp_path, finding):
+    """As it is sent to the workers of a cluster."""
+    whole = scan_map(1)
+    none = making.make_feature_map(whole.octree, whole.centers[:0], WORKERS)
+    save_map(replace(whole, local_features=none), tmp_path / "a.map")
+    loaded = load_map(tmp_path / "a.map")
+    assert loaded.lacks_features
+    assert len(loaded.features_now(WORKERS).points) > 1000
+    assert finding == [1]
+
+
+def test_a_scan_of_arrays_is_opened_without_them(finding):
+    scan = open_scan(Cloud(rooms.points_world(1), colors=rooms.room(1)[1].colors), num_threads=2)
+    assert scan._opened.prepared.lacks_features
+    assert finding == []
+    scan.localize(rooms.query(1).rgb, gravity="unknown")
+    assert finding == [1]

@@ -77,12 +77,7 @@ def test_alpha_is_turned_with_the_colors(tmp_path, orientation):
 
 @pytest.mark.parametrize(
     ("width", "height", "expected"),
-    [
-        (1000, 500, (500, 1000)),
-        (1001, 501, (500, 1000)),
-        (999, 501, (499, 998)),
-        (990, 500, (495, 990)),
-    ],
+    [(1000, 500, (500, 1000)), (1001, 501, (500, 1000)), (999, 501, (499, 998)), (990, 500, (495, 990))],
 )
 def test_nearly_two_to_one_is_shrunk(tmp_path, width, height, expected):
     stored = np.dstack([smooth_rgb(height, width), np.full((height, width), 255, dtype=np.uint8)])
@@ -157,10 +152,7 @@ def png_of(packed):
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (
-            b"GIF89a" + bytes(99),
-            "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF, WebP or HEIC picture",
-        ),
+        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF, WebP or HEIC"),
         (b"\xff\xd8", "the JPEG is cut off"),
         (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "the PNG is cut off, damaged .* .broken PNG file"),
         (png_of(zlib.compress(bytes(9000))), "the PNG is cut off, damaged .*truncated"),

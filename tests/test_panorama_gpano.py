@@ -100,9 +100,7 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
     np.testing.assert_array_equal(panorama.rgb, RGB)
     assert panorama.is_valid.all()
     assert "the crop in the metadata is invalid" in panorama.warnings[0]
-    with pytest.raises(
-        InputError, match=r"found a picture of 300 x 200, .* and a crop in the metadata that does"
-    ):
+    with pytest.raises(InputError, match=r"found a picture of 300 x 200, .* and a crop in the metadata"):
         read_panorama(write(tmp_path / "b", file_of(RGB[:, :300], fields)))
 
 
@@ -157,11 +155,8 @@ def test_the_order_is_heading_pitch_roll_about_the_cameras_axes(pitch, roll):
 
 def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     path = write(tmp_path / "a.png", encoded(RGB[60:140, 100:300], ".png"))
-    assert_refused(
-        r"found a picture of 200 x 80, which is no full .* part of a panorama, give `fov_deg`",
-        read_panorama,
-        path,
-    )
+    message = r"found a picture of 200 x 80, which is no full .* part of a panorama, give `fov_deg`"
+    assert_refused(message, read_panorama, path)
     panorama = read_panorama(Photo(path, fov_deg=180.0))
     rgb, is_valid = expected_crop(100, 60, 200, 80)
     np.testing.assert_array_equal(panorama.is_valid, is_valid)
@@ -169,14 +164,11 @@ def test_a_field_of_view_is_centred_on_the_horizon(tmp_path):
     around = read_panorama(Photo(path, fov_deg=360.0))
     assert around.rgb.shape == (100, 200, 3)
     assert around.is_valid[10:90].all()
+    for fov_deg in (0.0, -90.0, 361.0, float("nan")):
+        with pytest.raises(InputError, match=r"`fov_deg`: found .*, wanted above 0 and at most 360"):
+            Photo("a.jpg", fov_deg=fov_deg)
     with pytest.raises(InputError, match=r"found 200 x 200, higher than the sphere .* a smaller `fov_deg`"):
         read_panorama(Photo(write(path, encoded(RGB[:, :200], ".png")), fov_deg=270.0))
-
-
-@pytest.mark.parametrize("fov_deg", [0.0, -90.0, 361.0, float("nan")])
-def test_other_fields_of_view_are_refused(fov_deg):
-    with pytest.raises(InputError, match=r"`fov_deg`: found .*, wanted above 0 and at most 360"):
-        Photo("a.jpg", fov_deg=fov_deg)
 
 
 def test_many_prefixes_of_the_namespace_cost_no_time():

@@ -16,8 +16,15 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
-from piccolo.paper.localize import localize, make_loss, prepare
-from piccolo.paper.photometric import photometric_equations, photometric_loss, pixel_motion, view_gradient
+from piccolo.paper.localize import (
+    localize,
+    make_loss,
+    photometric_equations,
+    photometric_loss,
+    pixel_motion,
+    prepare,
+    view_gradient,
+)
 from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import View, render_view
 
@@ -122,23 +129,15 @@ def test_descent_recovers_the_true_pose(solver):
     settings = dataclasses.replace(PaperSettings(), loss="photometric", photometric_width=128, solver=solver)
     start = step(true_pose, np.array([0.06, -0.04, 0.08, 0.1, -0.12, 0.05]))
     refined = refine(points, make_loss(panorama, settings), start, settings)
-    distance, angle_deg = errors(refined.pose, true_pose)
-    assert distance < 0.03
-    assert angle_deg < 0.5
+    rooms.assert_near(refined.pose, true_pose, 0.03, 0.5)
     assert refined.loss < photometric_loss(points, shrink(panorama, settings.photometric_width), start)
 
 
 @pytest.mark.parametrize("initialization", ["two-stage", "loss-only"])
 def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initialization):
-    settings = PaperSettings(
-        loss="photometric",
-        initialization=initialization,
-        num_translations=20,
-        max_points=30_000,
-        num_iterations=40,
-        photometric_width=128,
-        num_by_histogram=3,
-    )
+    quick = {"num_translations": 20, "max_points": 30_000, "num_iterations": 40, "num_by_histogram": 3}
+    how = {"loss": "photometric", "photometric_width": 128, "initialization": initialization}
+    settings = PaperSettings(**how, **quick)
     paper_map, panorama = prepare(room(1)[1], settings), as_panorama(query(1).rgb)
     one, two = (localize(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
     assert errors(one.pose, query(1).pose)[0] < 0.1

@@ -12,8 +12,7 @@ import pytest
 from batches import ROOT
 
 from piccolo.errors import InputError
-from piccolo.jobs.processes import IN_FLIGHT, Processes
-from piccolo.jobs.tasks import Here, WorkerLostError
+from piccolo.jobs.processes import IN_FLIGHT, Here, Processes, WorkerLostError
 
 
 def _die():

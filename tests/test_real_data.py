@@ -20,7 +20,9 @@ def scan():
 @pytest.mark.parametrize("query", CORRIDOR.queries, ids=lambda query: query.image.stem)
 def test_best_pose_of_a_photo_in_a_real_corridor_is_right(query, scan):
     camera = CORRIDOR.folder / "cameras" / f"{query.image.stem}.camera.json"
-    pose = scan.localize(piccolo.Photo(query.image, camera=camera)).best_pose
-    distance, angle = pose_errors(pose, query.pose)
+    result = scan.localize(piccolo.Photo(query.image, camera=camera))
+    distance, angle = pose_errors(result.best_pose, query.pose)
     assert distance < 0.1  # [m]; found: 0.039 and 0.015, of which the true poses may be off by 0.02
     assert math.degrees(angle) < 1.0  # found: 0.34
+    assert distance < 3.0 * math.hypot(result.covariance.largest_std, 0.02)  # [m] of the reference
+    assert result.confidence > 0.5

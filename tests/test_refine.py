@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from rooms import errors
 
 from piccolo.geometry.pose import Pose, pose_errors, step, yaw_rotation
 from piccolo.optimize.descent_animation import encode_gif, perturb_pose, refine_with_history
@@ -29,9 +28,7 @@ def test_descent_recovers_the_true_pose(scene, solver, use_visibility):
     texels = pack_texels(panorama.rgb)
     settings = dataclasses.replace(PaperSettings(), solver=solver, use_visibility=use_visibility)
     refined = refine(points, make_sampling_loss(texels), step(true_pose, PERTURBATION), settings)
-    distance, angle_deg = errors(refined.pose, true_pose)
-    assert distance < 0.010
-    assert angle_deg < 0.3
+    rooms.assert_near(refined.pose, true_pose, 0.010, 0.3)
 
 
 def test_adam_decays_after_patience_stalled_losses():

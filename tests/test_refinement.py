@@ -20,9 +20,9 @@ from piccolo.localization import query as query_module
 from piccolo.localization.beam import Ends, best_and_alternatives, narrow
 from piccolo.localization.comparison import CONTRADICTS, Comparison
 from piccolo.localization.ladder import AROUND_MIDDLE, FINE, SECOND, Limits
-from piccolo.localization.query import Cache, prepare_query
+from piccolo.localization.query import Cache
 from piccolo.localization.search import Starts
-from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.settings import METHOD
 from piccolo.views.view import Cells
 
 FINE_BLOCKS = METHOD.fine_view.arrays.blocks
@@ -43,7 +43,7 @@ def _asked(is_partial=False):
 
 @functools.lru_cache
 def _query(seed):
-    return prepare_query(rooms.scene(seed)[1], rooms.scan_map(seed), CoarseToFineSettings(), Workers(2))
+    return rooms.ask(rooms.scene(seed)[1], rooms.scan_map(seed))
 
 
 # What is compared
@@ -229,9 +229,7 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
     monkeypatch.setattr(query_module, "normalize_view", lambda sums, center, config, shown: shown)
-    views = SimpleNamespace(
-        averages=lambda *_: None, points=lambda place, config, shown, count: (shown, count)
-    )
+    views = SimpleNamespace(averages=lambda *_: None, points=lambda place, config, *shown: shown)
     asked = replace(narrow, cache=Cache(views))
     assert (asked.view_at(pose, "fine") == shown).all()
     assert asked.view_at(pose, "points") == (shown.tobytes(), 30_000)
@@ -245,9 +243,7 @@ def test_the_end_hardly_depends_on_where_the_descent_begins(seed, most):
         ladder.settle(query, Hypothesis(step(true_pose, np.array([0, 0, 0, *d])), 0.0)).pose
         for d in ([0.002, 0.001, 0.0], [-0.002, -0.001, 0.002])
     ]
-    distance, angle_deg = rooms.errors(*ends)
-    assert distance < most
-    assert angle_deg < 0.03
+    rooms.assert_near(*ends, most, 0.03)
     again = ladder.settle(query, Hypothesis(ends[0], 0.0)).pose
     assert rooms.errors(again, ends[0])[0] < 2e-5
     assert rooms.errors(ends[0], true_pose)[0] < 0.01

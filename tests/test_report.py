@@ -10,12 +10,14 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from poses import write_results
+from refusals import assert_input_error
 from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
-from piccolo.export.video import writing_video
+from piccolo.panorama.video import writing_video
 from piccolo.report.entries import collect_entries, shorten_names, unique_names
 
 STOREYS = ["--storeys", "Ground floor", "First floor"]
@@ -85,9 +87,8 @@ def test_photos_know_their_storey_height_and_place_on_the_plan(house, made):
         np.testing.assert_allclose(photo["pose"]["rotation"], pose.R_cam_from_world.ravel(), atol=1e-6)
         center = photo["pose"]["center"] + np.array(document["origin"])
         np.testing.assert_allclose(center, world, atol=1e-6)
-    assert _photo(document, "000.jpg")["spread"]["ellipse"] == pytest.approx(
-        [0.004895, 0.002448, 0], abs=2e-5
-    )
+    spread = _photo(document, "000.jpg")["spread"]
+    assert spread["ellipse"] == pytest.approx([0.004895, 0.002448, 0], abs=2e-5)
 
 
 def test_every_status_is_there_with_what_it_has(made):
@@ -147,9 +148,7 @@ def test_a_moved_folder_of_photos_and_one_that_is_gone(house, tmp_path, capsys):
     assert "no pictures of it" in capsys.readouterr().err
     assert {photo["hasPictures"] for photo in _document(tmp_path / "r")["photos"]} == {False}
     moved = tmp_path / "moved.jsonl"
-    moved.write_text(
-        "".join(replace(r, pano=f"gone/{k}.jpg").to_json() + "\n" for k, r in enumerate(scene.results))
-    )
+    write_results(moved, [replace(r, pano=f"gone/{k}.jpg") for k, r in enumerate(scene.results)])
     assert report.main(["--results", str(moved), *words[2:], "--out", str(tmp_path / "m")]) == 0
     assert "; if it is in another folder, give --images FOLDER\n" in capsys.readouterr().err
     assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(tmp_path / "no")]) == 3
@@ -262,8 +261,7 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     digest = hashlib.sha256(scene.cloud.read_bytes()).hexdigest()
     sources = [replace(scene.results[0].source, cloud_sha256=s) for s in (digest, "0" * 64, None)]
     results = [replace(r, source=s) for r, s in zip(scene.results, sources, strict=False)]
-    lines = tmp_path / "poses.jsonl"
-    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--cache", "none"]
     for option, name in (("--out", "r"), ("--plan", "p.svg")):
         assert report.main([*words, option, str(tmp_path / name)]) == 3
@@ -275,18 +273,15 @@ def test_results_of_another_scan_are_refused_or_told_of_on_the_page(house, tmp_p
     assert f"warning: {note}" in capsys.readouterr().err
     assert _document(tmp_path / "r")["note"] == note
     scan = piccolo.open_scan(scene.cloud)
-    with pytest.raises(InputError, match="results of another scan"):
-        piccolo.write_report(lines, scan, tmp_path / "r")
+    assert_input_error("results of another scan", piccolo.write_report, lines, scan, tmp_path / "r")
     piccolo.write_report(lines, scan, tmp_path / "r", piccolo.ReportSettings(force=True))
 
 
 def test_hopeless_guesses_are_on_no_plan(house, tmp_path):
     scene, _ = house
-    results = [
-        replace(scene.results[k], status="not_localized", confidence=c) for k, c in ((0, 0.003), (2, 0.3))
-    ]
-    lines = tmp_path / "poses.jsonl"
-    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    guesses = ((0, 0.003), (2, 0.3))
+    results = [replace(scene.results[k], status="not_localized", confidence=c) for k, c in guesses]
+    lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--quiet"]
     assert report.main([*words, "--out", str(tmp_path / "r"), "--plan", str(tmp_path / "p.svg")]) == 0
     assert [photo["isOnPlan"] for photo in _document(tmp_path / "r")["photos"]] == [False, True]
@@ -302,8 +297,7 @@ def test_in_python(house, tmp_path):
     assert page == tmp_path / "r" / "index.html"
     assert _document(tmp_path / "r")["title"] == "A walk"
     assert ("photos", 6, 6) in told
-    with pytest.raises(InputError, match="`title`: found 1, wanted a text"):
-        piccolo.ReportSettings(title=1)
+    assert_input_error("`title`: found 1, wanted a text", piccolo.ReportSettings, title=1)
     with pytest.raises(InputError, match=r"`scan`: found .*, wanted Scan"):
         piccolo.write_report(results, str(scene.cloud), tmp_path / "r")
     with pytest.raises(InputError, match="found 1 names, wanted 2"):
@@ -341,8 +335,7 @@ def test_frames_of_a_video_are_taken_out_of_it(house, tmp_path, capsys):
     with writing_video(tmp_path / "walk.mp4", 1.0, (128, 64)) as add:
         for result in scene.results[:2]:
             add(cv2.cvtColor(cv2.imread(result.pano), cv2.COLOR_BGR2RGB))
-    lines = tmp_path / "poses.jsonl"
-    lines.write_text("".join(result.to_json() + "\n" for result in results))
+    lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--out", str(tmp_path / "r")]
     assert report.main(words) == 0
     document = _document(tmp_path / "r")

@@ -4,10 +4,10 @@ import os
 
 import numpy as np
 import pytest
+from refusals import assert_input_error
 
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Alternative, Evidence
-from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.result import Result, Source, read_results, unreadable_result
 
@@ -38,8 +38,7 @@ WITHOUT_ARRAYS = {"status": "not_localized", "best_pose": None, "alternatives": 
 
 def test_json_round_trip_keeps_every_bit_of_the_pose():
     back = Result.from_json(RESULT.to_json())
-    np.testing.assert_array_equal(back.pose.R_cam_from_world, RESULT.pose.R_cam_from_world)
-    np.testing.assert_array_equal(back.pose.center_world, RESULT.pose.center_world)
+    assert back.pose.key == RESULT.pose.key
     found, kept = (a.pose.R_cam_from_world for a in (back.alternatives[0], ALTERNATIVE))
     np.testing.assert_array_equal(found, kept)
     np.testing.assert_array_equal(back.covariance.matrix, RESULT.covariance.matrix)
@@ -111,8 +110,7 @@ def test_any_name_that_a_file_may_have_comes_back_from_ascii(tmp_path):
     assert [os.fsencode(result.pano) for result in read_results([file])] == [os.fsencode(n) for n in names]
     for name, text in (("half a character \ud83d", "wanted a file's name as"), (7, "Expected str, got int")):
         file.write_text(json.dumps(json.loads(RESULT.to_json()) | {"pano": name}))
-        with pytest.raises(InputError, match=text):
-            read_results([file])
+        assert_input_error(text, read_results, [file])
 
 
 def test_result_without_a_pose_or_with_nan():
@@ -140,13 +138,9 @@ def test_several_files_of_a_cloud_are_a_list():
     assert Result.from_json(several.to_json()) == several
     for cloud in (7, ["a", 7], None):
         document = json.loads(several.to_json()) | {"cloud": cloud}
-        with pytest.raises(InputError, match=r"at .*cloud"):
-            Result.from_json(json.dumps(document))
+        assert_input_error(r"at .*cloud", Result.from_json, json.dumps(document))
 
 
-@pytest.mark.parametrize(
-    "text", ["{", "[]", "{}", '{"format": "piccolo-pose/3"}', '{"format": "piccolo-pose/10"}']
-)
+@pytest.mark.parametrize("text", ["{", "[]", "{}", *(f'{{"format": "piccolo-pose/{k}"}}' for k in (3, 10))])
 def test_other_text_is_refused(text):
-    with pytest.raises(InputError, match="piccolo-pose/10"):
-        Result.from_json(text)
+    assert_input_error("piccolo-pose/10", Result.from_json, text)

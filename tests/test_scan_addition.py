@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
+from refusals import assert_input_error
 from scipy.spatial import cKDTree
 
 from piccolo.cli import localize as localize_command
@@ -122,9 +123,8 @@ def test_views_are_made_anew_where_the_new_scan_is_seen():
     taken = old.from_world(rooms.query(1).pose).center_world  # within the room
     place = old.centers[np.linalg.norm(old.centers - taken, axis=1).argmin()]
     center_world = old.to_world(Pose(np.eye(3), place)).center_world
-    column = Cloud(
-        points.astype(np.float32), rng.integers(256, size=(len(points), 3), dtype=np.uint8), center_world
-    )
+    colors = rng.integers(256, size=(len(points), 3), dtype=np.uint8)
+    column = Cloud(points.astype(np.float32), colors, center_world)
     scan_map = _added(old, column, "column")
     gone = _rows(scan_map, old.centers)[1]
     beside = np.abs(old.centers - place) - size / 2
@@ -196,8 +196,7 @@ def test_what_can_not_be_added_is_refused():
         _added(replace(first(), octree=octree), cloud, "B")
     scan_map = _added(first(), _shifted(cloud, np.array([2000.0, 0.0, 0.0])), "B")
     assert "both need one coordinate system" in scan_map.warnings[-1]
-    with pytest.raises(InputError, match=r"^`name`: found a map of several scans: 'A', 'B'$"):
-        name_scan(scan_map, "C")
+    assert_input_error(r"^`name`: found a map of several scans: 'A', 'B'$", name_scan, scan_map, "C")
 
 
 def test_a_map_of_two_scans_by_the_command_line(tmp_path, capsys):

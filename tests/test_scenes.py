@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from refusals import assert_refused
+from refusals import assert_input_error, assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
@@ -64,8 +64,7 @@ def test_scenes_are_found_at_any_depth_and_named_by_it(tmp_path):
 
 
 def test_what_lacks_a_field_or_comes_twice_or_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"found no queries\.json in or below it"):
-        find_scenes([tmp_path])
+    assert_input_error(r"found no queries\.json in or below it", find_scenes, [tmp_path])
     assert_refused(r"queries\.json: cannot be read \(No such file", read_scene, tmp_path)
     document = json.loads((_written(tmp_path, ("images/a.jpg", "images/b.jpg")) / "queries.json").read_text())
     del document["queries"][1]["variant"]
@@ -74,8 +73,7 @@ def test_what_lacks_a_field_or_comes_twice_or_is_not_there_is_named(tmp_path):
     document["queries"][1] = document["queries"][0]
     (tmp_path / "queries.json").write_text(json.dumps(document))
     assert_refused("an image twice", read_scene, tmp_path)
-    with pytest.raises(InputError, match="found a file, wanted a folder with scenes"):
-        find_scenes([Path(__file__)])
+    assert_input_error("found a file, wanted a folder with scenes", lambda: find_scenes([Path(__file__)]))
 
 
 @pytest.mark.parametrize(

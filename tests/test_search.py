@@ -14,7 +14,6 @@ from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
 from piccolo.localization.photo import make_images
-from piccolo.localization.query import prepare_query
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
@@ -30,7 +29,7 @@ AREA = make_grid(24).solid_angle
 @functools.lru_cache
 def _query(gpano=None):
     panorama = dataclasses.replace(rooms.scene(1)[1], gpano=gpano)
-    return prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(num_yaws=12), Workers(2))
+    return rooms.ask(panorama, rooms.scan_map(1), CoarseToFineSettings(num_yaws=12))
 
 
 def _levels(texels):
@@ -122,9 +121,8 @@ def test_best_poses_are_the_largest_that_have_more_than_the_least(rank, count):
     """As many as there are, however many more have it than are sorted."""
     scores = np.random.default_rng(1).normal(size=(400, 600)).astype(np.float32)
     ranked = np.sort(scores.ravel())[::-1]
-    candidate, rotation, values = search.best_poses(
-        scores, 100, search.LOWEST if rank is None else ranked[rank]
-    )
+    lowest = search.LOWEST if rank is None else ranked[rank]
+    candidate, rotation, values = search.best_poses(scores, 100, lowest)
     np.testing.assert_array_equal(values, ranked[:count])
     np.testing.assert_array_equal(scores[candidate, rotation], values)
 
@@ -144,7 +142,7 @@ def test_the_users_gravity_goes_before_the_tilt_in_the_metadata(tmp_path):
     path.write_bytes(with_metadata(content, xmp=xmp_packet({"PosePitchDegrees": 20})))
     assert read_panorama(path).gpano == GPano(pitch_deg=20.0)
     panorama = read_panorama(Photo(path, gravity_vector=(-9.0, 0.0, -9.0)))
-    photo = prepare_query(panorama, rooms.scan_map(1), CoarseToFineSettings(), Workers(2)).photo
+    photo = rooms.ask(panorama, rooms.scan_map(1)).photo
     assert photo.has_tilt
     np.testing.assert_allclose(photo.R_cam_from_level @ [0.0, 0.0, -1.0], [-(0.5**0.5), 0.0, -(0.5**0.5)])
 
@@ -154,9 +152,8 @@ def test_about_level_are_seven_pitches_in_forty_headings():
     rotations = search.list_rotations(_query(), "level")
     assert len(rotations) == 7 * 40
     forward, left, _ = rotations.transpose(1, 0, 2)
-    np.testing.assert_allclose(
-        rotations @ rotations.transpose(0, 2, 1), np.eye(3)[None].repeat(280, 0), atol=1e-9
-    )
+    products = rotations @ rotations.transpose(0, 2, 1)
+    np.testing.assert_allclose(products, np.eye(3)[None].repeat(280, 0), atol=1e-9)
     np.testing.assert_allclose(left[:, 2], 0.0, atol=1e-9)
     pitches, counts = np.unique(np.round(np.degrees(np.arcsin(forward[:, 2])), 6), return_counts=True)
     np.testing.assert_allclose(pitches, 9.0 * np.arange(-3, 4), atol=1e-5)
@@ -180,17 +177,12 @@ def test_about_level_only_headings_that_the_prior_allows_are_searched():
 def test_a_known_tilt_is_searched_as_known_whatever_the_photo_shows():
     """With all yaws at that tilt, not about level."""
     is_left = np.arange(1024) < 300
-    for gpano, tilts in (
-        (GPano(pitch_deg=0.0), "known"),
-        (None, "level"),
-        (GPano(pitch_deg=12.0), "known"),
-    ):
+    for gpano, tilts in ((GPano(pitch_deg=0.0), "known"), (None, "level"), (GPano(pitch_deg=12.0), "known")):
         narrow = _query(gpano).mask(~is_left & np.ones((512, 1), bool))
         assert narrow.photo.is_partial
         assert narrow.photo.has_tilt == (gpano is not None)
-        searched = [
-            run.keywords["tilts"] for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")
-        ]
+        planned = [run for _, run in attempts.plan_attempts(narrow) if hasattr(run, "keywords")]
+        searched = [run.keywords["tilts"] for run in planned]
         assert searched == [tilts, "any"]
         rotations = search.list_rotations(narrow, tilts)
         if gpano is not None:

@@ -1,19 +1,24 @@
 """Which pose is taken, each in a made-up case where one rule decides."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 import pytest
+import rooms
 from made_up import QUERY, at, compared, place, places
 
+from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import Standing
-from piccolo.confidence.occlusion import Agreement
+from piccolo.confidence.localization import Localization
+from piccolo.geometry.pose import step
 from piccolo.localization import beam, last_descent, selection
 from piccolo.localization import judge as judging
+from piccolo.localization.comparison import score_pose
+from piccolo.localization.covariance import UNKNOWN_ERRORS
 from piccolo.localization.last_descent import refine_best
 from piccolo.localization.selection import Selection
+from piccolo.localization.verification import count_agreeing
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):
@@ -189,39 +194,42 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
     assert asked == [0.0]
 
 
-def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):
-    counts = {0.0: 30, 1.0: 4, 2.0: 6}
-    explains = {0.0: 0.6, 1.0: 0.5, 2.0: 0.4}
-    around = SimpleNamespace(surroundings=lambda place, scale: "points" if scale < 0.01 else "coarse points")
-    query = compared(monkeypatch, explains, counts)
-    photo = SimpleNamespace(panorama=None, is_partial=False)
-    query = replace(query, photo=photo, cache=replace(query.cache, views=around))
-    query.scan_map.R_map_from_world = np.eye(3)
-    for name, value in {
-        "visible_points": lambda *_: None,
-        "sampling_loss": lambda *_: 0.07,
-        "measure_agreement": lambda points, panorama, pose: Agreement({"coarse points": 0.8}[points], 1.0),
-        "compare_occlusion": lambda *_: SimpleNamespace(fractions=lambda: (0.6, 0.3)),
-        "count_agreeing": lambda query, pose: counts.get(place(pose), 0),
-        "estimate_covariance": lambda *_: None,
-        "is_mirrored": lambda *_: False,
-    }.items():
-        monkeypatch.setattr(judging, name, value)
-    alternatives = at(1.0, 0.3), at(2.0, 0.2)
-    found = judging.judge(query, Selection(at(0.0, 0.6), alternatives, 0.7))
-    e = found.evidence
-    assert (e.score, e.agreement, e.seen_fraction) == (0.6, 0.8, 1.0)
-    assert (e.explained_fraction, e.contradicted_fraction) == (0.6, 0.3)
-    assert (e.num_matches, e.alternative_matches) == (30, 6)
-    assert e.margin == pytest.approx(0.3)
-    assert places(found.alternatives) == [1.0, 2.0]
-    assert found.loss == 0.07
-    assert [(a.score, a.num_matches) for a in found.alternatives] == [(0.3, 4), (0.2, 6)]
-    assert [s.ratio for s in found.standings] == pytest.approx([1.0, 0.5 / 0.6, 0.4 / 0.6])
+@pytest.mark.parametrize(("is_copy", "order"), [(True, [3.0, 0.0, 6.0]), (False, [0.0, 3.0, 6.0])])
+def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(monkeypatch, is_copy, order):
+    query = compared(monkeypatch, {0.0: 0.3, 3.0: 0.5, 6.0: 0.1}, {0.0: 20, 3.0: 20})
+    monkeypatch.setattr(judging, "find_copies", lambda *_: [is_copy, False])
+    monkeypatch.setattr(judging, "settle", lambda _, h: h)
+    measured = judging.Measured(at(0.0, 0.0).pose, UNKNOWN_ERRORS, 0.05, None)
+    monkeypatch.setattr(judging, "measure", lambda *_: measured)
+    monkeypatch.setattr(judging, "conclude", lambda _, found, *more: found)
+    found = Selection(at(0.0, 0.3), (at(3.0, 0.5), at(6.0, 0.1)))
+    judged = judging.judge(replace(query, evidence="drawn scan"), found)
+    assert places([judged.best, *judged.alternatives]) == order
+    assert judging.judge(query, found).best is found.best  # matched with features of the map: no copies
+
+
+def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
+    """Of a photo at its true pose, beside two others in the room; far outside, no point is seen."""
+    _, panorama, true = rooms.scene(1)
+    query = rooms.ask(panorama, rooms.scan_map(1))
+    steps = [[0.0] * 6, [0.0, 0.0, 1.5, 0.5, 0.0, 0.0], [0.0, 0.0, 3.0, 0.0, 0.5, 0.0]]
+    best, *others = (score_pose(query, step(true, np.array(delta))) for delta in steps)
+    found = judging.judge(query, Selection(best, tuple(others), 0.3))
+    e, most = found.evidence, max(count_agreeing(query, h.pose) for h in others)
+    assert (e.score, e.num_matches, e.alternative_matches) == (best.score, count_agreeing(query, true), most)
+    assert e.margin == pytest.approx(0.7)
+    assert e.num_matches > 40 > most
+    assert min(e.seen_fraction, e.explained_fraction) > 0.8
+    assert e.agreement > 0.5
+    assert max(e.contradicted_fraction, found.loss) < 0.1
+    told = [(a.score, a.num_matches, a.pose.key) for a in found.alternatives]
+    to_world = query.scan_map.to_world
+    assert told == [(h.score, count_agreeing(query, h.pose), to_world(h.pose).key) for h in others]
+    assert found.standings[0].ratio == 1.0 > found.standings[1].ratio
     stated = [found.confidence, *(a.probability for a in found.alternatives), found.probability_none]
     assert sum(stated) == pytest.approx(1.0)
-    assert stated[0] > stated[1] > stated[2]
-    alone = judging.judge(query, Selection(at(0.0, 0.6), ()))
+    assert found.status == "localized"
+    alone = judging.judge(query, Selection(best, ()))
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
-    monkeypatch.setattr(judging, "sampling_loss", lambda *_: np.inf)
-    assert judging.judge(query, Selection(at(0.0, 0.6), ())).pose is None
+    outside = step(true, np.array([0.0, 0.0, 0.0, 500.0, 0.0, 0.0]))
+    assert judging.judge(query, Selection(Hypothesis(outside, 0.6), ())) == Localization()

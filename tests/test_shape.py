@@ -3,6 +3,7 @@
 import functools
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import e57_files
@@ -10,7 +11,9 @@ import numpy as np
 import pytest
 import rooms
 from las_files import OFFSETS, las_bytes
+from made_up import at
 from meshes import SQUARE, write_obj
+from refusals import assert_input_error
 
 import piccolo
 from piccolo.cli import localize as command_line
@@ -18,21 +21,19 @@ from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
-from piccolo.cloud.shape import paint_shape
 from piccolo.cloud.stream import Cloud
+from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.localize import localize
-from piccolo.localization.query import prepare_query
-from piccolo.localization.selection import assess_alone
+from piccolo.localization import localize as method
+from piccolo.localization.selection import Selection, assess_alone
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
-from piccolo.panorama.edges import draw_edges, soften
-from piccolo.panorama.manhattan import find_axes
+from piccolo.panorama.edges import draw_edges, find_axes, soften
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 
@@ -167,11 +168,9 @@ def test_the_vertical_is_among_the_axes_of_a_photos_lines(turn):
 def test_a_photo_is_found_by_shape(gravity, R):
     taken = rooms.query(SEED, width=WIDTH)
     settings = CoarseToFineSettings(gravity=gravity)
-    found = localize(_shape_map(), _turned(taken.rgb, R), settings, Workers(2), Stopwatch())
+    found = rooms.locate(_turned(taken.rgb, R), _shape_map(), settings)
     true_pose = replace(taken.pose, R_cam_from_world=R @ taken.pose.R_cam_from_world)
-    distance, angle_deg = rooms.errors(found.pose, true_pose)
-    assert distance < 0.1
-    assert angle_deg < 4.0
+    rooms.assert_near(found.pose, true_pose, 0.1, 4.0)
     assert found.evidence.num_matches is None
     assert all(standing.evidence == "shape" for standing in found.standings)
 
@@ -184,9 +183,9 @@ def test_intensity_is_a_channel_of_its_own():
         scan_map = prepare_map(made, Workers(2), has_features=False)
         assert scan_map.has_shape
         assert scan_map.has_intensity == (name == "intensity")
-        settings = CoarseToFineSettings(gravity="known")
+        settings = rooms.KNOWN
         photo = rooms.as_panorama(rooms.query(PATTERNED, width=WIDTH).rgb)
-        pose = localize(scan_map, photo, settings, Workers(2), Stopwatch()).pose
+        pose = rooms.locate(photo, scan_map, settings).pose
         found[name] = rooms.errors(pose, rooms.query(PATTERNED).pose)[0]
     assert found["intensity"] < 0.03
     assert found["shape"] > 1.0
@@ -211,9 +210,43 @@ def test_softer_images_are_whole_across_the_seam():
     assert soft[16].sum() == pytest.approx(600, abs=10)
 
 
+@pytest.mark.parametrize(
+    ("clear", "is_known", "searched"),
+    [
+        ("level", False, ["level"]),
+        ("tilt 1", False, ["level", "tilt 0", "tilt 1"]),
+        ("any heading", True, ["level", "any heading"]),
+        ("any heading", False, ["level", "tilt 0", "tilt 1", "any heading"]),
+    ],
+)
+def test_tilts_and_headings_are_searched_until_a_pose_explains_the_edges(
+    monkeypatch, clear, is_known, searched
+):
+    asked = []
+
+    def at_tilt(name):
+        return SimpleNamespace(name=name, rotations=name, with_rotations=lambda _: at_tilt("any heading"))
+
+    def find(query, *_):
+        asked.append(query.name)
+        return method.Found(query, Selection(at(0.0, 0.9 if query.name == clear else 0.01), ()), None)
+
+    for name, made in {
+        "find": find,
+        "find_axes": lambda _: [],
+        "align_level": lambda *_: at_tilt("level"),
+        "is_tilt_known": lambda _: is_known,
+        "find_tilts": lambda *_: [at_tilt("tilt 0"), at_tilt("tilt 1")],
+    }.items():
+        monkeypatch.setattr(method, name, made)
+    scan_map = SimpleNamespace(yaw_of_walls=0.0)
+    found = method.find_by_edges(SimpleNamespace(source=None), scan_map, Stopwatch())
+    assert (found.query.name, asked) == (clear, searched)
+
+
 def test_a_photo_of_another_room_is_not_localized():
     photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
-    found = localize(_shape_map(), photo, CoarseToFineSettings(), Workers(2), Stopwatch())
+    found = rooms.locate(photo, _shape_map())
     assert found.status == "not_localized"
 
 
@@ -222,7 +255,7 @@ def test_a_part_of_the_sphere_counts_less():
     is_valid = np.zeros(taken.rgb.shape[:2], bool)
     is_valid[:, : WIDTH // 4] = True
     for shown, ratio in ((np.ones_like(is_valid), 1.0), (is_valid, 0.5)):
-        query = prepare_query(Panorama(taken.rgb, shown), _shape_map(), CoarseToFineSettings(), Workers(1))
+        query = rooms.ask(Panorama(taken.rgb, shown), _shape_map())
         (standing,) = assess_alone(query, [Hypothesis(_shape_map().from_world(taken.pose), 0.2)])
         assert standing.score == pytest.approx(0.2 * ratio, rel=0.02)
 
@@ -264,12 +297,10 @@ def test_files_of_points_alone_are_read_and_others_say_how(tmp_path):
     points = np.round(np.asarray(rooms.room(1)[1].points[:1500], np.float64), 4)
     for name in _bare_files(tmp_path, points):
         cloud = read_cloud(tmp_path / name, CloudSettings(channels=WITHOUT_COLORS))
-        found = (
-            np.asarray(cloud.points, np.float64) + cloud.origin_world - (OFFSETS if "las" in name else 0.0)
-        )
+        shift = OFFSETS if "las" in name else 0.0
+        found = np.asarray(cloud.points, np.float64) + cloud.origin_world - shift
         np.testing.assert_allclose(np.sort(found, axis=0), np.sort(points, axis=0), atol=2e-3)
-        with pytest.raises(InputError, match="wanted"):
-            read_cloud(tmp_path / name, IN_COLORS)
+        assert_input_error("wanted", read_cloud, tmp_path / name, IN_COLORS)
         assert not open_cloud([tmp_path / name]).has_colors
     mesh = write_obj(tmp_path, mtl="", uv=None, library="", material="", vertices=3.0 * SQUARE)
     cloud = read_cloud(mesh, CloudSettings(channels=WITHOUT_COLORS))
@@ -288,33 +319,33 @@ def test_files_with_and_without_colours_are_one_scan_by_shape_alone(tmp_path):
     np.savetxt(tmp_path / "gray.txt", np.column_stack([points, np.arange(1500.0)]))
     both = [tmp_path / "bare.npy", tmp_path / "colored.npy"]
     message = "bare.npy: found no colours, though .*colored.npy has them, wanted them in all"
-    with pytest.raises(InputError, match=message):
-        open_cloud(both)
+    assert_input_error(message, open_cloud, both)
     assert open_cloud(both, CloudSettings(channels=WITHOUT_COLORS)).sources[1].channel == "shape"
     mixed = open_cloud([both[0], tmp_path / "gray.txt"])
     assert [source.channel for source in mixed.sources] == ["shape", "shape"]
 
 
-def test_arrays_without_colours_are_a_scan(tmp_path):
-    scan = piccolo.open_scan(rooms.room(1)[1].points, cache=False)
-    assert SHAPE_ALONE in scan.warnings
+def test_arrays_and_files_without_colours_are_scans(tmp_path):
+    points = rooms.room(1)[1].points
+    np.save(tmp_path / "colored.npy", np.column_stack([points, np.full_like(points, 100.0)]))
+    ignoring = piccolo.Cloud(tmp_path / "colored.npy", ignore_colors=True)
+    for source in (points[::4], ignoring):
+        assert SHAPE_ALONE in piccolo.open_scan(source, cache=False).warnings
 
 
 def test_options_that_do_not_go_with_the_shape_are_refused(tmp_path):
-    with pytest.raises(InputError, match="`ignore_colors`"):
-        piccolo.Cloud(tmp_path / "a.ply", ignore_colors=True, labels=True)
+    assert_input_error("`ignore_colors`", piccolo.Cloud, tmp_path / "a.ply", ignore_colors=True, labels=True)
     bare = piccolo.Cloud(rooms.room(1)[1].points, ignore_colors=True)
     with pytest.raises(InputError, match="found no colours to be used, wanted some for the preset paper"):
         piccolo.open_scan(bare, settings=piccolo.PaperSettings())
 
 
 def test_the_command_localizes_in_a_scan_without_colours(tmp_path, capsys):
-    cloud = rooms.room(SEED, NUM_POINTS)[1]
-    np.save(tmp_path / "bare.npy", np.asarray(cloud.points, np.float64) + cloud.origin_world)
+    save_map(_shape_map(), tmp_path / "bare.map")
     taken = rooms.query(SEED, width=WIDTH)
     cv2.imwrite(str(tmp_path / "a photo.png"), taken.rgb[..., ::-1])
-    arguments = ["--cloud", str(tmp_path / "bare.npy"), "--pano", str(tmp_path / "a photo.png")]
-    code = command_line.main([*arguments, "--ignore-colors", "--cache", "none", "--quiet"])
+    arguments = ["--cloud", str(tmp_path / "bare.map"), "--pano", str(tmp_path / "a photo.png")]
+    code = command_line.main([*arguments, "--quiet"])
     out = json.loads(capsys.readouterr().out)
     found = out if out["center_world"] else out["best_guess"]
     assert np.linalg.norm(np.array(found["center_world"]) - taken.pose.center_world) < 0.1

@@ -8,14 +8,6 @@ from hypothesis import strategies as st
 
 from piccolo.geometry import sphere
 from piccolo.geometry.pose import exp_so3
-from piccolo.geometry.sphere import (
-    find_cell,
-    interpolation,
-    make_grid,
-    make_neighbors,
-    whole_areas,
-    wider_cells,
-)
 
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))
 CENTER = np.array([0.3, -0.2, 1.5])
@@ -108,7 +100,7 @@ def test_pixel_centres_come_back_from_their_rays():
 
 @pytest.mark.parametrize("num_rings", [12, 24, 96])
 def test_cells_share_the_sphere_nearly_evenly(num_rings):
-    grid = make_grid(num_rings)
+    grid = sphere.make_grid(num_rings)
     assert grid.solid_angle.sum() == pytest.approx(1.0, abs=1e-5)
     assert grid.solid_angle.max() / grid.solid_angle.min() < 2.0
     np.testing.assert_allclose(np.linalg.norm(grid.directions, axis=1), 1.0, atol=1e-6)
@@ -116,12 +108,12 @@ def test_cells_share_the_sphere_nearly_evenly(num_rings):
 
 @pytest.mark.parametrize("num_rings", [12, 24])
 def test_a_cells_centre_lies_in_it(num_rings):
-    grid = make_grid(num_rings)
-    np.testing.assert_array_equal(find_cell(grid.directions, num_rings), np.arange(len(grid)))
+    grid = sphere.make_grid(num_rings)
+    np.testing.assert_array_equal(sphere.find_cell(grid.directions, num_rings), np.arange(len(grid)))
 
 
 def test_neighbours_are_near_and_weighted_by_a_gaussian():
-    near, grid = make_neighbors(24, 14.0), make_grid(24)
+    near, grid = sphere.make_neighbors(24, 14.0), sphere.make_grid(24)
     for cell in (0, len(grid) // 2, len(grid) - 1):
         rows = slice(near.row[cell], near.row[cell + 1])
         angle = np.arccos(np.clip(grid.directions[near.cell[rows]] @ grid.directions[cell], -1, 1))
@@ -132,8 +124,8 @@ def test_neighbours_are_near_and_weighted_by_a_gaussian():
 
 @pytest.mark.parametrize(("num_rings", "coarse_rings"), [(24, 12), (96, 24), (24, 16), (12, 12)])
 def test_interpolated_values_are_those_of_a_smooth_field(num_rings, coarse_rings):
-    fine, coarse = make_grid(num_rings), make_grid(coarse_rings)
-    cells, weights = interpolation(num_rings, coarse_rings)
+    fine, coarse = sphere.make_grid(num_rings), sphere.make_grid(coarse_rings)
+    cells, weights = sphere.interpolation(num_rings, coarse_rings)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0, atol=1e-6)
     assert weights.min() >= 0.0
     width = np.pi / coarse_rings
@@ -147,12 +139,12 @@ def test_interpolated_values_are_those_of_a_smooth_field(num_rings, coarse_rings
 
 
 def test_wider_cells_add_up_the_solid_angle_in_whole_numbers():
-    (cells, areas), wide = wider_cells(12), make_grid(12)
+    (cells, areas), wide = sphere.wider_cells(12), sphere.make_grid(12)
     np.testing.assert_array_equal(areas, np.rint(areas))
     np.testing.assert_array_equal(np.unique(cells), np.arange(len(wide)))
-    apart = np.arccos(np.sum(wide.directions[cells] * make_grid(24).directions, axis=1))
+    apart = np.arccos(np.sum(wide.directions[cells] * sphere.make_grid(24).directions, axis=1))
     assert apart.max() < np.pi / 12
-    area, units = make_grid(24).solid_angle, whole_areas(24)
+    area, units = sphere.make_grid(24).solid_angle, sphere.whole_areas(24)
     np.testing.assert_allclose(units, 1000 * area / area.max(), atol=0.51)
     np.testing.assert_array_equal(areas, [units[cells == k].sum() for k in range(len(wide))])
     np.testing.assert_allclose(areas / areas.sum(), wide.solid_angle, rtol=0.5)

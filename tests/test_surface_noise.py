@@ -3,7 +3,7 @@ import pytest
 
 from piccolo.cloud import Cloud
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.surface_noise import NOISE_SHARE, surface_variance
+from piccolo.cloud.surfaces import NOISE_SHARE, surface_variance
 
 SIZE = np.array([5.0, 4.0, 2.6])  # [m] of a room turned by 20 degrees, so that no wall is along an axis
 TURN = np.array([[0.9397, -0.342, 0.0], [0.342, 0.9397, 0.0], [0.0, 0.0, 1.0]])

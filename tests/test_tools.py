@@ -35,9 +35,8 @@ def scene(tmp_path_factory):
 def table_of(page, title):
     """The rows of a section's table by their first cell, each a dict by column."""
     lines = page.split(f"## {title}\n")[1].split("\n## ")[0].splitlines()
-    head, _, *rows = (
-        [cell.strip() for cell in line.strip("|").split("|")] for line in lines if line[:1] == "|"
-    )
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line[:1] == "|"]
+    head, _, *rows = rows
     return {cells[0]: dict(zip(head[1:], cells[1:], strict=True)) for cells in rows}
 
 

@@ -13,25 +13,11 @@ from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_indices, pixel_rays
-from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.localize import localize
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.localization.verification import (
-    PLACE,
-    TURN,
-    count_agreeing,
-    find_copies,
-    match_beside,
-    match_pictures,
-    matches_near,
-    place_keypoints,
-    verify,
-)
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 from research.synthetic.photos import mask_outside_field
@@ -39,7 +25,6 @@ from research.synthetic.world import change_light, photograph, scan_world
 
 NUM_POINTS = 200_000
 WIDTH = 1024
-SETTINGS = CoarseToFineSettings(gravity="unknown")
 SMALL = np.array([0.01, -0.02, 0.015, 0.05, -0.04, 0.03])  # [rad], [m]
 
 
@@ -51,7 +36,7 @@ def _narrow(seed=1, yaw=1.0):
 
 def _asked(num_threads=2):
     """A query of its own, with an empty cache."""
-    return prepare_query(_narrow()[0], rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(num_threads))
+    return rooms.ask(_narrow()[0], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN, num_threads)
 
 
 @functools.lru_cache
@@ -79,12 +64,12 @@ def _beside():
     rng = np.random.default_rng(0)
     rgb = change_light(photograph(world.rooms[0], pose, WIDTH, Workers(2)), rng, rng)
     panorama = Panorama(rgb, _narrow()[0].is_valid)
-    query = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    return place_keypoints(query, rooms.local(1, pose, NUM_POINTS))
+    query = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    return verification.place_keypoints(query, rooms.local(1, pose, NUM_POINTS))
 
 
 def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
-    matches = match_beside(_query(), _beside())
+    matches = verification.match_beside(_query(), _beside())
     agreeing = count_matches(matches, _true_pose(), verification.COS_AGREE)
     assert agreeing >= 20
     assert (np.diff(matches.query) >= 0).all()
@@ -96,7 +81,7 @@ def test_a_photo_is_matched_with_one_beside_it_on_the_scan():
 
 def test_what_moves_with_the_camera_is_no_match():
     """A photo matched with itself: of what is left, nothing is where the pose puts it."""
-    matches = match_beside(_query(), place_keypoints(_query(), _true_pose()))
+    matches = verification.match_beside(_query(), verification.place_keypoints(_query(), _true_pose()))
     assert len(matches.query) < 0.2 * len(_query().photo.seen().keypoints.rays)
     assert count_matches(matches, _true_pose(), verification.COS_AGREE) == 0
 
@@ -104,17 +89,17 @@ def test_what_moves_with_the_camera_is_no_match():
 def test_a_mirrored_photo_has_no_matches_beside():
     """It has some without that rule, as many things are symmetric."""
     taken = Panorama(_narrow()[0].rgb[:, ::-1].copy(), _narrow()[0].is_valid[:, ::-1].copy())
-    mirrored = prepare_query(taken, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    assert len(match_pictures(mirrored.photo.seen().keypoints, _beside().keypoints)[0]) > 0
-    assert match_beside(mirrored, _beside()) is NO_MATCHES
+    mirrored = rooms.ask(taken, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    assert len(verification.match_pictures(mirrored.photo.seen().keypoints, _beside().keypoints)[0]) > 0
+    assert verification.match_beside(mirrored, _beside()) is NO_MATCHES
 
 
 def test_the_picture_with_the_most_matches_counts(monkeypatch):
-    query = replace(_query(), beside=(match_beside(_query(), _beside()), NO_MATCHES))
-    assert rooms.errors(verify(query, _true_pose()).pose, _true_pose())[0] < 0.03
-    assert verify(query, _moved((0.0, 0.0, 0.0), 2.0)).num_matches <= 6
+    query = replace(_query(), beside=(verification.match_beside(_query(), _beside()), NO_MATCHES))
+    assert rooms.errors(verification.verify(query, _true_pose()).pose, _true_pose())[0] < 0.03
+    assert verification.verify(query, _moved((0.0, 0.0, 0.0), 2.0)).num_matches <= 6
     monkeypatch.setattr(verification, "matches_near", lambda *_: NO_MATCHES)
-    beside = verify(query, _true_pose())
+    beside = verification.verify(query, _true_pose())
     assert beside.num_matches >= 20
     assert rooms.errors(beside.pose, _true_pose())[0] < 0.1
 
@@ -128,13 +113,13 @@ def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
     both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
     order = morton_order(both.points, both.colors)
     both = Cloud(both.points[order], both.colors[order], both.origin_world)
-    query = prepare_query(_narrow()[0], prepare_map(both, Workers(2)), SETTINGS, Workers(2))
+    query = rooms.ask(_narrow()[0], prepare_map(both, Workers(2)), rooms.UNKNOWN)
     here = query.scan_map.from_world(_narrow()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
     others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]
     away = Pose(yaw_rotation(2.0) @ here.R_cam_from_world, here.center_world + apart)
-    assert find_copies(query, here, [*others, away]) == [True, False, False, False]
-    assert find_copies(query, here, []) == []
+    assert verification.find_copies(query, here, [*others, away]) == [True, False, False, False]
+    assert verification.find_copies(query, here, []) == []
 
 
 def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
@@ -148,28 +133,28 @@ def test_keypoints_on_what_the_scan_does_not_show_are_left_out():
     poster = cv2.resize(rng.integers(0, 255, (14, 16, 3), np.uint8), (80, 70), interpolation=cv2.INTER_CUBIC)
     rgb[230:300, 310:390] = poster
     given = Panorama(rgb, panorama.is_valid)
-    occluded = prepare_query(given, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
+    occluded = rooms.ask(given, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
     for asked, least, most in ((query, 0.5, 1.0), (occluded, 0.0, 0.1)):
         seen = asked.photo.seen().keypoints.rays
-        kept = place_keypoints(asked, _true_pose()).keypoints.rays
+        kept = verification.place_keypoints(asked, _true_pose()).keypoints.rays
         num_seen, num_kept = (hidden[compute_indices(rays, WIDTH)].sum() for rays in (seen, kept))
         assert num_seen > 10
         assert least * num_seen <= num_kept <= most * num_seen
 
 
 def test_the_true_pose_has_many_matches_and_wrong_ones_have_few():
-    right = verify(_query(), _true_pose())
+    right = verification.verify(_query(), _true_pose())
     assert right.num_matches >= 20
-    assert count_agreeing(_query(), _true_pose()) == right.num_matches
+    assert verification.count_agreeing(_query(), _true_pose()) == right.num_matches
     for wrong in (_moved((0.0, 0.0, 0.0), 2.0), _moved((1.0, -0.8, 0.0))):
-        assert verify(_query(), wrong).num_matches <= 6
-        assert count_agreeing(_query(), wrong) <= 6
+        assert verification.verify(_query(), wrong).num_matches <= 6
+        assert verification.count_agreeing(_query(), wrong) <= 6
 
 
 def test_a_pose_is_refined_towards_the_truth():
     off = step(_true_pose(), SMALL)
     before = rooms.errors(off, _true_pose())
-    found = verify(_query(), off)
+    found = verification.verify(_query(), off)
     after = rooms.errors(found.pose, _true_pose())
     assert after[0] < min(0.02, 0.4 * before[0])
     assert after[1] < 0.4 * before[1]
@@ -178,10 +163,8 @@ def test_a_pose_is_refined_towards_the_truth():
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():
     poses = [_true_pose(), step(_true_pose(), SMALL), _moved((1.0, -0.8, 0.0))]
-    one, two = (
-        query.workers.map(functools.partial(verify, query), poses, "verify")
-        for query in (_asked(1), _asked(2))
-    )
+    queries = _asked(1), _asked(2)
+    one, two = (q.workers.map(functools.partial(verification.verify, q), poses, "verify") for q in queries)
     for a, b in zip(one, two, strict=True):
         assert a.num_matches == b.num_matches
         assert a.pose.key == b.pose.key
@@ -197,26 +180,30 @@ def test_the_scan_is_drawn_once_for_each_pose_of_the_grid(monkeypatch):
 
     monkeypatch.setattr(verification, "match_drawn", match_drawn)
     query = _asked()
-    middle = Pose(exp_so3(TURN * np.array([3.0, -2.0, 8.0])), PLACE * np.array([7.0, -4.0, 2.0]))
+    middle = Pose(
+        exp_so3(verification.TURN * np.array([3.0, -2.0, 8.0])),
+        verification.PLACE * np.array([7.0, -4.0, 2.0]),
+    )
     for share in (0.0, 0.4, -0.4):
-        turn = log_so3(middle.R_cam_from_world) + share * TURN
-        near = Pose(exp_so3(turn), middle.center_world + share * PLACE)
-        assert matches_near(query, near) == 1
+        turn = log_so3(middle.R_cam_from_world) + share * verification.TURN
+        near = Pose(exp_so3(turn), middle.center_world + share * verification.PLACE)
+        assert verification.matches_near(query, near) == 1
     assert len(drawn) == 1
     np.testing.assert_allclose(drawn[0].center_world, middle.center_world, atol=1e-12)
     np.testing.assert_allclose(drawn[0].R_cam_from_world, middle.R_cam_from_world, atol=1e-9)
-    assert matches_near(query, Pose(middle.R_cam_from_world, middle.center_world + 0.6 * PLACE)) == 2
-    turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * TURN, 0.0]))
-    assert matches_near(query, Pose(turned, middle.center_world)) == 3
+    beside = Pose(middle.R_cam_from_world, middle.center_world + 0.6 * verification.PLACE)
+    assert verification.matches_near(query, beside) == 2
+    turned = exp_so3(log_so3(middle.R_cam_from_world) + np.array([0.0, 0.6 * verification.TURN, 0.0]))
+    assert verification.matches_near(query, Pose(turned, middle.center_world)) == 3
     masked = query.mask(np.zeros((8, 16), bool))
-    assert matches_near(masked, middle) == 4
-    assert matches_near(query, middle) == 1
+    assert verification.matches_near(masked, middle) == 4
+    assert verification.matches_near(query, middle) == 1
 
 
 def test_matches_lie_on_the_scan_where_the_photo_sees_them():
     """At the true pose many rays lead to their points, and sizes and tangents are those of the photo."""
     true = _true_pose()
-    matches = matches_near(_query(), true)
+    matches = verification.matches_near(_query(), true)
     offsets = matches.points - true.center_world
     distances = np.linalg.norm(offsets, axis=1)
     rays = offsets @ true.R_cam_from_world.T / distances[:, None]
@@ -244,24 +231,24 @@ def test_matches_with_which_a_pose_moves_away_are_anothers(monkeypatch, offset, 
     """By 0.3 m or 5 degrees."""
     moved = _moved(offset, math.radians(yaw_deg))
     monkeypatch.setattr(verification, "verify", lambda *_: verification.Verified(moved, 30))
-    assert count_agreeing(_query(), _true_pose()) == expected
+    assert verification.count_agreeing(_query(), _true_pose()) == expected
 
 
 @pytest.mark.parametrize("offset", [(0.0, -0.4, 0.0), (0.4, 0.4, 0.1), (-0.4, 0.2, 0.0)])
 def test_half_a_metre_off_the_matches_are_those_of_the_true_pose(offset):
     off = _moved(offset, math.radians(8.0))
-    found = verify(_query(), off)
+    found = verification.verify(_query(), off)
     assert found.num_matches >= 12
     assert rooms.errors(found.pose, _true_pose())[0] < 0.1
-    assert count_agreeing(_query(), off) == 0
+    assert verification.count_agreeing(_query(), off) == 0
 
 
 def test_whole_photos_and_whole_views_alone_are_not_drawn(monkeypatch):
     monkeypatch.setattr(verification, "verify", lambda *_: pytest.fail("drawn"))
     panorama = rooms.scene(1)[1]
-    whole = prepare_query(panorama, rooms.scan_map(1, NUM_POINTS), SETTINGS, Workers(2))
-    assert count_agreeing(whole, _true_pose()) == count_matches(whole.matches, _true_pose()) > 20
-    assert count_agreeing(_query().by_views(), _true_pose()) == 0
+    whole = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    assert verification.count_agreeing(whole, _true_pose()) == count_matches(whole.matches, _true_pose()) > 20
+    assert verification.count_agreeing(_query().by_views(), _true_pose()) == 0
 
 
 def _keypoints(rays, descriptors):
@@ -296,7 +283,7 @@ def test_pictures_are_matched_as_their_twin(seed):
     unknown = rng.integers(0, 60, (60, 128)).astype(np.uint8)
     own = _keypoints(np.zeros((150, 3)), np.concatenate([descriptors[:90] + noise, unknown]))
     drawn = _keypoints(rays, descriptors)
-    mine, theirs = match_pictures(own, drawn)
+    mine, theirs = verification.match_pictures(own, drawn)
     assert list(zip(mine, theirs, strict=True)) == _match_one_by_one(own, drawn)
     assert set(range(40)) | set(range(80, 90)) <= set(mine)
     assert not set(range(40, 80)) & set(mine)
@@ -308,8 +295,8 @@ def test_without_features_nothing_matches_and_a_lone_one_is_distinct():
     own = _keypoints(np.eye(3), rng.integers(0, 60, (3, 128)).astype(np.uint8))
     nothing = own.take(np.empty(0, np.int64))
     for a, b in ((own, nothing), (nothing, own), (nothing, nothing)):
-        assert [len(found) for found in match_pictures(a, b)] == [0, 0]
-    mine, theirs = match_pictures(own, own.take(np.array([1])))
+        assert [len(found) for found in verification.match_pictures(a, b)] == [0, 0]
+    mine, theirs = verification.match_pictures(own, own.take(np.array([1])))
     assert (mine.tolist(), theirs.tolist()) == ([0, 1, 2], [0, 0, 0])
 
 
@@ -319,8 +306,6 @@ def test_without_features_nothing_matches_and_a_lone_one_is_distinct():
 def test_a_narrow_photo_of_unknown_gravity_is_found(seed, yaw, most, most_deg):
     """70 degrees of a room, with furniture and pictures in view."""
     photo, true_pose = _narrow(seed, yaw)
-    found = localize(rooms.scan_map(seed, NUM_POINTS), photo, SETTINGS, Workers(2), Stopwatch())
-    distance, angle_deg = rooms.errors(found.pose, true_pose)
+    found = rooms.locate(photo, rooms.scan_map(seed, NUM_POINTS), rooms.UNKNOWN)
     assert found.status == "localized"
-    assert distance < most
-    assert angle_deg < most_deg
+    rooms.assert_near(found.pose, true_pose, most, most_deg)

@@ -5,10 +5,11 @@ import time
 import cv2
 import numpy as np
 import pytest
-from rooms import write_room
-from test_gps import write_photo
+import rooms
+from pictures import encoded, write
+from refusals import assert_input_error
+from test_priors import write_photo
 
-import piccolo
 from piccolo.batch.inputs import times_of
 from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
@@ -138,12 +139,10 @@ def test_times_by_names_tables_and_exif(tmp_path):
     (tmp_path / "t.csv").write_text("name,when\na,3\n")
     with pytest.raises(InputError, match=r"t\.csv: found KeyError 'time', wanted a CSV file"):
         times_of(frames, str(tmp_path / "t.csv"))
-    with pytest.raises(InputError, match="wanted them to rise"):
-        times_of(frames[::-1], "names")
+    assert_input_error("wanted them to rise", times_of, frames[::-1], "names")
     with pytest.raises(InputError, match=r"^`times` names: found no number in walk\.jpg"):
         times_of([tmp_path / "walk.jpg"], "names")
-    with pytest.raises(InputError, match=r"^`times` exif: found a frame without a time in EXIF"):
-        times_of(frames, "exif")
+    assert_input_error(r"^`times` exif: found a frame without a time in EXIF", times_of, frames, "exif")
 
 
 @pytest.mark.parametrize("zone", ["UTC", "Europe/Berlin", "America/New_York"])
@@ -174,11 +173,9 @@ def test_times_of_exif_are_those_of_no_machine(tmp_path, monkeypatch, zone):
 
 
 def test_a_frame_that_is_gone_or_another_is_not_read_again(tmp_path):
-    folder = write_room(tmp_path, "--seed 3 --points 40000 --panoramas 2 --width 512 --variants clean")
-    pictures = [path.read_bytes() for path in sorted((folder / "images").iterdir())]
-    path = tmp_path / "latest.png"
-    path.write_bytes(pictures[0])
-    walk = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=2).track(gravity="known")
+    pictures = [encoded(rooms.query(3, index=k).rgb, ".png") for k in range(2)]
+    path = write(tmp_path / "latest.png", pictures[0])
+    walk = rooms.scan(3).track(gravity="known")
     walk.add(path, 0.0)
     np.testing.assert_array_equal(walk.tracker.read(0).rgb, cv2.imread(str(path))[..., ::-1])
     path.write_bytes(pictures[1])
@@ -189,11 +186,9 @@ def test_a_frame_that_is_gone_or_another_is_not_read_again(tmp_path):
 
 
 def test_the_result_of_a_narrow_frame_has_its_camera_and_name(tmp_path):
-    folder = write_room(tmp_path, "--seed 3 --points 40000 --panoramas 1 --width 512 --variants clean")
     photo = Photo(tmp_path / "photo.png", focal_px=140.0)
     cv2.imwrite(photo.name, np.random.default_rng(0).integers(0, 255, (120, 160, 3), dtype=np.uint8))
-    scan = piccolo.open_scan(folder / "cloud.ply", cache=False, num_threads=2)
-    walk, again = (scan.track(gravity="known") for _ in range(2))
+    walk, again = (rooms.scan(3).track(gravity="known") for _ in range(2))
     walk.add(photo, 0.0, "a name")
     again.restore(walk.last_to_json(), photo)
     for result in (*walk.finish(), *again.finish()):

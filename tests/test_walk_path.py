@@ -1,25 +1,21 @@
-"""The path through a walk's key frames, against the sum over every way there is."""
+"""The path through a walk's key frames, against the sum over every way there is; and lost frames."""
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
+from piccolo.walk import path as walk_path
+from piccolo.walk import second_look
 from piccolo.walk.frames import MOST_EXPECTED, Frame, State
 from piccolo.walk.motion import JUMP_LOG, Motion, check_times
-from piccolo.walk.path import (
-    COPY_LOG_ODDS,
-    Gap,
-    believe,
-    build_lattice,
-    emissions,
-    is_moved,
-    log_transition,
-    motion_between,
-)
+from piccolo.walk.path import NOTHING, Belief, believe
+from piccolo.walk.tracker import Followed, expect
 
 MOTION = Motion(max_speed=1.0)
 
@@ -57,7 +53,7 @@ def _followed(time, key, center, odds=5.0):
 
 def _naive(frames, share):
     """Probabilities of all frames' states, by going every way there is."""
-    emitted = [emissions(frame) for frame in frames]
+    emitted = [walk_path.emissions(frame) for frame in frames]
     ways = {}
     for way in itertools.product(*([None, *range(len(frame.states))] for frame in frames)):
         log = 0.0
@@ -68,13 +64,11 @@ def _naive(frames, share):
             log += emitted[k][0][j]
             if before is not None:
                 m, i = before
-                gap = np.linalg.norm(
-                    frames[k].states[j].pose.center_world - frames[m].states[i].pose.center_world
-                )
+                here, there = (frames[f].states[s].pose.center_world for f, s in ((k, j), (m, i)))
+                gap = np.linalg.norm(here - there)
                 expected = min(-math.log(share), MOST_EXPECTED + emitted[k][1])
-                log += float(
-                    log_transition(np.array([gap]), frames[k].time - frames[m].time, MOTION, expected)[0]
-                )
+                passed = frames[k].time - frames[m].time
+                log += float(walk_path.log_transition(np.array([gap]), passed, MOTION, expected)[0])
             before = k, j
         ways[way] = log
     total = sum(math.exp(log) for log in ways.values())
@@ -100,7 +94,7 @@ def test_probabilities_are_those_of_all_ways_there_are(seed):
         num = rng.integers(1, 4)
         states = [(rng.uniform(0.0, 4.0, 3), float(rng.normal(0.5, 3.0))) for _ in range(num)]
         frames.append(_key(k + 0.3 * rng.random(), *states))
-    lattice = build_lattice(frames, Open(share), MOTION)
+    lattice = walk_path.build_lattice(frames, Open(share), MOTION)
     path = lattice.smooth()
     probabilities = _naive(frames, share)
     for found, wanted in zip(path.probabilities, probabilities, strict=True):
@@ -111,20 +105,20 @@ def test_probabilities_are_those_of_all_ways_there_are(seed):
 
 
 def test_places_that_look_alike_share_the_evidence():
-    copies = [((9.0 * i, 0, 0), 4.0 - 0.9 * COPY_LOG_ODDS * (i > 0)) for i in range(5)]
-    emitted, log_alike = emissions(_key(0, *copies, ((99, 0, 0), -8.0)))
+    copies = [((9.0 * i, 0, 0), 4.0 - 0.9 * walk_path.COPY_LOG_ODDS * (i > 0)) for i in range(5)]
+    emitted, log_alike = walk_path.emissions(_key(0, *copies, ((99, 0, 0), -8.0)))
     np.testing.assert_allclose(emitted[:5], 4.0 - math.log(5.0), atol=1e-3)
     assert log_alike == pytest.approx(math.log(5.0), abs=1e-3)
-    assert emitted[5] == pytest.approx(4.0 - 12.0 + COPY_LOG_ODDS - log_alike)
+    assert emitted[5] == pytest.approx(4.0 - 12.0 + walk_path.COPY_LOG_ODDS - log_alike)
 
 
 def test_twin_rooms_are_told_apart_by_the_place_after_them_and_before_it_are_not():
     """Twenty frames in twin rooms, each a little for the wrong one; then a place that there is once."""
-    worse = 3.0 - 0.9 * COPY_LOG_ODDS
+    worse = 3.0 - 0.9 * walk_path.COPY_LOG_ODDS
     twins = [_key(2.0 * k, ((0.1 * k, 0, 0), worse), ((0.1 * k + 20, 0, 0), 3.0)) for k in range(20)]
-    alone = build_lattice(twins, Open(), MOTION).smooth()
+    alone = walk_path.build_lattice(twins, Open(), MOTION).smooth()
     np.testing.assert_allclose([p[0] / p.sum() for p in alone.probabilities], 0.5, atol=0.01)
-    told = build_lattice([*twins, _key(41.0, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
+    told = walk_path.build_lattice([*twins, _key(41.0, ((2.0, 0, 0), 6.0))], Open(), MOTION).smooth()
     assert _chosen(told) == [0] * 21
     assert min(p[0] for p in told.probabilities) > 0.95
 
@@ -133,17 +127,17 @@ def test_a_turn_at_its_end_tells_a_twin_corridor_if_the_motion_is_known():
     """Two corridors alike; from the end of each a copy of a room is in reach, 90 degrees apart."""
     before = _key(0, ((0, 0, 0), 5.0), ((40, 0, 0), 5.0))
     after = _key(9, ((6, 0, 0), 5.0), ((40, 6, 0), 5.0))
-    unknown = build_lattice([before, after], Open(), MOTION).smooth()
+    unknown = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     np.testing.assert_allclose(unknown.probabilities[0], 0.5, atol=0.01)
     after.key, after.arrived = 0, _pose(6, 0, 0)
-    tracked = build_lattice([before, after], Open(), MOTION).smooth()
+    tracked = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     assert tracked.probabilities[0][0] > 0.99
     after.key = None
     after.arrived = None
     before.odometry, after.odometry = _pose(100, 0, 0, yaw=1.0), _pose(100, 0, 0, yaw=1.0)
     turn = yaw_rotation(1.0).T
     after.odometry = Pose(after.odometry.R_cam_from_world, turn @ np.array([6.0, 0, 0]) + [100.0, 0, 0])
-    measured = build_lattice([before, after], Open(), MOTION).smooth()
+    measured = walk_path.build_lattice([before, after], Open(), MOTION).smooth()
     assert measured.probabilities[0][0] > 0.99
 
 
@@ -159,58 +153,54 @@ def test_a_motion_is_carried_to_where_the_camera_is():
 
 def test_known_motions_have_the_error_of_their_length():
     frames = [_key(0, ((0, 0, 0), 5.0)), _key(1, ((30, 0, 0), 5.0))]
-    assert motion_between(frames, 0, 1) is None
+    assert walk_path.motion_between(frames, 0, 1) is None
     frames[0].odometry, frames[1].odometry = _pose(0, 0, 0), _pose(29, 0, 0)
-    moved = motion_between(frames, 0, 1)
-    assert is_moved(moved, frames[0].states, frames[1].states).tolist() == [[True]]
+    moved = walk_path.motion_between(frames, 0, 1)
+    assert walk_path.is_moved(moved, frames[0].states, frames[1].states).tolist() == [[True]]
     frames[1].odometry = _pose(27, 0, 0)
-    assert not is_moved(motion_between(frames, 0, 1), frames[0].states, frames[1].states).any()
+    moved = walk_path.motion_between(frames, 0, 1)
+    assert not walk_path.is_moved(moved, frames[0].states, frames[1].states).any()
     frames[1].odometry = _pose(30, 0, 0, yaw=0.5)
-    assert not is_moved(motion_between(frames, 0, 1), frames[0].states, frames[1].states).any()
+    moved = walk_path.motion_between(frames, 0, 1)
+    assert not walk_path.is_moved(moved, frames[0].states, frames[1].states).any()
 
 
 def test_a_jump_has_a_price_and_is_reported():
-    frames = [
-        *(_key(k, ((k, 0, 0), 5.0)) for k in range(4)),
-        *(_key(k, ((k + 50, 0, 0), 5.0)) for k in range(4, 8)),
-    ]
-    path = build_lattice(frames, Open(), MOTION).smooth()
+    frames = [_key(k, ((k + 50 * (k > 3), 0, 0), 5.0)) for k in range(8)]
+    path = walk_path.build_lattice(frames, Open(), MOTION).smooth()
     assert _chosen(path) == [0] * 8
-    assert path.gaps == [None] * 4 + [Gap(51.0, 1.0)] + [None] * 3
+    assert path.gaps == [None] * 4 + [walk_path.Gap(51.0, 1.0)] + [None] * 3
     lonely = [*frames[:4], _key(4, ((54, 0, 0), 2.0)), _key(5, ((5, 0, 0), 5.0))]
-    path = build_lattice(lonely, Open(), MOTION).smooth()
+    path = walk_path.build_lattice(lonely, Open(), MOTION).smooth()
     assert _chosen(path) == [0, 0, 0, 0, None, 0]
     assert path.probabilities[4][0] < 0.01
-    assert log_transition(np.array([50.0]), 1.0, MOTION)[0] == JUMP_LOG
+    assert walk_path.log_transition(np.array([50.0]), 1.0, MOTION)[0] == JUMP_LOG
 
 
 def test_frames_without_times_may_be_anywhere_and_report_no_gap():
-    assert (Motion().speed, Motion(is_timed=False).speed, Motion(max_speed=3.0, is_timed=False).speed) == (
-        2.0,
-        5.0,
-        3.0,
-    )
+    motions = Motion(), Motion(is_timed=False), Motion(max_speed=3.0, is_timed=False)
+    assert [motion.speed for motion in motions] == [2.0, 5.0, 3.0]
     frames = [_key(k, ((50.0 * k, 0, 0), 1.0)) for k in range(4)]
-    path = build_lattice(frames, Open(), Motion(is_timed=False)).smooth()
+    path = walk_path.build_lattice(frames, Open(), Motion(is_timed=False)).smooth()
     assert _chosen(path) == [0] * 4
     assert path.gaps == [None] * 4
-    assert _chosen(build_lattice(frames, Open(), Motion()).smooth()) == [None] * 4
+    assert _chosen(walk_path.build_lattice(frames, Open(), Motion()).smooth()) == [None] * 4
 
 
 def test_twins_that_are_as_likely_are_no_gap():
     frames = [_key(3.0 * k, ((k % 2 * 40, 0, 0), 5.0), ((40 - k % 2 * 40, 0, 0), 5.0)) for k in range(5)]
-    path = build_lattice(frames, Open(), MOTION).smooth()
+    path = walk_path.build_lattice(frames, Open(), MOTION).smooth()
     np.testing.assert_allclose([p.max() for p in path.probabilities], 0.5, atol=0.01)
     assert path.gaps == [None] * 5
 
 
 def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there():
     frames = [_key(0, ((0, 0, 0), 5.0), ((20, 0, 0), 5.0)), _followed(1, 0, (1, 0, 0)), Frame(2.0)]
-    here = build_lattice([*frames, _key(3, ((2, 0, 0), 6.0))], Open(), MOTION)
+    here = walk_path.build_lattice([*frames, _key(3, ((2, 0, 0), 6.0))], Open(), MOTION)
     belief = believe(here.frames, here.smooth(), 1)
     assert belief.is_sure
     assert belief.states[0] is frames[1].states[0]
-    there = build_lattice([*frames, _key(3, ((22, 0, 0), 6.0))], Open(), MOTION)
+    there = walk_path.build_lattice([*frames, _key(3, ((22, 0, 0), 6.0))], Open(), MOTION)
     belief = believe(there.frames, there.smooth(), 1)
     assert not belief.is_sure
     np.testing.assert_allclose(belief.expected.center_world, [21.0, 0.0, 0.0])
@@ -222,7 +212,7 @@ def test_tracked_frames_are_where_their_key_frame_is_or_are_to_be_tracked_there(
 def test_a_tracked_frame_before_a_contradiction_is_less_sure():
     frames = [_key(0, ((0, 0, 0), 8.0)), _followed(1, 0, (1, 0, 0)), _key(2, ((70, 0, 0), 5.0))]
     frames[2].key, frames[2].arrived = 0, _pose(2, 0, 0)
-    lattice = build_lattice(frames, Open(), MOTION)
+    lattice = walk_path.build_lattice(frames, Open(), MOTION)
     path = lattice.smooth()
     assert _chosen(path) == [0, None, None]
     assert believe(frames, path, 1).probabilities[0] < 0.5 < believe(frames, path, 0).probabilities[0]
@@ -231,7 +221,7 @@ def test_a_tracked_frame_before_a_contradiction_is_less_sure():
 def test_live_probabilities_are_those_of_the_last_key_frame_that_is_tracked_from():
     frames = [_key(0, ((0, 0, 0), 5.0)), _key(1, ((70, 0, 0), -1.0), ((90, 0, 0), -2.0))]
     frames[1].departed = None
-    lattice = build_lattice([*frames, _followed(2, 0, (2, 0, 0))], Open(), MOTION)
+    lattice = walk_path.build_lattice([*frames, _followed(2, 0, (2, 0, 0))], Open(), MOTION)
     path = lattice.filter_path()
     assert _chosen(path) == [0, None, None]
     assert believe(lattice.frames, path, 1).states[0] is frames[1].states[0]
@@ -248,22 +238,22 @@ def test_tracking_is_known_by_way_of_later_key_frames():
     ]
     frames[1].key, frames[1].arrived = 0, _pose(1, 0, 0)
     frames[2].key, frames[2].arrived = 1, _pose(32, 0, 0)
-    begin, end, _ = motion_between(frames, 0, 2)
+    begin, end, _ = walk_path.motion_between(frames, 0, 2)
     np.testing.assert_allclose(end.center_world - begin.center_world, [2.0, 0.0, 0.0])
-    lattice = build_lattice(frames, Open(), MOTION)
-    again = build_lattice(frames, Open(), MOTION, lattice)
+    lattice = walk_path.build_lattice(frames, Open(), MOTION)
+    again = walk_path.build_lattice(frames, Open(), MOTION, lattice)
     for found, wanted in zip(again.smooth().probabilities, lattice.smooth().probabilities, strict=True):
         assert found.tobytes() == wanted.tobytes()
     frames[2].states = frames[2].states[1:]
-    changed = build_lattice(frames, Open(), MOTION, lattice).smooth()
+    changed = walk_path.build_lattice(frames, Open(), MOTION, lattice).smooth()
     assert len(changed.probabilities[2]) == 1
 
 
 def test_frames_tracked_from_a_dark_key_frame_speak_for_it_when_they_are_known():
     dark = _key(0, ((0, 0, 0), -1.0))
-    alone = build_lattice([dark], Open(), MOTION).smooth()
+    alone = walk_path.build_lattice([dark], Open(), MOTION).smooth()
     assert alone.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.e))
-    told = build_lattice([dark, _followed(1, 0, (1, 0, 0), 4.0)], Open(), MOTION).smooth()
+    told = walk_path.build_lattice([dark, _followed(1, 0, (1, 0, 0), 4.0)], Open(), MOTION).smooth()
     assert told.probabilities[0][0] == pytest.approx(1.0 / (1.0 + math.exp(-4.0)))
 
 
@@ -272,8 +262,8 @@ def test_frames_that_name_each_other_as_key_frames_measure_nothing():
     frames = [_key(0.0, ((0, 0, 0), 5.0)), _followed(1.0, 2, (1, 0, 0)), _followed(2.0, 1, (2, 0, 0))]
     for frame in frames[1:]:
         frame.departed = _pose(0, 0, 0)
-    assert motion_between(frames, 0, 2) is None
-    assert motion_between(frames, 0, 1) is None
+    assert walk_path.motion_between(frames, 0, 2) is None
+    assert walk_path.motion_between(frames, 0, 1) is None
 
 
 def test_refusals():
@@ -281,5 +271,100 @@ def test_refusals():
         check_times([0.0, 2.0, 1.0])
     with pytest.raises(InputError, match=r"^times: found one that is no finite number, wanted seconds$"):
         check_times([0.0, np.nan])
-    with pytest.raises(InputError, match=r"^`max_speed`: found -1.0, wanted a number above 0$"):
-        Motion(max_speed=-1.0)
+    assert_input_error(r"^`max_speed`: found -1.0, wanted a number above 0$", Motion, max_speed=-1.0)
+
+
+TIMES = (9.0, 9.5, 10.0, 12.0)  # the third is lost
+LOST = 2
+
+
+def _at(x):
+    return Pose(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+@pytest.fixture
+def walk():
+    """Key frames along a line at 1 m/s, of which one is lost; and what is believed of each."""
+    sure = [State(_at(time), 8.0, 0.5) for time in TIMES]
+    both = zip(TIMES, sure, strict=True)
+    frames = [Frame(time, [state], is_key=True, departed=state.pose) for time, state in both]
+    frames[LOST] = Frame(TIMES[LOST])
+    beliefs = [Belief([state], np.array([0.99])) for state in sure]
+    beliefs[LOST] = NOTHING
+    probabilities = [belief.probabilities for belief in beliefs]
+
+    def find(query, frame, near):
+        expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
+        return second_look.find_near(query, expected)
+
+    tracker = SimpleNamespace(frames=frames, motion=Motion(), find=find, query_of=lambda k: k)
+    return tracker, walk_path.Path(probabilities, [None] * len(frames)), beliefs
+
+
+def _find(walk, monkeypatch, x, how="near", is_alone=True):
+    """Look for the lost frame, which is found at a place; return it, and where it was expected."""
+    asked = []
+
+    def find(query, expected):
+        asked.append(expected)
+        return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
+
+    monkeypatch.setattr(second_look, "find_near", find)
+    tracker, path, beliefs = walk
+    second_look._find_lost(tracker, path, beliefs, LOST)
+    return tracker.frames[LOST], asked
+
+
+def test_a_lost_frame_is_expected_from_the_sure_frames_nearest_in_time(walk, monkeypatch):
+    frame, asked = _find(walk, monkeypatch, 10.1)
+    assert [expected.last.center_world[0] for expected in asked] == [9.5]
+    assert asked[0].pose.center_world[0] == pytest.approx(10.0)
+    assert asked[0].reach == Motion().reach(0.5)
+    assert (frame.key, frame.how, frame.is_key) == (1, "near", False)
+    assert frame.arrived.center_world[0] == pytest.approx(10.1)
+    assert walk[2][LOST].states[0].pose.center_world[0] == pytest.approx(10.1)
+
+
+@pytest.mark.parametrize(("x", "is_alone"), [(7.5, True), (10.1, False)])
+def test_a_place_out_of_reach_or_one_of_several_is_none(walk, monkeypatch, x, is_alone):
+    """From the frame after it, at 12 m, one at 7.5 m could not have been reached in 2 s."""
+    frame, asked = _find(walk, monkeypatch, x, "near", is_alone)
+    assert len(asked) == 1
+    assert frame == Frame(TIMES[LOST])
+    assert walk[2][LOST] is NOTHING
+
+
+def test_a_sure_frame_is_not_looked_for(walk, monkeypatch):
+    walk[2][LOST] = walk[2][1]
+    assert _find(walk, monkeypatch, 10.1)[1] == []
+
+
+def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeypatch):
+    """Whatever looks like that place near it."""
+    expected = _at(10.2)
+    tracker, _, beliefs = walk
+    tracker.frames[LOST].key = 1
+    beliefs[LOST] = Belief([State(expected, 4.0)], np.array([0.5]), expected)
+    frame, asked = _find(walk, monkeypatch, 10.1, "tracked", is_alone=False)
+    assert asked[0].pose is expected
+    assert frame.arrived.center_world[0] == pytest.approx(10.1)
+
+
+@pytest.mark.parametrize(
+    ("probabilities", "is_refined", "listed"),
+    [
+        ([0.95, 0.04], [True, False], []),
+        ([0.8, 0.15], [True, False], [1]),
+        ([0.87, 0.05, 0.08], [True, False, False], [2]),
+        ([0.7, 0.06, 0.09, 0.08, 0.07], [True] + 4 * [False], [2, 3, 4]),
+        ([0.86, 0.09, 0.02, 0.02], [True, False, False, False], [1]),
+        ([0.4, 0.09, 0.09], [True, False, False], []),
+        ([0.04, 0.4, 0.3], [True, False, False], [1, 2]),
+    ],
+)
+def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is_refined, listed):
+    """Of those that do so together, as many as leave it sure without them."""
+    states = [State(_at(5.0 * k), 1.0, 0.5 if r else None) for k, r in enumerate(is_refined)]
+    tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
+    path = walk_path.Path([np.array(probabilities)], [None])
+    assert second_look._list_rough(tracker, path, 0) == listed

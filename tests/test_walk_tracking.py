@@ -15,8 +15,6 @@ from piccolo.localization.attempts import CHANCE_MATCHES
 from piccolo.localization.beam import brief_query, score_briefly, score_mirror
 from piccolo.localization.comparison import Comparison, score_pose
 from piccolo.localization.near import Near
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, State
@@ -39,7 +37,7 @@ SEED = 1
 def seen():
     """A frame's query in the map of a room, and its true pose there."""
     taken, scan_map = rooms.query(SEED), rooms.scan_map(SEED)
-    query = prepare_query(rooms.as_panorama(taken.rgb), scan_map, CoarseToFineSettings(), Workers(2))
+    query = rooms.ask(rooms.as_panorama(taken.rgb), scan_map)
     return query, rooms.local(SEED, taken.pose)
 
 
@@ -54,7 +52,7 @@ def _narrow(query):
     panorama = rooms.as_panorama(rooms.query(SEED).rgb)
     columns = np.linspace(-0.5, 0.5, panorama.is_valid.shape[1])
     narrow = replace(panorama, is_valid=panorama.is_valid & (np.abs(columns) < 0.15))
-    return prepare_query(narrow, query.scan_map, CoarseToFineSettings(), Workers(2))
+    return rooms.ask(narrow, query.scan_map)
 
 
 def test_a_descent_goes_on_around_its_end_while_that_helps(seen, monkeypatch):
@@ -103,7 +101,7 @@ def test_a_frame_is_found_where_it_is_expected_or_near(seen):
     for seconds in (1.0, 10.0):
         assert find_near(query, _expected(_off(true, 50.0, 0.0), seconds)) is None
     rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
-    mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
+    mirrored = rooms.ask(rooms.as_panorama(rgb), query.scan_map)
     assert find_near(mirrored, _expected(true, 1.0)) is None
 
 
@@ -167,7 +165,7 @@ def test_the_places_that_look_like_a_photo(seen):
 def test_a_mirrored_photo_is_told_near_a_pose_and_anywhere(seen):
     query, true = seen
     rgb = np.ascontiguousarray(rooms.query(SEED).rgb[:, ::-1])
-    mirrored = prepare_query(rooms.as_panorama(rgb), query.scan_map, CoarseToFineSettings(), Workers(2))
+    mirrored = rooms.ask(rooms.as_panorama(rgb), query.scan_map)
     for taken, wanted in ((query, False), (mirrored, True)):
         for some in (query_near(taken, true, 2.0), brief_query(taken)):
             assert (score_mirror(some) > score_briefly(some)) == wanted
@@ -235,9 +233,7 @@ def test_an_end_that_is_unlikely_or_explains_nothing_is_none(seen, monkeypatch, 
     query, true = seen
     probability = 1.0 / (1.0 + np.exp(-odds))
     seen_there = Comparison(np.array([CHANCE + (1.0 - CHANCE) * score]), np.ones(1), np.ones(1), 1.0)
-    monkeypatch.setattr(
-        tracker, "refine_near", lambda query, start: Near(start, seen_there, None, probability)
-    )
+    monkeypatch.setattr(tracker, "refine_near", lambda _, start: Near(start, seen_there, None, probability))
     assert (track(query, true) is not None) == is_found
 
 

@@ -16,7 +16,7 @@ from ..errors import InputError, is_passing
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
-from ..jobs.tasks import WorkerLostError
+from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..localization.beside import SurePhoto
 from ..localization.settings import CoarseToFineSettings
@@ -37,7 +37,7 @@ class Task(NamedTuple):
     photo: Photo
     settings: Settings
     files: Mapping[str, bytes] | None = None  # what is at its path, where that is not to be seen
-    look: Look | None = None  # if it is looked at again, beside others
+    look: Look | None = None  # if it is looked at again
 
     @contextmanager
     def place(self, folder: Path) -> Iterator[Photo]:
@@ -134,14 +134,7 @@ class Localizer:
 
     def answer_in(self, scan: OpenedScan) -> Callable[[Task], Answer]:
         """Return what answers tasks in an opened scan."""
-        locate = lru_cache(MOST_PICTURES)(partial(self.locate, scan))
-
-        def answer(task: Task) -> Answer:
-            if task.look is None:
-                return self.answer(scan, task)
-            return self.answer_again(scan, task, task.look, locate)
-
-        return answer
+        return partial(self.answer, scan, lru_cache(MOST_PICTURES)(partial(self.place_keypoints, scan)))
 
     def open_scan(self, workers: Workers) -> OpenedScan:
         """Read and prepare the scan."""
@@ -152,48 +145,20 @@ class Localizer:
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)
         return replace(scan, name=self.name)
 
-    def answer(self, scan: OpenedScan, task: Task) -> Answer:
-        """Localize one photo, and make the pictures asked for; of one that can't be read say why."""
-        return self._answer(scan, task, lambda photo: scan.localize(photo, task.settings))
-
-    def answer_again(
-        self, scan: OpenedScan, task: Task, look: Look, locate: Callable[[str], SurePhoto | None]
+    def answer(
+        self, scan: OpenedScan, place_keypoints: Callable[[str], SurePhoto | None], task: Task
     ) -> Answer:
-        """Look at a photo again, beside others; `locate` returns one of these by its result's JSON."""
+        """Localize one photo, and make the pictures asked for; of one that can't be read say why.
 
-        def list_pictures() -> dict[str, SurePhoto]:
-            found = ((json.loads(line)["pano"], locate(line)) for line in look.beside)
-            return {name: picture for name, picture in found if picture}
-
-        def localize(photo: Photo) -> Result:
-            if look.first:
-                first = Result.from_json(look.first)
-            else:
-                first = scan.localize(photo, task.settings, look.focal)
-            if not look.beside:
-                return replace(first, beside=None)
-            found, names = scan.localize_again(photo, first, list_pictures, task.settings)
-            return replace(found, beside=Beside(names, look.asked_sha256))
-
-        return self._answer(scan, task, localize)
-
-    def locate(self, scan: OpenedScan, line: str) -> SurePhoto | None:
-        """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
-        result = Result.from_json(line)
-        photo, settings = self.ask(Path(result.pano))
-        try:
-            return scan.locate(replace(photo, picture=self.folder / photo.path), result, settings)
-        except (OSError, InputError) as error:
-            if is_passing(error):
-                raise
-        return None
-
-    def _answer(self, scan: OpenedScan, task: Task, localize: Callable[[Photo], Result]) -> Answer:
-        """Return the answer by a function of the photo."""
+        `place_keypoints` returns a photo that is sure by its result's JSON.
+        """
         name = task.photo.name
         with task.place(self.folder) as photo, reading_once():
             try:
-                found = localize(photo)
+                if task.look is None:
+                    found = scan.localize(photo, task.settings)
+                else:
+                    found = look_again(scan, photo, task.settings, task.look, place_keypoints)
                 overlay, mask = self._pictures(scan, photo, found)
             except Exception as error:
                 return Answer(make_failed_result(scan, photo, error, task.settings, name))
@@ -201,16 +166,23 @@ class Localizer:
         result = replace(found, pano=name, warnings=warnings)
         return Answer(result, warnings[len(scan.warnings) :], overlay, mask)
 
-    def wait_for(self, task: Task, wait: Callable[[], Answer], cloud_sha256: str | None) -> Answer:
-        """Return the answer to a task, also to one whose workers were lost."""
-        name = task.photo.name
+    def place_keypoints(self, scan: OpenedScan, line: str) -> SurePhoto | None:
+        """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""
+        result = Result.from_json(line)
+        photo, settings = self.ask(Path(result.pano))
         try:
-            return wait()
-        except WorkerLostError as error:
-            text = f"{name}: {error}"
+            return scan.place_keypoints(replace(photo, picture=self.folder / photo.path), result, settings)
+        except (OSError, InputError) as error:
+            if is_passing(error):
+                raise
+        return None
+
+    def give_up(self, task: Task, error: WorkerLostError, cloud_sha256: str | None) -> Answer:
+        """Return the answer to a task whose workers were lost."""
+        name = task.photo.name
         settings = settings_json(task.settings, self.cloud_settings, task.photo)
         about = {"settings": settings, "source": Source(cloud_sha256)}
-        return Answer(unreadable_result(text, self.name, name, is_passing=True, **about))
+        return Answer(unreadable_result(f"{name}: {error}", self.name, name, is_passing=True, **about))
 
     def _pictures(self, scan: OpenedScan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
@@ -225,3 +197,23 @@ class Localizer:
         if self.makes_occlusion_masks:
             mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask
+
+
+def look_again(
+    scan: OpenedScan,
+    photo: Photo,
+    settings: Settings,
+    look: Look,
+    place_keypoints: Callable[[str], SurePhoto | None],
+) -> Result:
+    """Localize a photo again: with the focal length that others tell, or beside others."""
+
+    def list_pictures() -> dict[str, SurePhoto]:
+        found = ((json.loads(line)["pano"], place_keypoints(line)) for line in look.beside)
+        return {name: picture for name, picture in found if picture}
+
+    first = Result.from_json(look.first) if look.first else scan.localize(photo, settings, look.focal)
+    if not look.beside:
+        return replace(first, beside=None)
+    found, names = scan.localize_again(photo, first, list_pictures, settings)
+    return replace(found, beside=Beside(names, look.asked_sha256))

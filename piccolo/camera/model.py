@@ -173,7 +173,6 @@ class Camera:
     max_angle_deg: float | None = None  # from the axis; beyond, nothing is shown (a fisheye's circle)
 
     def __post_init__(self) -> None:
-        """Refuse what is no camera."""
         if self.model not in MODELS:
             raise InputError(f"found the camera model {self.model!r}, wanted one of {', '.join(MODELS)}")
         names = MODELS[self.model][1]
@@ -325,10 +324,7 @@ def pinhole(width: int, height: int, focal: float) -> Camera:
 
 
 def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:
-    """Return ideal photo of this size, `lens` pinhole or fisheye, whose `width` shows a field of view [deg].
-
-    Raises InputError for a field that the lens can't have.
-    """
+    """Return an ideal pinhole or fisheye that shows `fov_deg` across its width; InputError if none can."""
     if lens == "fisheye":
         focal = width / math.radians(fov_deg)
         return Camera("SIMPLE_FISHEYE", width, height, (focal, width / 2.0, height / 2.0))

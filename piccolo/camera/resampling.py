@@ -13,8 +13,8 @@ import numpy as np
 
 from ..arrays import Array, Bytes, Floats, Mask
 from ..geometry.sphere import compute_rays
+from .calibration import Mount
 from .model import SPHERE
-from .rig import Mount
 
 MAX_SPHERE_WIDTH = 4096  # [px] nothing looks at more
 MIN_SPHERE_WIDTH = 256  # [px]

@@ -9,8 +9,8 @@ import numpy as np
 from ..arrays import Array
 from ..cloud import CloudStream, open_cloud
 from ..cloud.octree import build_octree
-from ..cloud.ply_writer import write_transformed
 from ..cloud.settings import CloudSettings, R_z_from_axis
+from ..cloud.writers import write_transformed
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically

@@ -19,8 +19,7 @@ from ..confidence.confidence import AMBIGUOUS, LOCALIZED
 from ..errors import InputError, printable
 from ..jobs.cluster import LOCAL, Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
-from ..jobs.processes import Processes
-from ..jobs.tasks import Here
+from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
 from ..localization.focal_length import WIDE
 from ..opened_scan import OpenedScan
@@ -245,4 +244,8 @@ def answer_all(
     values = executor.values(tasks)
     pairs = show(values)
     for task, wait in interruption.each(pairs, values.take_finished()) if interruption else pairs:
-        yield localizer.wait_for(task, wait, cloud_sha256)
+        try:
+            answer = wait()
+        except WorkerLostError as error:
+            answer = localizer.give_up(task, error, cloud_sha256)
+        yield answer

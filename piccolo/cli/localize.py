@@ -21,9 +21,8 @@ from ..batch.results_file import FileOutput, Output, Records, StreamOutput
 from ..batch.second_look import LISTINGS, Look, list_changed_by_consensus
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import InputError
-from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, write_atomically
+from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
 from ..files.line_file import LineFile, open_locked, write_line
-from ..files.temporary import temporary_folder
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
 from ..localization.settings import CoarseToFineSettings

@@ -10,10 +10,9 @@ import numpy as np
 
 from ..arrays import Array32
 from ..camera import Camera, Mount
-from ..camera.files import read_calibration
+from ..camera.calibration import read_calibration
 from ..cloud.soa import LocalCloud
 from ..errors import InputError
-from ..export.video import writing_video
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
 from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
@@ -25,6 +24,7 @@ from ..optional import import_optional
 from ..panorama import read_panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
+from ..panorama.video import writing_video
 from ..result import read_results
 from ..scan_map.open_map import open_points
 from ..scene import read_scene

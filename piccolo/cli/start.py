@@ -13,7 +13,7 @@ from functools import partial
 from importlib import import_module
 from types import FrameType
 
-from ..jobs.arenas import share_arenas
+from ..jobs.memory import share_arenas
 
 # Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
 COMMANDS = (

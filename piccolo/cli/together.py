@@ -21,11 +21,10 @@ from ..batch.results_file import WAYS, Records, write_results
 from ..coloring import color_scan
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
-from ..files.atomic import is_stream
-from ..files.journal import Journal, keeping_steps
-from ..files.temporary import temporary_folder
+from ..files.atomic import is_stream, temporary_folder
+from ..files.line_file import Journal, keeping_steps
 from ..geometry.pose import Pose
-from ..jobs.tasks import InFlight
+from ..jobs.processes import InFlight
 from ..jobs.threads import Stopwatch
 from ..opened_scan import OpenedScan
 from ..panorama.photo import sha256_of
@@ -168,7 +167,7 @@ def make_coloring_job(
     more = {"colors": "those of the other photos"}
 
     def localize(shown: ScanMap, k: int) -> Result:
-        result = localizer.answer(replace(scan, prepared=shown), localizer.task(photos[k])).result
+        result = localizer.answer_in(replace(scan, prepared=shown))(localizer.task(photos[k])).result
         return replace(result, settings={**result.settings, **more})
 
     def run(journal: Journal) -> list[Result]:

@@ -1,6 +1,5 @@
 """Point clouds: a reader for each format, then checks and an order common to all."""
 
-from .open import FORMATS, open_cloud, open_source, read_cloud
-from .stream import Cloud, CloudStream, stream_points
+from .stream import FORMATS, Cloud, CloudStream, open_cloud, open_source, read_cloud
 
-__all__ = ["FORMATS", "Cloud", "CloudStream", "open_cloud", "open_source", "read_cloud", "stream_points"]
+__all__ = ["FORMATS", "Cloud", "CloudStream", "open_cloud", "open_source", "read_cloud"]

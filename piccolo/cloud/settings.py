@@ -31,7 +31,6 @@ class CloudSettings:
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
 
     def __post_init__(self) -> None:
-        """Raise InputError for invalid values, and for labels of a scan whose colours are ignored."""
         if self.labels and "colors" not in self.channels:
             raise InputError("`ignore_colors`, `labels`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):
@@ -50,6 +49,17 @@ def check_crs(crs: str) -> Any:
     except pyproj.exceptions.CRSError as error:
         wanted = "wanted a coordinate system such as EPSG:25832"
         raise InputError(f"`crs`: found {crs[:80]!r}, {wanted}") from error
+
+
+def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
+    """Return x and y of a place in a projected system, in its unit; None if there are none."""
+    system = check_crs(crs)
+    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    if not system.is_projected:
+        return None
+    transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
+    x, y = transformer.transform(longitude_deg, latitude_deg)
+    return (float(x), float(y)) if math.isfinite(x) and math.isfinite(y) else None
 
 
 IN_METRES = CloudSettings()

@@ -23,7 +23,6 @@ class PackedPoints:
     rgbx: Int32s  # (N,) as pack_rgbx
 
     def __len__(self) -> int:
-        """Return the number of points."""
         return len(self.x)
 
     def take(self, indices: NDArray[np.integer] | slice) -> "PackedPoints":

@@ -1,10 +1,13 @@
-"""Clouds in files, read as often as needed and checked chunk by chunk: into voxels, or into memory."""
+"""Clouds in files, read as often as needed and checked chunk by chunk: into voxels, or into memory.
+
+A file's format follows from its first bytes, or else from its name.
+"""
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +18,8 @@ from ..files.cache import sha256_of_arrays
 from ..geometry.pose import MAX_COORDINATE, rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, no_progress
-from .readers.reader import CHUNK, GRAY, PointSource, RawCloud, color_chunks, find_full_brightness, points_of
-from .settings import Channel, UpAxis
+from .readers import e57, e57_file, las, mesh, mesh_files, npz, pcd, ply, reader, text
+from .settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
 MIN_POINTS = 1000
@@ -27,6 +30,7 @@ COARSE = 0.01  # [m] steps between float32 numbers that are reported, from 131 k
 MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
 Chunk = tuple[Array, Bytes]  # finite points (N, 3) [m], colours (N, 3)
+MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description; a longer one is ignored
 ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
 
 
@@ -41,7 +45,7 @@ class PointValidator:
     brightest: int = 0
     step: float = 0.0  # [m] between numbers at the farthest point that is stored in float32
 
-    def filter(self, raw: RawCloud) -> Chunk:
+    def filter(self, raw: reader.RawCloud) -> Chunk:
         """Count the points of a chunk; return the finite ones in metres."""
         is_finite: Mask = np.all(np.isfinite(raw.points_world), axis=1)
         num_finite = int(np.count_nonzero(is_finite))
@@ -121,24 +125,16 @@ class Cloud:
         return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)
 
 
-def stream_points(path: Path, raw: RawCloud) -> "CloudStream":
-    """Return points in memory as the stream of a file named `path`."""
-    return CloudStream([PointSource(path, lambda: iter([raw]), len(raw.colors))])
-
-
-def _no_box() -> Array:
-    return np.repeat([[np.inf], [-np.inf]], 3, axis=1)
-
-
 @dataclass(frozen=True)
 class CloudStream:
     """One cloud in one or several files. Each reading begins at the start and ends with all checks."""
 
-    sources: Sequence[PointSource]  # in an order of their own: the user's changes nothing
+    sources: Sequence[reader.PointSource]  # in an order of their own: the user's changes nothing
     scale: float = 1.0  # metres per unit of the files
     show: Progress = no_progress
     sha256: str = ""  # of what is read, if that is known
-    box: Array = field(default_factory=_no_box)  # (2, 3) least and greatest of all points read so far [m]
+    # (2, 3) least and greatest of all points read so far [m]
+    box: Array = field(default_factory=lambda: np.repeat([[np.inf], [-np.inf]], 3, axis=1))
 
     @property
     def label(self) -> str:
@@ -167,7 +163,7 @@ class CloudStream:
         """Yield the finite points in metres; append each file's validator once it is read."""
         for source in self.sources:
             validator = PointValidator(source.path, self.scale)
-            total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
+            total = None if source.num_points is None else math.ceil(source.num_points / reader.CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
                     check_address_space()
@@ -222,10 +218,148 @@ def stream_of_arrays(points: Floats, colors: NDArray[Any] | None) -> CloudStream
         raise InputError(f"points, colors: found shapes {shapes}, wanted arrays of shape (N, 3)")
     if points.dtype.kind not in "fiu":
         raise InputError(f"points: found {points.dtype}, wanted numbers")
-    given = np.full(points.shape, GRAY, np.uint8) if colors is None else colors
-    brightest = find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
-    parts = [(points_of([*points.T]), given)]
-    chunk = next(color_chunks(parts, brightest, lambda row: f"{ARRAYS}, row {row}"))
+    given = np.full(points.shape, reader.GRAY, np.uint8) if colors is None else colors
+    brightest = reader.find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
+    parts = [(reader.points_of([*points.T]), given)]
+    chunk = next(reader.color_chunks(parts, brightest, lambda row: f"{ARRAYS}, row {row}"))
     channel: Channel = "shape" if colors is None else "colors"
-    source = PointSource(ARRAYS, lambda: iter([chunk]), len(given), channel=channel)
+    source = reader.PointSource(ARRAYS, lambda: iter([chunk]), len(given), channel=channel)
     return CloudStream([source], sha256=sha256_of_arrays(points, given))
+
+
+class CloudFormat(NamedTuple):
+    """A format and its reader."""
+
+    name: str
+    suffixes: tuple[str, ...]  # lower case, with the dot
+    has_magic: Callable[[bytes], object]  # true of a file's first HEAD_SIZE bytes; content goes before names
+    # MissingChannelError if the file has no such channel
+    open_source: Callable[[Path, CloudSettings, Channel], reader.PointSource]
+    has_labels: bool = False  # the reader knows them
+
+
+def _begins(*magic: bytes) -> Callable[[bytes], bool]:
+    return lambda head: head.startswith(magic)
+
+
+FORMATS = (
+    CloudFormat("PLY", (".ply",), _begins(*ply.MAGIC), ply.open_ply, has_labels=True),
+    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las.MAGIC), las.open_las, has_labels=True),
+    CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
+    CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd, has_labels=True),
+    CloudFormat("PTX", (".ptx",), text.has_ptx_magic, text.open_ptx),
+    CloudFormat("PTS", (".pts",), _begins(), text.open_pts),
+    CloudFormat("NumPy .npz", (".npz",), npz.has_npz_magic, npz.open_npz),
+    CloudFormat("NumPy .npy", (".npy",), _begins(npz.NPY_MAGIC), npz.open_npy),
+    CloudFormat(
+        "OBJ, GLB and glTF meshes", (".obj", ".glb", ".gltf"), _begins(mesh_files.GLB_MAGIC), mesh.open_mesh
+    ),
+    CloudFormat("text x y z r g b", (".txt", ".xyz", ".asc", ".csv", ".xyzrgb"), _begins(), text.open_text),
+)
+WANTED = f"wanted a point cloud: {', '.join(f.name for f in FORMATS)}"
+
+
+def open_cloud(
+    paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Progress = no_progress
+) -> CloudStream:
+    """Return the cloud in one or several files, before its points are read, in the first channel of all.
+
+    Raises InputError if a file is missing, has a damaged header, none of the channels, or an unknown format,
+    or if some files have colours and some have none. Reading the points raises it where the data are damaged
+    or fail the checks of `PointValidator`.
+    """
+    sources = [open_source(path, settings) for path in sorted(paths)]
+    if len({source.channel for source in sources}) > 1:
+        colored = next((source.path for source in sources if source.channel == "colors"), None)
+        if colored:
+            bare = next(source.path for source in sources if source.channel != "colors")
+            found = f"{bare}: found no colours, though {colored} has them"
+            raise InputError(f"{found}, wanted them in all files, or `ignore_colors`")
+        only_shape = replace(settings, channels=("shape",))
+        sources = [open_source(path, only_shape) for path in sorted(paths)]
+    return CloudStream(sources, settings.scale, show)
+
+
+def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
+    """Return the cloud in a file, checked, in metres, in Morton order.
+
+    The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
+    metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
+    coordinates and a room at the origin take the same path. Raises InputError like `open_cloud`.
+    """
+    return open_cloud([path], settings).read()
+
+
+def open_source(path: Path, settings: CloudSettings = IN_METRES) -> reader.PointSource:
+    """Return the points of a file in any supported format, in the first of the channels that it has."""
+    try:
+        format_ = _format_of(path)
+        if settings.labels and not format_.has_labels:
+            known = ", ".join(f.name for f in FORMATS if f.has_labels)
+            raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
+        try:
+            return _open_channel(format_, path, settings)
+        except reader.MissingChannelError:
+            raise
+        except InputError as error:
+            raise InputError(f"{error}{_hint(format_, path, settings)}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error}), {WANTED}") from error
+
+
+def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> reader.PointSource:
+    """Return the points in the first channel that the file has, with a warning if it has no colours."""
+    missing: list[reader.MissingChannelError] = []
+    for channel in ("colors",) if settings.labels else settings.channels:
+        try:
+            source = format_.open_source(path, settings, channel)
+        except reader.MissingChannelError as error:
+            missing.append(error.with_traceback(None))  # it would keep the file open
+            continue
+        notes = (str(missing[0]),) if missing and settings.channels[0] == "colors" else ()
+        return source._replace(channel=channel, warnings=(*source.warnings, *notes))
+    raise missing[0]
+
+
+def _hint(format_: CloudFormat, path: Path, settings: CloudSettings) -> str:
+    """Return what to add to the refusal of a file that would be read without its colours."""
+    if settings.labels or settings.channels != IN_METRES.channels:
+        return ""
+    try:
+        format_.open_source(path, settings, "shape")
+    except InputError:
+        return ""
+    return "; `ignore_colors` localizes by the shape alone"
+
+
+def _format_of(path: Path) -> CloudFormat:
+    """Return the format of a file: by its first bytes, or else by its suffix."""
+    if not path.exists():
+        raise InputError(f"{path}: no such file, {WANTED}")
+    if not path.is_file():
+        raise InputError(f"{path}: not a file but a folder or a device, {WANTED}")
+    with path.open("rb") as file:
+        head = file.read(reader.HEAD_SIZE)
+    if not head:
+        raise InputError(f"{path}: the file is empty, {WANTED}")
+    suffix = path.suffix.lower()
+    by_content = [f for f in FORMATS if f.has_magic(head)]
+    by_name = [f for f in FORMATS if suffix in f.suffixes]
+    if not by_content and not by_name:
+        raise InputError(f"{path}: unknown format '{path.suffix}', {WANTED}")
+    return (by_content or by_name)[0]
+
+
+def read_crs(paths: Sequence[Path]) -> str:
+    """Return the system that the first of a scan's files names, as WKT or EPSG:code; empty if it names none.
+
+    LAS and LAZ: the OGC WKT record, or the GeoTIFF keys. E57: coordinateMetadata.
+    """
+    with paths[0].open("rb") as file:
+        head = file.read(reader.HEAD_SIZE)
+    text = ""
+    if head.startswith(las.MAGIC):
+        text = las.read_crs(paths[0])
+    elif head.startswith(e57_file.MAGIC):
+        text = e57_file.read_xml(paths[0]).findtext("coordinateMetadata", "")
+    return " ".join(text.split()) if len(text) <= MAX_CRS_LENGTH else ""

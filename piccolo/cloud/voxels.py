@@ -127,17 +127,11 @@ def join_voxels(first: Array32, second: Array32, origin: Array) -> Voxels:
 
 
 @inline_kernel
-def first_slot(x: np.int64, y: np.int64, z: np.int64, num_slots: int) -> np.int64:
-    """Return the slot of an index (2^k,) at which the search for a cell begins."""
-    # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
-    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-    return (mixed ^ (mixed >> 17)) & (num_slots - 1)
-
-
-@inline_kernel
 def find_slot(index: Int32s, rows: Int32s, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
     """Return the slot that holds a cell's row, or else the free slot where it belongs."""
-    slot = first_slot(x, y, z, len(index))
+    # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
+    mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
+    slot = (mixed ^ (mixed >> 17)) & (len(index) - 1)
     while index[slot] != 0:
         row = rows[index[slot] - 1]
         if row[CELL] == x and row[CELL + 1] == y and row[CELL + 2] == z:

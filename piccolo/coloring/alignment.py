@@ -3,35 +3,28 @@
 Minimised is the sum over points, and over the pairs of photos that see them, of a robust loss of the
 difference of their colours, with each pose's distance from where it was found before. All poses are
 optimised jointly, because overlapping photos are coupled. After Zhou and Koltun, "Color Map Optimization
-for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time.
+for 3D Reconstruction with Consumer Depth Cameras" (SIGGRAPH 2014), who move one at a time. Before, gains make
+their exposures alike. A photo sees the nearest surfaces, best where it looks at them squarely from near.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s, Int64s
 from ..cloud.octree import Octree
 from ..geometry.pose import Pose, log_so3, step
-from ..geometry.sphere import pixel_jacobian
+from ..geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, Scalar, kernel
+from ..kernels.jit import F0, Scalar, kernel, whole
+from ..local_features.view_image import render_gray
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import FALL, FIRST_DAMPING, RISE
-from ..panorama import Panorama
+from ..panorama import Panorama, texels
 from ..panorama.model import resize
-from ..panorama.texels import (
-    Texels,
-    blend_with_gradient,
-    in_camera,
-    is_valid,
-    locate_texel,
-    pack_texels,
-    pose_float32,
-)
-from .exposure import balance
-from .sight import look, weigh_points
 
 WIDTHS = 512, 1024, 2048  # [px] of the photos, from one round to the next
 POINTS_PER_PHOTO = 5000
@@ -43,6 +36,16 @@ NOISE = 10.0  # [8-bit levels] of one
 NUM_ALIKE = 30.0  # points whose differences err alike: with fewer, weak constraints outweigh where poses were
 NUM_STEPS = 15  # a round, at most
 SETTLED = 1e-4  # [rad, m] the largest part of a step after which a round ends
+DARKEST = 8.0  # [8-bit levels] darker and brighter colours say nothing of gains
+BRIGHTEST = 247.0
+SCALE = 0.2  # of the logarithm of a ratio, beyond which it counts little: the photos show different things
+NUM_ROUNDS = 4
+SIGHT_WIDTH = 1024  # [px] of the sphere on which ranges are found
+BEHIND = np.float32(1.02)  # what is farther than the surface by this factor
+BEHIND_OFFSET = np.float32(0.03)  # [m] and this is hidden
+NEIGHBOR = 2  # [px] between the pixels by which a surface's slope is found
+LEAST_COSINE = 0.02
+LEAST_RANGE = 0.3  # [m] nearer surfaces count as much as this
 
 
 class Anchor(NamedTuple):
@@ -50,6 +53,44 @@ class Anchor(NamedTuple):
 
     pose: Pose  # in the map
     information: Array  # (6, 6) of a step [rad, m] in the camera's frame
+
+
+class Sight(NamedTuple):
+    """The surfaces around a photo."""
+
+    ranges: Array32  # (H, W) [m], 0 where nothing is seen
+    weights: Array32  # (H, W) cosine of the angle to the surface's normal / range^2 [1 / m^2]
+
+
+def look(octree: Octree, pose: Pose) -> Sight:
+    """Return what a photo at a pose in the map sees."""
+    ranges = render_gray(octree, pose, np.ones((SIGHT_WIDTH // 2, SIGHT_WIDTH), np.bool_)).ranges
+    rays = pixel_rays(SIGHT_WIDTH)
+    smooth = np.asarray(cv2.medianBlur(ranges, 3), np.float64)
+    points = np.pad(rays * smooth[..., None], ((NEIGHBOR, NEIGHBOR), (0, 0), (0, 0)), mode="edge")
+    across = np.roll(points, -NEIGHBOR, axis=1) - np.roll(points, NEIGHBOR, axis=1)
+    normals = np.cross(across[NEIGHBOR:-NEIGHBOR], points[2 * NEIGHBOR :] - points[: -2 * NEIGHBOR])
+    along = np.abs((normals * rays).sum(axis=-1))
+    cosine = along / np.maximum(np.linalg.norm(normals, axis=-1), 1e-12)
+    weights = np.maximum(cosine, LEAST_COSINE) / np.maximum(ranges, LEAST_RANGE) ** 2
+    return Sight(ranges, np.where(ranges > 0.0, weights, 0.0).astype(np.float32))
+
+
+@kernel
+def weigh_points(
+    points: Array32, sight: Sight, R_cam_from_map: Array, center_map: Array, found: Array32
+) -> None:
+    """Write how well a photo sees each of some points (N, 3) of the map, 0 for what is hidden."""
+    pose = texels.pose_float32(R_cam_from_map, center_map)
+    height, width = sight.ranges.shape
+    for n in range(len(points)):
+        x, y, z = texels.in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        rho2 = x * x + y * y
+        u, v = direction_to_pixel(x, y, z, np.sqrt(rho2), np.float32(width))
+        i = min(whole(v), height - 1)
+        j = min(whole(u), width - 1)
+        is_seen = np.sqrt(rho2 + z * z) <= sight.ranges[i, j] * BEHIND + BEHIND_OFFSET
+        found[n] = sight.weights[i, j] if is_seen else F0
 
 
 class Sightings(NamedTuple):
@@ -81,11 +122,12 @@ def align(
     gains = np.ones((len(poses), 3), np.float32)
     for width in WIDTHS:
         sized = [resize(panorama, width) for panorama in panoramas]
-        texels = [pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
+        images = [texels.pack_texels(panorama.rgb, panorama.is_valid) for panorama in sized]
         sightings = find_sightings(octree, points, poses, workers)
-        values = read_all(points, sightings, texels, np.ones_like(gains), poses, workers).values
+        read = partial(read_all, points, sightings, images, workers)
+        values = read(poses, np.ones_like(gains)).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
-        poses = descend(points, sightings, texels, gains, poses, anchors, workers)
+        poses = descend(partial(read, gains=gains), sightings, poses, anchors)
     return poses, gains
 
 
@@ -93,9 +135,8 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
     """Find which photos see points (N, 3), those alone that several see."""
 
     def weigh(pose: Pose) -> Array32:
-        sight = look(octree, pose)
         found = np.empty(len(points), np.float32)
-        weigh_points(points, *sight, pose.R_cam_from_world, pose.center_world, found)
+        weigh_points(points, look(octree, pose), pose.R_cam_from_world, pose.center_world, found)
         return found
 
     best = np.zeros((len(points), MOST_SEEN), np.float32)
@@ -119,10 +160,10 @@ def find_sightings(octree: Octree, points: Array32, poses: Sequence[Pose], worke
 def read_all(
     points: Array32,
     sightings: Sightings,
-    texels: Sequence[Texels],
-    gains: Array32,
-    poses: Sequence[Pose],
+    images: Sequence[texels.Texels],
     workers: Workers,
+    poses: Sequence[Pose],
+    gains: Array32,
 ) -> Readings:
     """Read what the photos show at all points that they see."""
     count = len(sightings.point)
@@ -130,7 +171,7 @@ def read_all(
 
     def read(k: int) -> None:
         pose = poses[k]
-        image = texels[k]
+        image = images[k]
         read_photo(
             points, sightings.own[k], sightings.point, image.rgbx, image.width, gains[k],
             pose.R_cam_from_world, pose.center_world, *readings,
@@ -141,18 +182,12 @@ def read_all(
 
 
 def descend(
-    points: Array32,
-    sightings: Sightings,
-    texels: Sequence[Texels],
-    gains: Array32,
-    poses: list[Pose],
-    anchors: Sequence[Anchor],
-    workers: Workers,
+    read: Callable[[Sequence[Pose]], Readings], sightings: Sightings, poses: list[Pose], anchors: list[Anchor]
 ) -> list[Pose]:
     """Return the poses at which photos agree best: Levenberg-Marquardt on all of them."""
 
     def equations(at: Sequence[Pose]) -> tuple[float, Array, Array]:
-        readings = read_all(points, sightings, texels, gains, at, workers)
+        readings = read(at)
         matrix = np.zeros((6 * len(at), 6 * len(at)))
         gradient = np.zeros(6 * len(at))
         loss = add_pairs(sightings.first, sightings.photo, *readings, LOSS_SCALE, matrix, gradient)
@@ -162,7 +197,9 @@ def descend(
         gradient /= variance
         for k, (pose, anchor) in enumerate(zip(at, anchors, strict=True)):
             own = slice(6 * k, 6 * k + 6)
-            away = measure_step(anchor.pose, pose)
+            turn = log_so3(pose.R_cam_from_world @ anchor.pose.R_cam_from_world.T)
+            move = anchor.pose.R_cam_from_world @ (pose.center_world - anchor.pose.center_world)
+            away = np.concatenate([turn, move])
             loss += 0.5 * float(away @ anchor.information @ away)
             matrix[own, own] += anchor.information
             gradient[own] += anchor.information @ away
@@ -187,18 +224,12 @@ def descend(
     return poses
 
 
-def measure_step(pose: Pose, other: Pose) -> Array:
-    """Return the step (6,) [rad, m], in the camera's frame, from a pose to another near it."""
-    turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
-    return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
-
-
 @kernel
 def read_photo(
     points: Array32,
     own: Int64s,
     point: Int64s,
-    texels: Int32s,
+    image: Int32s,
     width: int,
     gains: Array32,
     R_cam_from_map: Array,
@@ -207,18 +238,18 @@ def read_photo(
     rows: Array32,
 ) -> None:
     """Write the values (S, 3) and rows (S, 3, 6) of one photo's own sightings."""
-    pose = pose_float32(R_cam_from_map, center_map)
+    pose = texels.pose_float32(R_cam_from_map, center_map)
     for s in own:
         n = point[s]
-        x, y, z = in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        x, y, z = texels.in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
         rho2 = x * x + y * y
-        k, fu, fv = locate_texel(x, y, z, np.sqrt(rho2), width)
+        k, fu, fv = texels.locate_texel(x, y, z, np.sqrt(rho2), width)
         below = k + width + 2
-        t00, t10, t01, t11 = texels[k], texels[k + 1], texels[below], texels[below + 1]
+        t00, t10, t01, t11 = image[k], image[k + 1], image[below], image[below + 1]
         ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, rho2, np.float32(width))
-        is_shown = is_valid(t00, t10, t01, t11) > F0
+        is_shown = texels.is_valid(t00, t10, t01, t11) > F0
         for c in range(3):
-            value, by_u, by_v = blend_with_gradient(t00, t10, t01, t11, fu, fv, 8 * c)
+            value, by_u, by_v = texels.blend_with_gradient(t00, t10, t01, t11, fu, fv, 8 * c)
             values[s, c] = value * gains[c] if is_shown else np.float32(np.nan)
             gx = gains[c] * (by_u * ux + by_v * vx)
             gy = gains[c] * (by_u * uy + by_v * vy)
@@ -282,3 +313,39 @@ def add_pair(
             matrix[j + p, j + q] += weight * other[p] * other[q]
             matrix[i + p, j + q] -= cross
             matrix[j + q, i + p] -= cross
+
+
+def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> Array32:
+    """Return the gains (photos, 3) by which the colours of photos are multiplied to be alike.
+
+    `values` (S, 3) are what `photo` (S,) shows at `point` (S,), sorted by points. The logarithms of gains are
+    found by robust least squares on those of ratios, their mean is 0.
+    """
+    is_plain = np.asarray(np.all((values > DARKEST) & (values < BRIGHTEST), axis=1))  # not NaN either
+    logs = np.log(np.where(is_plain[:, None], values, 1.0).astype(np.float64))
+    pairs = [np.empty((0, 2), np.int64)]
+    for apart in range(1, num_photos):
+        a = np.arange(len(point) - apart)
+        a = a[point[a] == point[a + apart]]
+        if not len(a):
+            break
+        pairs.append(np.stack([a, a + apart], axis=1)[is_plain[a] & is_plain[a + apart]])
+    a, b = np.concatenate(pairs).T
+    i, j = photo[a], photo[b]
+    ratios = logs[b] - logs[a]
+    gains = np.zeros((num_photos, 3))
+    for _ in range(NUM_ROUNDS):
+        errors = ratios - (gains[i] - gains[j])
+        weights = 1.0 / (1.0 + (errors**2).sum(axis=1) / SCALE**2) ** 2
+        gains = solve(i, j, ratios * weights[:, None], weights, num_photos)
+    return np.exp(gains).astype(np.float32)
+
+
+def solve(i: Int64s, j: Int64s, loads: Array, weights: Array, count: int) -> Array:
+    """Return x (count, 3) of least squares weights (P,) on x[i] - x[j] = loads / weights (P, 3), mean 0."""
+    cross = np.bincount(i * count + j, weights, count * count).reshape(count, count)
+    cross = cross + cross.T
+    matrix = np.diag(cross.sum(axis=1) + 1.0) - cross  # one observation that a photo is like others
+    right = [np.bincount(i, load, count) - np.bincount(j, load, count) for load in loads.T]
+    found = np.linalg.solve(matrix, np.stack(right, axis=1))
+    return np.asarray(found - found.mean(axis=0))

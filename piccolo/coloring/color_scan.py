@@ -1,4 +1,7 @@
-"""A scan in the colours of photos that were localized in it, by its shape or by colours it has already."""
+"""A scan in the colours of photos that were localized in it, by its shape or by colours it has already.
+
+A point's colour is the weighted median of the photos that see it, so that no single photo decides.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -7,23 +10,23 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32
+from ..arrays import Array, Array32, Bytes, Int32s
 from ..cloud import open_cloud
-from ..cloud.colored_writer import SUFFIXES, write_colored
-from ..cloud.octree import recolor
+from ..cloud.octree import Octree, recolor
+from ..cloud.writers import SUFFIXES, write_colored
 from ..errors import InputError
-from ..files.journal import Journal
+from ..files.line_file import Journal
 from ..geometry.pose import Pose
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
+from ..kernels.jit import F0, HALF, kernel
 from ..opened_scan import OpenedScan, labels_of, photo_of
-from ..panorama import Panorama, read_panorama
+from ..panorama import Panorama, read_panorama, texels
 from ..panorama.model import shrink
 from ..result import FAILED, Result
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
-from .alignment import Anchor, align
-from .painting import WIDTH, Brush, Paint, make_brushes, paint_points, sees_paint
+from .alignment import Anchor, Sight, align, look, weigh_points
 
 LEAST_PHOTOS = 2
 NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
@@ -34,6 +37,127 @@ PAIR_BYTES = 5 * 6 * 6 * 8  # of two photos: normal equations, and copies of the
 UNKNOWN_STD = np.radians(0.5), 0.03  # [rad], [m] of a pose without a covariance
 PAINT_STD = 0.008  # [m] of positions in a scan whose colours are all of photos that found each other
 PAINTED = "photos are localized by the colours that others gave to the scan"
+WIDTH = 4096  # [px] of a photo, at most
+SAMPLES = 1 << 21  # of photos at points, that a task holds
+LEAST_PAINTED = 0.25  # of what a photo sees: of 17 right ones with less, colours refused 14
+MOST_PHOTOS = 255  # that are counted for a point
+FULL = np.float32(255.0)
+
+
+class Brush(NamedTuple):
+    """A photo that gives colours."""
+
+    image: texels.Texels
+    pose: Pose  # in the map
+    gains: Array32  # (3,) by which its colours are multiplied
+    sight: Sight
+
+
+class Paint(NamedTuple):
+    """Colours of points."""
+
+    colors: Bytes  # (N, 3) RGB, 0 where no photo looks
+    num_photos: Bytes  # (N,) that see the point
+
+
+def make_brushes(
+    octree: Octree, panoramas: Sequence[Panorama], poses: Sequence[Pose], gains: Array32, workers: Workers
+) -> list[Brush]:
+    """Return the photos at their poses in a map, with gains (photos, 3)."""
+
+    def make(k: int) -> Brush:
+        shown = shrink(panoramas[k], WIDTH)
+        image = texels.pack_texels(shown.rgb, shown.is_valid)
+        return Brush(image, poses[k], gains[k], look(octree, poses[k]))
+
+    return workers.map(make, range(len(poses)), "see")
+
+
+def paint_points(points: Array32, brushes: Sequence[Brush], workers: Workers) -> Paint:
+    """Return the colours of points (N, 3) of the map."""
+    paint = Paint(np.empty((len(points), 3), np.uint8), np.empty(len(points), np.uint8))
+    at_once = max(1, SAMPLES // len(brushes))
+
+    def run(lo: int) -> None:
+        part = slice(lo, lo + at_once)
+        some = points[part]
+        weights = np.empty((len(brushes), len(some)), np.float32)
+        colors = np.empty((len(brushes), len(some), 3), np.float32)
+        for k, (image, pose, gains, sight) in enumerate(brushes):
+            R, t = pose.R_cam_from_world, pose.center_world
+            weigh_points(some, sight, R, t, weights[k])
+            read_colors(some, image.rgbx, image.width, gains, R, t, weights[k], colors[k])
+        find_medians(colors, weights, paint.colors[part], paint.num_photos[part])
+
+    workers.map(run, range(0, len(points), at_once), "paint")
+    return paint
+
+
+def sees_paint(brush: Brush, points: Array32, paint: Paint) -> bool:
+    """Return True if enough of what a photo sees of points (N, 3), by its solid angle, has paint."""
+    weights = np.empty(len(points), np.float32)
+    weigh_points(points, brush.sight, brush.pose.R_cam_from_world, brush.pose.center_world, weights)
+    return bool(weights[paint.num_photos > 0].sum() > LEAST_PAINTED * weights.sum())
+
+
+@kernel
+def read_colors(
+    points: Array32,
+    image: Int32s,
+    width: int,
+    gains: Array32,
+    R_cam_from_map: Array,
+    center_map: Array,
+    weights: Array32,
+    colors: Array32,
+) -> None:
+    """Write what a photo shows at points (N, 3) whose weights (N,) are above 0; masked, they become 0."""
+    pose = texels.pose_float32(R_cam_from_map, center_map)
+    for n in range(len(points)):
+        if weights[n] <= F0:
+            continue
+        x, y, z = texels.in_camera(points[n, 0], points[n, 1], points[n, 2], pose)
+        k, fu, fv = texels.locate_texel(x, y, z, np.sqrt(x * x + y * y), width)
+        below = k + width + 2
+        t00, t10, t01, t11 = image[k], image[k + 1], image[below], image[below + 1]
+        weights[n] *= texels.is_valid(t00, t10, t01, t11)
+        blended = texels.bilinear_weights(fu, fv)
+        for c in range(3):
+            colors[n, c] = min(texels.blend(t00, t10, t01, t11, blended, 8 * c) * gains[c], FULL)
+
+
+@kernel
+def find_medians(colors: Array32, weights: Array32, medians: Bytes, counts: Bytes) -> None:
+    """Write weighted medians (N, 3) of colours (K, N, 3), and how many weights (K, N) are above 0 (N,)."""
+    num = len(weights)
+    values = np.empty(num, np.float32)
+    loads = np.empty(num, np.float32)
+    for n in range(weights.shape[1]):
+        count = 0
+        for k in range(num):
+            count += weights[k, n] > F0
+        counts[n] = min(count, MOST_PHOTOS)
+        for c in range(3):
+            total = F0
+            filled = 0
+            for k in range(num):
+                if weights[k, n] <= F0:
+                    continue
+                at = filled
+                while at > 0 and values[at - 1] > colors[k, n, c]:
+                    values[at] = values[at - 1]
+                    loads[at] = loads[at - 1]
+                    at -= 1
+                values[at] = colors[k, n, c]
+                loads[at] = weights[k, n]
+                total += weights[k, n]
+                filled += 1
+            at = 0
+            below = loads[0] if filled else F0
+            while below < HALF * total:
+                at += 1
+                below += loads[at]
+            medians[n, c] = np.uint8(values[at] + HALF) if filled else np.uint8(0)
 
 
 class Colored(NamedTuple):

@@ -14,8 +14,8 @@ LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
 MIN_CONFIDENCE = 0.9
-# what a photo is compared with: the scan's shape or its coloured views, and beside these its local features
-# with those of the map or of the scan drawn at the pose
+# the scan's shape; its coloured views; these, and local features of the map; these, and local features of the
+# scan drawn at the pose
 EvidenceKind = Literal["shape", "views", "map features", "drawn scan"]
 
 
@@ -26,7 +26,7 @@ class Standing(NamedTuple):
     score: float  # [0, 1] what the photo's blocks explain beyond chance
     num_matches: int | None  # local features that agree with it; None of whole views alone
     evidence: EvidenceKind
-    log_prior: float = 0.0  # logarithm of what is known beforehand: less of what contradicts the user
+    log_prior: float = 0.0  # log odds by what is known beforehand: lower where the pose contradicts it
 
 
 class ChoiceModel(NamedTuple):
@@ -41,7 +41,7 @@ MOST_STD = 0.3  # [m] and those above this
 LEAST_SCORE = 0.02
 LEAST_RATIO = 0.1
 MOST_RATIO = 1.2
-CONTRADICTED = 0.01  # odds of what the user says to be wrong
+CONTRADICTED = 0.01  # odds that what the user says is wrong
 NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
@@ -87,8 +87,8 @@ def posterior(
 
     `std` is the largest deviation [m] of the best pose, `std_of_fit` that with an exact focal length (as
     `std` by default). The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees.
-    Calibrated for queries of which half were taken in the scan. None is more likely if the best pose's
-    deviation makes 0.1 m doubtful.
+    Calibrated for queries of which half were taken in the scan. That no pose is right is more likely if the
+    best pose's deviation makes 0.1 m doubtful.
     """
     model = model or MODELS[standings[0].evidence]
     logits = [log_odds(standing, model) for standing in standings]

@@ -6,8 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-SLIPS = 0.02  # chosen: of given focal lengths, those that are wrong
-SLIP = 0.1  # chosen: deviation of the logarithm of a wrong one
+WRONG_SHARE = 0.02  # chosen: of given focal lengths, those that are wrong
+WRONG_DEVIATION = 0.1  # chosen: deviation of the logarithm of a wrong one
 MOST_LOG = 20.0  # of odds
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
 LEAST_PHOTOS = 3  # that make a consensus
@@ -29,12 +29,12 @@ class Opinion(NamedTuple):
     def doubt(self, prior_deviation: float) -> float:
         """Return the probability that the focal length given is wrong.
 
-        Some are: of another picture, a crop, a slip. Then they are off by a tenth; else by no more than the
-        variance of the difference says. Both are normal distributions of the logarithm.
+        Some belong to another picture or a crop, or are typing errors: then off with a deviation of a tenth,
+        else as the variances say. Both are normal distributions of the logarithm.
         """
         spread = self.variance + prior_deviation**2
-        wide = spread + SLIP**2
-        odds = SLIPS / (1.0 - SLIPS) * math.sqrt(spread / wide)
+        wide = spread + WRONG_DEVIATION**2
+        odds = WRONG_SHARE / (1.0 - WRONG_SHARE) * math.sqrt(spread / wide)
         odds *= math.exp(min(0.5 * self.off**2 * (1.0 / spread - 1.0 / wide), MOST_LOG))
         return odds / (1.0 + odds)
 

@@ -48,7 +48,7 @@ class FocalLength:
     given_std_px: float
     picture_px: float | None = None  # by the photo and the scan alone; None if they tell nothing
     picture_std_px: float | None = None
-    doubt: float = 0.0  # probability that it rests on what was given, and that this is wrong
+    doubt: float = 0.0  # probability that what was given is wrong and has pulled this along
     source: str = ""  # of what was given: the option, or EXIF
     others_px: float | None = None  # by other photos of the camera, where that was taken for the one given
     others_std_px: float | None = None
@@ -66,8 +66,8 @@ class FocalLength:
         off = math.log(self.picture_px / self.given_px)
         return Opinion(off, (self.picture_std_px / self.picture_px) ** 2)
 
-    def after(self, found: "FocalLength | None") -> "FocalLength":
-        """Return what was found with what others say, beside what was given and what the photo said alone."""
+    def update(self, found: "FocalLength | None") -> "FocalLength":
+        """Return this with what a later fit found; what was given and what the photo said alone stay."""
         return self if found is None else replace(self, px=found.px, std_px=found.std_px, doubt=found.doubt)
 
 
@@ -78,12 +78,12 @@ class Localization:
     status: str = NOT_LOCALIZED
     confidence: float = 0.0  # probability of the best pose
     probability_none: float | None = 1.0  # that no pose listed is right; of the preset paper unknown
-    pose: Pose | None = None  # None if there was no start, and then all that follows
+    pose: Pose | None = None  # None, as are loss to covariance, if nothing was searched
     loss: float | None = None
     evidence: Evidence | None = None
     alternatives: tuple[Alternative, ...] = ()  # poses elsewhere, best first
     covariance: PoseCovariance | None = None
-    warnings: tuple[str, ...] = ()  # one line each: why there is no pose
+    warnings: tuple[str, ...] = ()  # one line each: why there is no pose, or to doubt it
     cameras: tuple[Mount, ...] = ()  # of a photo whose focal length was fitted: the camera found
     focal_length: FocalLength | None = None  # of such a photo
     scan: str | None = None  # as of Alternative

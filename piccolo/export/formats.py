@@ -1,4 +1,4 @@
-"""Poses as text: tables, trajectories, Potree, COLMAP, nerfstudio, OpenSfM, points and tracks on maps.
+"""Poses as tables, trajectories, Potree, COLMAP, nerfstudio, OpenSfM, points and tracks on maps, in JPEGs.
 
 Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
 written beside it: <name>.offset.txt.
@@ -16,12 +16,16 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..errors import InputError, printable
-from ..files.atomic import is_stream, replacing_folder, write_atomically
+from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
+from ..files.json_file import read_bytes
 from ..geometry import rotations
 from ..geometry.pose import Pose, log_so3, quaternion_wxyz
 from ..geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM, OPTICAL_FROM_CAM, turn_axes
 from ..optional import import_optional
-from .posed_images import NO_UTF8, Format, Options, PosedImage
+from ..panorama.gpano import with_pose
+from ..panorama.picture import WANTED
+from ..result import Result
+from .posed_images import NO_UTF8, Format, LeftOut, Options, PosedImage, select_images
 
 COLUMNS = (
     *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
@@ -305,6 +309,23 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
     return {"type": "Feature", "geometry": point, "properties": properties}
 
 
+def write_gpano(images: Sequence[PosedImage], out: Path, options: Options) -> None:
+    """Write a copy of each picture into a new folder, under its name in `images` or its file name."""
+    names = [image.name if options.images else Path(image.name).name for image in images]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{twice}: two pictures have this name; use `images` FOLDER to distinguish them")
+    with replacing_folder(out) as folder:
+        for name, image in zip(names, images, strict=True):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            write_atomically(folder / name, _copy(image))
+
+
+def _copy(image: PosedImage) -> bytes:
+    """Return the picture's file with its pose."""
+    return with_pose(image.path, read_bytes(image.path, WANTED), rotations.heading_pitch_roll_deg(image.pose))
+
+
 OFFSET = frozenset({"offset"})
 MODEL = OFFSET | {"size"}
 COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; `out` is a new folder"
@@ -327,3 +348,22 @@ GEOJSON_TEXT = "points for maps, in WGS84; needs `crs` and the library pyproj"
 GEOJSON = Format("geojson", GEOJSON_TEXT, write_geojson, frozenset({"crs"}), has_unique_names=False)
 GPX_TEXT = "track of the positions in WGS84; needs `crs` and the library pyproj"
 GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")
+GPANO_TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; `out` is a new folder"
+GPANO = Format("gpano", GPANO_TEXT, write_gpano, is_folder=True, forbidden="", cameras="spheres", check=_copy)
+_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, GPX, POTREE, GPANO
+FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
+
+
+def export(results: Sequence[Result], name: str, out: Path, options: Options) -> LeftOut:
+    """Write the poses of `results`, which all have one, to `out` in the format `name`, whole or not at all.
+
+    Returns the pictures that are left out, by why: the format can't hold them, or they can't be read.
+    Raises InputError if no pose is left, or `out` can't be written.
+    """
+    form = FORMATS[name]
+    (check_output_folder if form.is_folder else check_output)(out)
+    if not results:
+        raise InputError(f"{out}: there is no pose to write; `all` also writes those that are not localized")
+    images, left_out = select_images(results, form, options)
+    form.write(images, out, options)
+    return left_out

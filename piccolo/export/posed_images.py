@@ -16,7 +16,7 @@ from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, unreadable
 from ..geometry.pose import Pose
 from ..panorama import panorama_size
-from ..panorama.gpano import ASPECT_TOLERANCE
+from ..panorama.gpano import check_size
 from ..result import Result
 from ..scene import Scene
 
@@ -48,7 +48,6 @@ class Options:
     crs: str | None = None  # of the cloud's coordinates, such as EPSG:25832
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing, naming the option."""
         if self.size is not None:
             check_size("`size`", self.size)
         if self.offset is not None and not all(math.isfinite(value) for value in self.offset):
@@ -67,13 +66,6 @@ class Format(NamedTuple):
     forbidden: str = NO_UTF8  # regular expression of what a name can't have in it; empty for anything
     check: Callable[[PosedImage], object] | None = None  # raises InputError for a picture that it can't hold
     cameras: Literal["any", "own", "spheres"] = "any"  # of photos: no matter, an image each, or not at all
-
-
-def check_size(label: str, size: tuple[int, int]) -> None:
-    """Refuse the size of a picture that is no full sphere."""
-    width, height = size
-    if min(size) < 1 or abs(width - 2 * height) > ASPECT_TOLERANCE * 2 * height:
-        raise InputError(f"{label}: found {width} x {height}, wanted width = 2 x height (a full sphere)")
 
 
 class Selection(NamedTuple):

@@ -80,10 +80,7 @@ class ArrayArchive:
                 check_memory(self.status.st_size, file.name, "keep it in the cache")
                 self.content = mmap.mmap(-1, self.status.st_size)
                 file.seek(0)
-                with memoryview(self.content) as whole:
-                    done = 0
-                    while count := file.readinto(whole[done:]):
-                        done += count
+                file.readinto(self.content)
         size = sum(info.file_size for info in infos)
         if size > len(self.content) or len(self.members) != len(infos):
             raise ValueError(f"arrays of {size} bytes")

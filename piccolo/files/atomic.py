@@ -1,12 +1,17 @@
-"""Files that are either whole or not there, and what else a path of the user's may lead to."""
+"""Files that are either whole or not there, and what else a path of the user's may lead to.
+
+A later process removes temporary folders where a killed one left them.
+"""
 
 import errno
+import fcntl
 import os
 import secrets
 import shutil
 import stat
 import sys
 import tempfile
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -16,6 +21,8 @@ from ..errors import InputError
 
 STDOUT = Path("-")
 WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}  # that name no file
+PREFIX = "piccolo-temporary-"
+YOUNG_S = 10.0  # a folder is made a moment before it is locked
 
 
 def is_stdout(path: Path) -> bool:
@@ -112,7 +119,9 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
                 yield file
                 file.flush()
                 if old:
-                    _keep_owner(handle, old)
+                    with suppress(PermissionError):  # where that is not allowed
+                        os.fchown(handle, old.st_uid, old.st_gid)
+                    os.fchmod(handle, mode)
                 # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
                 # no room, and after a power cut the new name might stand for an empty file.
                 os.fsync(handle)
@@ -120,13 +129,6 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     except BaseException:
         temporary.unlink(missing_ok=True)
         raise
-
-
-def _keep_owner(handle: int, old: os.stat_result) -> None:
-    """Give an open file the owner, where that is allowed, and the mode of the one that it replaces."""
-    with suppress(PermissionError):
-        os.fchown(handle, old.st_uid, old.st_gid)
-    os.fchmod(handle, stat.S_IMODE(old.st_mode))
 
 
 def _write_stream(path: Path, file: IO[bytes]) -> None:
@@ -161,10 +163,7 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
-    """Yield a temporary folder beside `path`, which is new or empty; it is renamed to `path` at the end.
-
-    Nobody sees it half full, and after an error nothing is left.
-    """
+    """Yield a folder that becomes `path`, new or empty, at the end; after an error nothing is left."""
     target = _target_of(path)
     temporary = _temporary_beside(target)
     try:
@@ -184,3 +183,27 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Write `content` to `path`, whole or not at all."""
     with replacing(path) as file:
         file.write(content)
+
+
+@contextmanager
+def temporary_folder() -> Iterator[Path]:
+    """Make a folder that is removed at the end, or else by the next process that makes one."""
+    for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}????????"):
+        with suppress(OSError):  # it is in use, or not ours
+            status = left.lstat()
+            if status.st_uid == os.getuid() and time.time() - status.st_mtime > YOUNG_S:
+                with _hold_lock(left):
+                    shutil.rmtree(left)
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as name, _hold_lock(Path(name)):
+        yield Path(name)
+
+
+@contextmanager
+def _hold_lock(folder: Path) -> Iterator[None]:
+    """Hold a folder's lock, which ends with the process; OSError if another has it."""
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(handle)

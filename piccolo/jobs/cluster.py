@@ -19,8 +19,7 @@ from urllib.parse import urlsplit
 from .. import __version__
 from ..errors import InputError
 from ..optional import import_optional
-from .processes import IN_FLIGHT, LIBRARIES
-from .tasks import Function, InFlight, Opening, WorkerLostError
+from .processes import IN_FLIGHT, LIBRARIES, Function, InFlight, Opening, WorkerLostError
 
 LOCAL = "local"
 HOST = "127.0.0.1"  # of the scheduler and workers of "local"

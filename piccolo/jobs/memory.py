@@ -1,5 +1,9 @@
-"""Memory that may still be taken, asked before much is: a refusal in one line, not the kernel's kill."""
+"""Memory that may still be taken, asked before much is: a refusal in one line, not the kernel's kill.
 
+This imports no library, as `share_arenas` comes before these are.
+"""
+
+import ctypes
 import os
 import resource
 from collections.abc import Iterator
@@ -15,8 +19,8 @@ V2 = ("", "memory.max", "memory.current", "inactive_file")
 V1 = ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
 OPENCV_NO_MEMORY = -4  # `code` of a cv2.error
 LEAST_LEFT = 200e6  # [byte] of address space: with less, Python may abort where it should raise
-
-
+M_ARENA_MAX = -8  # of glibc's mallopt(3)
+MOST_ARENAS = 2  # each keeps what was freed in it
 LIMIT: list[float] = []  # [byte] of this process, if the user sets one
 
 
@@ -114,3 +118,14 @@ def _text(path: Path) -> str:
         return path.read_text()
     except OSError:
         return ""
+
+
+def share_arenas() -> None:
+    """Let all threads share two of glibc's arenas: a process of four keeps some 50 MB less.
+
+    Unless MALLOC_ARENA_MAX or GLIBC_TUNABLES in the environment say how many. Other C libraries have none.
+    """
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    is_told = "MALLOC_ARENA_MAX" in os.environ or "arena_max" in os.environ.get("GLIBC_TUNABLES", "")
+    if mallopt is not None and not is_told:
+        mallopt(M_ARENA_MAX, MOST_ARENAS)

@@ -1,4 +1,8 @@
-"""Serial kernels on several threads: whole items are spread, and results come back in the items' order."""
+"""Serial kernels on several threads: whole items are spread, and results come back in the items' order.
+
+BLAS has one thread meanwhile: those of OpenBLAS spin for tens of milliseconds after each product, on the
+cores that the next kernels want.
+"""
 
 import os
 import threading
@@ -7,8 +11,10 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cache, partial
 from typing import Any, Generic, TypeVar
+
+from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from ..errors import InputError
 from .memory import check_address_space
@@ -86,7 +92,6 @@ class Workers:
     warn: Callable[[str], None] = ignore_warning  # of what should be known before the work is done
 
     def __post_init__(self) -> None:
-        """Refuse a count that means nothing."""
         if not 1 <= self.num_threads <= MAX_THREADS:
             raise InputError(f"`num_threads`: found {self.num_threads}, wanted 1 to {MAX_THREADS}")
 
@@ -168,3 +173,24 @@ class Stopwatch:
         begin = time.perf_counter()
         yield
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+_blas = cache(lambda: ThreadpoolController().select(user_api="blas"))  # that NumPy has loaded
+_limiting = threading.Lock()
+_limiters: list[Any] = []  # of the threads of BLAS, for each of those within `one_blas_thread`
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Within this, BLAS has one thread; several threads may be within at once."""
+    with _limiting:
+        _limiters.append(_limiters[0] if _limiters else _blas().limit(limits=1))
+    try:
+        yield
+    finally:
+        with _limiting:
+            limiter = _limiters.pop()
+            if not _limiters:
+                OpenBLASController.clear_controlling_thread(force=True)  # another thread may have come first
+                limiter.restore_original_limits()
+                OpenBLASController.clear_controlling_thread()

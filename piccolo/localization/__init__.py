@@ -1,1 +1,14 @@
-"""The default method: it localizes a panorama in a prepared scan."""
+"""The default method: it localizes a panorama in a prepared scan.
+
+A photo's way from its file to a result:
+1. `opened_scan.OpenedScan.localize` reads it (`panorama.read_panorama`) and asks for its GPS position;
+2. `localize.localize` prepares its images and the part of the map that the prior allows (`query`, `photo`);
+3. `attempts.plan_attempts` lists the searches: a brief one by views, local features, all views;
+4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`),
+   until one is sure (`selection.is_sure`, `is_clear`);
+5. `last_descent.refine_best` refines the best poses to the end and selects among them (`selection.select`);
+6. `focal_length.calibrate` fits the focal length of a photo of one camera;
+7. `judge.judge` measures the best pose, its covariance (`covariance`) and its probability, and decides;
+8. `result.with_localization` makes the result in the world, which a command writes.
+Photos that help each other begin with the same steps: see `judge`.
+"""

@@ -46,7 +46,7 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
     A first look by whole views may settle a whole upright sphere. Then come poses from feature matches,
     first of a part of the views, then of all, and at last searches by whole views: with gravity `auto` as
     known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly taken
-    about level: unless their tilt is known exactly, this is what is searched as known.
+    about level: with a tilt that is not known exactly, "known" searches about level.
     """
     method = query.method
     looks_first = method.uses_features and method.uses_search and is_whole(query)
@@ -80,10 +80,9 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses
 
 def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Search the few rotations of a photo whose lines lie along walls; True if one pose alone is clear."""
-    with watch.stage("search"):
-        starts = search_poses(query, "known")
+    refined = search_and_refine(query, "known", FIRST_BEAM, watch)
     with watch.stage("refine"):
-        found = known + refine_starts(query, starts, FIRST_BEAM)
+        found = known + refined
         return found, is_clear(query, found)
 
 
@@ -116,12 +115,18 @@ def search_views(
 ) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
     asked = thin_query(query) if is_brief else query
-    with watch.stage("search"):
-        starts = search_poses(asked, tilts)
+    refined = search_and_refine(asked, tilts, FIRST_BEAM if is_brief else query.method.beam, watch)
     with watch.stage("refine"):
-        found = refine_starts(asked, starts, FIRST_BEAM if is_brief else query.method.beam)
-        found = known + add_verified(query, found)
+        found = known + add_verified(query, refined)
         return found, is_sure(query, found)
+
+
+def search_and_refine(query: Query, tilts: Tilts, beam: Beam, watch: Stopwatch) -> list[Hypothesis]:
+    """Search by whole views, and refine the starts to a few poses."""
+    with watch.stage("search"):
+        starts = search_poses(query, tilts)
+    with watch.stage("refine"):
+        return refine_starts(query, starts, beam)
 
 
 def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
@@ -142,10 +147,7 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
         return []
     settings = replace(query.settings, prior=NOTHING_KNOWN)
     anywhere = brief_query(replace(query, scan_map=scan_map, settings=settings))
-    with watch.stage("search"):
-        starts = search_poses(anywhere, "known")
-    with watch.stage("refine"):
-        return refine_starts(anywhere, starts, FIRST_BEAM)
+    return search_and_refine(anywhere, "known", FIRST_BEAM, watch)
 
 
 def match_poses(query: Query) -> list[Pose]:

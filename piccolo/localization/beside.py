@@ -12,12 +12,12 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
+from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, skew
 from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
@@ -35,7 +35,7 @@ from .settings import CoarseToFineSettings
 from .verification import Located, match_beside, place_keypoints
 
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
-MOST_BESIDE = 3  # photos that a photo is compared with, those with the most matches
+MOST_BESIDE = 3  # photos whose matches count, those with the most
 
 
 class SurePhoto(NamedTuple):
@@ -55,27 +55,20 @@ class Neighbor(NamedTuple):
     pose: Pose  # of the other, by the matches
 
 
-@one_blas_thread
-def locate(
-    scan_map: ScanMap,
-    panorama: Panorama,
-    found: Localization,
-    settings: CoarseToFineSettings,
-    workers: Workers,
+@one_blas_thread()
+def place_sure(
+    query: Query, pose_world: Pose, covariance: PoseCovariance | None, confidence: float
 ) -> SurePhoto:
     """Return the keypoints of a photo that is localized, and its pose with its errors."""
-    if found.pose is None:
-        raise ValueError("a photo without a pose")
-    query = prepare_query(panorama, scan_map, settings, workers)
-    pose = scan_map.from_world(found.pose)
+    pose = query.scan_map.from_world(pose_world)
     gaussian = None
-    if found.covariance is not None:
-        in_map = turn_positions(found.covariance.matrix, scan_map.R_map_from_world)
+    if covariance is not None:
+        in_map = turn_positions(covariance.matrix, query.scan_map.R_map_from_world)
         gaussian = split_errors(query, pose, in_map)
-    return SurePhoto(place_keypoints(query, pose), found.confidence, gaussian)
+    return SurePhoto(place_keypoints(query, pose), confidence, gaussian)
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize_beside(
     scan_map: ScanMap,
     panorama: Panorama,

@@ -19,11 +19,11 @@ from ..confidence.focal_length import MOST_CONFLICT, Consensus
 from ..confidence.localization import Localization
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (
+    NUM_ROUNDS,
     Adjusted,
     Bundle,
     Estimate,
@@ -70,7 +70,7 @@ class Agreed(NamedTuple):
     warnings: tuple[str, ...]
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize_bundle(
     scan_map: ScanMap,
     panoramas: Sequence[Panorama],
@@ -94,9 +94,8 @@ def localize_bundle(
             return query
         search = find_by_edges if query.evidence == "shape" else find
         query, selection, fit = search(query, scan_map, watch)
-        judged = judge(query, selection, fit, may_change=False)
-        if judged.pose is not None:
-            members[k] = Member(query.forget(), selection, fit, judged, cams_from_bundle[k])
+        judged = judge(query, selection, fit, may_promote=False)
+        members[k] = Member(query.forget(), selection, fit, judged, cams_from_bundle[k])
         return judged
 
     alone = [localize_alone(k, panorama) for k, panorama in enumerate(panoramas)]
@@ -166,7 +165,8 @@ def agree(
 ) -> Agreed | str:
     """Adjust the bundle to the photos whose own poses agree with it; a text says why it is not believed.
 
-    What the user says is doubted by the photos' own errors. Then these are larger by those of local optima.
+    The errors of the relative poses are estimated from the photos' own poses. Then own poses get the errors
+    of local optima too, as far as they may be such.
     """
     own = {
         k: Estimate(support.gaussian, members[k].cam_from_bundle)
@@ -187,11 +187,8 @@ def agree(
     if abs(log_scale) > MOST_CONFLICT * math.hypot(std, errors.log_scale):
         return f"`relative_poses`: positions are {describe_scale(log_scale)}; each photo is judged by itself"
     excess = max(log_scale**2 - std**2 - errors.log_scale**2, 0.0)
-    blurred = {
-        k: Estimate(estimate.own.blur(supports[k].local_share * LOCAL_ERRORS), estimate.cam_from_bundle)
-        for k, estimate in own.items()
-    }
     errors = errors._replace(log_scale=math.hypot(errors.log_scale, math.sqrt(excess)))
+    blurred = blur_local(bundle, own, {k: supports[k].local_share for k in own}, errors)
     adjusted = adjust(bundle, list(blurred.values()), errors)
     warnings = []
     if abs(adjusted.bundle.log_scale) > TOLD * expected.log_scale:
@@ -201,6 +198,27 @@ def agree(
         warnings.append(f"`relative_poses`: they are off by about {text} each")
     apart = (every - frozenset(own)) & frozenset(sure)
     return Agreed(adjusted, errors, blurred, apart, tuple(warnings))
+
+
+def blur_local(
+    bundle: Bundle, own: dict[int, Estimate], local_shares: dict[int, float], errors: RelativeErrors
+) -> dict[int, Estimate]:
+    """Give own poses the errors of local optima, as far as they may be such by themselves and by the others.
+
+    Both are found in turn (expectation maximization): a pose that is where the others expect it is none.
+    """
+    shares = local_shares
+    for _ in range(NUM_ROUNDS):
+        blurred = {
+            k: Estimate(one.own.blur(shares[k] * LOCAL_ERRORS), one.cam_from_bundle) for k, one in own.items()
+        }
+        shares = {}
+        for k, (found, cam_from_bundle) in own.items():
+            rest = [one for n, one in blurred.items() if n != k]
+            expected = adjust(bundle, rest, errors).predict(cam_from_bundle, errors)
+            odds = (1.0 - local_shares[k]) * (compare_errors(expected, found) if rest else 1.0)
+            shares[k] = local_shares[k] / (local_shares[k] + odds)
+    return blurred
 
 
 def describe_scale(log_scale: float) -> str:
@@ -229,7 +247,7 @@ def judge_member(
 
     `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
     """
-    if member.alone.is_ruled_out:
+    if member.alone.is_ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
     right, missed, *_ = support.shares
     if right + missed < EVEN or number in agreed.apart:
@@ -267,9 +285,9 @@ def judge_member(
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
-    """Return how much likelier a photo's own pose is that far from the one expected if it is right.
+    """Return the likelihood ratio of a photo's own pose, as far as it is from the one expected.
 
-    If it is not, it has the errors of a local optimum of the loss too.
+    It is right, or a local optimum of the loss near the right one, which has further errors.
     """
     step = subtract(own.pose, expected.pose)
     right = expected.own + own.own

@@ -119,7 +119,7 @@ def sum_squares(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeE
 
 
 def count_freedom(num_photos: int) -> Array:
-    """Return how many rotations and positions (2,) of photos are more than a pose and a scale take."""
+    """Return the degrees of freedom (2,) of rotations and positions that a pose and a scale leave."""
     return np.asarray(np.maximum(3.0 * num_photos - np.array([3.0, 4.0]), 0.0))
 
 
@@ -134,7 +134,7 @@ def find_limit(freedom: float) -> float:
 def estimate_errors(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> RelativeErrors:
     """Return the errors of relative poses, larger than expected where the photos' own poses say so.
 
-    A variance that few photos tell is larger than their squares (the mean of Student's t).
+    From few photos a variance is taken larger: chi square / (freedom - 2), as by Student's t.
     """
     freedom = count_freedom(len(estimates))
     for _ in range(NUM_ROUNDS):
@@ -150,7 +150,7 @@ def estimate_errors(bundle: Bundle, estimates: Sequence[Estimate], errors: Relat
 
 
 def find_contradicting(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> int | None:
-    """Return the photo without which the others fit much better, if they do not fit: an F test.
+    """Return the photo that contradicts the others, by an F test.
 
     None if all fit, or no single photo is to blame.
     """

@@ -11,13 +11,14 @@ import numpy as np
 from ..arrays import Array
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CONTRADICTED, posterior
+from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .comparison import compare, score_pose
-from .covariance import estimate_covariance
+from .covariance import Errors, estimate_covariance
 from .focal_length import FocalFit
 from .ladder import FINE, refine
 from .last_descent import HOPELESS_SCORE
@@ -47,9 +48,16 @@ class Member:
     cam_from_bundle: Pose
 
     @property
+    def is_misplaced(self) -> bool:
+        """True if it is ruled out for another focal length than other photos tell: so its place is wrong."""
+        prior = self.query.given.focal_prior
+        has_conflict = self.fit is not None and self.fit.conflict > MOST_CONFLICT
+        return has_conflict and prior is not None and prior.is_measured
+
+    @property
     def own_poses(self) -> list[tuple[Hypothesis, float]]:
         """Poses in the map with their probabilities, best first; none if the best one is ruled out."""
-        if self.alone.is_ruled_out:
+        if self.alone.pose is None or self.alone.is_ruled_out:
             return []
         hypotheses = [self.selection.best, *self.selection.alternatives]
         own = [self.alone.confidence, *(a.probability or 0.0 for a in self.alone.alternatives)]
@@ -68,10 +76,10 @@ class Support(NamedTuple):
 
     @property
     def weights(self) -> Array:
-        """Odds (4,) that the own pose is right, that the photo misses its own, and that it does not belong.
+        """Odds (4,): own pose right; own pose missed; photo outside of the scan; photo at its other poses.
 
-        The last are of no place in the scan, and of another pose of the photo. The odds of a photo alone are
-        those of the best of all places; if the others say which place it is, they are as many times larger.
+        A photo alone has the odds of the best of all places. Once the others say which place it is, they are
+        `num_places` times larger.
         """
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
@@ -168,19 +176,16 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     found = own or max(list_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
-    gaussian = member.alone.gaussian
-    std_of_fit = member.alone.std_of_fit
+    errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
         errors = estimate_covariance(query, found.pose, compare(query, found.pose))
-        gaussian, std_of_fit = errors or (None, None)
-        if gaussian is not None and member.fit is not None:
-            gaussian = gaussian.widen(member.fit.pose_covariance)
-    p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(gaussian), std_of_fit)
+        errors = errors.widen(member.fit.pose_covariance) if member.fit else errors
+    p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(errors.gaussian), errors.std_of_fit)
     k = next(k for k, h in enumerate(poses) if h is found)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
     num_places = len(query.scan_map.sparse)
-    return Support(found, gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places)
+    return Support(found, errors.gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places)
 
 
 def list_near(query: Query, expected: Pose) -> list[Hypothesis]:
@@ -196,10 +201,9 @@ def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
     The photos are independent evidence. A third of them may show nothing, or not belong to the others. If
-    more have missed a pose, these count as one: bare walls and changed places lie together. Photos that have
-    found the same pose of the bundle are more than chance, if they are more than chance would give among all
-    poses that were proposed. If the relative poses are wrong, each photo may have any of its own poses; that
-    counts as none.
+    more have missed a pose, these count as one: bare walls and changed places lie together. That photos have
+    found one pose of the bundle counts only beyond what chance gives among all that were proposed. If the
+    relative poses are wrong, each photo may have any of its own poses; that counts as none.
     """
     num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []

@@ -38,16 +38,25 @@ ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common
 SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
 # normals (9, 3), in the camera's frame, of planes between halves: the seam of two lenses may have any azimuth
 NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.0, 0.0, 1.0)])
-MOST_SCORE = 3.0  # of halves, 1 in the mean; of photos without a seam one in four has more, by nine planes
+MOST_SCORE = (
+    3.0  # of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
+)
 NUM_TRIED = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
 
 class Errors(NamedTuple):
-    """The errors of a pose that is found."""
+    """The errors of a pose that is found; None where the points do not fix it."""
 
-    gaussian: PoseGaussian  # the pose in the map with its covariance
-    std_of_fit: float  # [m] largest deviation if focal length and stitching were exact
+    gaussian: PoseGaussian | None  # the pose in the map with its covariance
+    std_of_fit: float | None  # [m] largest deviation if focal length and stitching were exact
+
+    def widen(self, common: Array) -> "Errors":
+        """Return these with a further error (6, 6) that photos have in common, as of a focal length."""
+        return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
+
+
+UNKNOWN_ERRORS = Errors(None, None)
 
 
 class DifferenceSteps(NamedTuple):
@@ -174,7 +183,7 @@ def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
 
 
 def few_blocks_factor(num_blocks: int) -> float:
-    """Return the factor by which errors weighed by a covariance of so many blocks are right in the mean.
+    """Return the factor by which a covariance that is estimated from few blocks is too small in the mean.
 
     It is that of the mean of the inverse of a Wishart matrix in six dimensions.
     """
@@ -221,8 +230,8 @@ def score_halves(sums: Array, is_ahead: Mask) -> Array:
 def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
     """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
 
-    It is in the images from coarse to fine or in the finest alone, whichever ends lower: that one does not
-    lead back over degrees, and in flat places a coarse one leads astray.
+    It descends in the images from coarse to fine, and in the finest alone; the lower end counts. The finest
+    alone can't correct degrees, and a coarse one misleads in flat places.
     """
     ends = []
     for way in (images, images[-1:]):
@@ -295,7 +304,7 @@ def photo_covariance(turn: float, median_range: float) -> Array:
 def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
-    These are correlated over many blocks: its noise and doubled surfaces, by `surface_noise`; of shape alone,
+    These are correlated over many blocks: its noise and doubled surfaces (`surface_variance`); of shape alone
     those of its edges.
     """
     surface = scan_map.surface_variance
@@ -315,10 +324,8 @@ def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
 
-def estimate_covariance(
-    query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None
-) -> Errors | None:
-    """Estimate the covariance of a pose in the map; None where the points do not fix it.
+def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:
+    """Estimate the covariance of a pose in the map.
 
     Photos have the errors of the scan in common, and of a scan without colours all errors: edges lie beside
     those of the photos in the same way. `seen` is the comparison at the pose, `seen_from` a pose so near that
@@ -335,7 +342,7 @@ def estimate_covariance(
     shown = query if leaves_out else masked
     covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
-        return None
+        return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
     median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
     prior = query.given.focal_prior

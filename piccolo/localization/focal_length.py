@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import Array, Array32, Mask
 from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
-from ..confidence.focal_length import MOST_CONFLICT, SLIPS, Opinion
+from ..confidence.focal_length import MOST_CONFLICT, WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
@@ -77,7 +77,7 @@ class FocalFit(NamedTuple):
     motion: Array  # (6, p) of a pose with it: rotation about the camera's axes [rad], centre in the map [m]
     opinion: Opinion | None  # what the picture alone says; None if it says nothing
     conflict: float  # deviations between that and what was given; 0 if it says nothing
-    doubt: float = 0.0  # probability that it rests on what was given, and that this is wrong
+    doubt: float = 0.0  # as of FocalLength
 
     @property
     def deviation(self) -> float:
@@ -154,7 +154,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
     crest = crest._replace(change=middle, information=both)
     conflict = 0.0
-    doubt = SLIPS if prior.deviation <= WIDE else 0.0
+    doubt = WRONG_SHARE if prior.deviation <= WIDE else 0.0
     opinion = None
     wide = precision.copy()
     if crest.information.any():
@@ -177,9 +177,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
     """Search the crest of the profile about a pose in ever narrower designs, moved downhill if they miss it.
 
-    Of the designs that have a crest, that which tells it best counts. If none has, the picture does not
-    determine the calibration: the information is 0. If the loss still falls at the end of the range, it does
-    contradict what was given, and the crest is the end.
+    Of the designs that have a crest, the one with the least variance counts. If none has, the picture does
+    not determine the calibration: the information is 0. If the loss still falls at the end of the range, the
+    end is the crest: that contradicts what was given.
     """
     middle = np.zeros(num)
     found: Crest | None = None
@@ -302,7 +302,7 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
-    The last fit in which the picture says something of it counts.
+    The last fit to which the picture contributed counts.
     """
     query, found = follow_matches(query, found)
     fit = fit_focal(query, found.best.pose)

@@ -1,7 +1,11 @@
-"""The judge: the only maker of a status, of confidences and of what is ruled out.
+"""The judge: of the default method the only maker of a status, of confidences and of what is ruled out.
 
-A photo alone is judged by its evidence. Photos that help each other, guesses of a focal length, and walks
-hand over probabilities and a pose with its errors; they never make a status.
+Every status is made in `decide`. A photo alone comes here with its evidence (`judge`). Photos that help each
+other never make a status; each way for them hands over probabilities, and a pose with its errors:
+- `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`; a new way does this;
+- `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
+- `batch.second_look`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
+- `walk.results`: the probabilities of a frame's places along the path, to `decide`.
 """
 
 import math
@@ -32,7 +36,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .beam import refine_matches
 from .comparison import compare
-from .covariance import estimate_covariance
+from .covariance import Errors, estimate_covariance
 from .focal_length import FocalFit, fit_focal
 from .ladder import settle
 from .prior import contradictions
@@ -51,18 +55,17 @@ class Measured(NamedTuple):
     """Measurements of the best pose."""
 
     pose: Pose  # in the map
-    gaussian: PoseGaussian | None  # with its covariance; None where the points do not fix it
-    std_of_fit: float | None  # [m] largest deviation if focal length and stitching were exact
+    errors: Errors
     loss: float
     evidence: Evidence
 
 
 def judge(
-    query: Query, found: Selection, fit: FocalFit | None = None, may_change: bool = True
+    query: Query, found: Selection, fit: FocalFit | None = None, may_promote: bool = True
 ) -> Localization:
     """Return the result for the best pose of a photo by itself.
 
-    `fit` is the fitted focal length, if the photo's is not exact. If `may_change`, a copy of the best pose's
+    `fit` is the fitted focal length, if the photo's is not exact. If `may_promote`, a copy of the best pose's
     place that turns out likelier becomes the best.
     """
     measured = measure(query, found, fit)
@@ -71,12 +74,12 @@ def judge(
     reported = found.alternatives[:MAX_ALTERNATIVES]
     is_copy = list_copies(query, found.best, reported)
     standings = credit_copies(assess_poses(query, found.best, reported), is_copy)
-    probabilities = posterior(standings, std_of(measured.gaussian), measured.std_of_fit)
+    probabilities = posterior(standings, std_of(measured.errors.gaussian), measured.errors.std_of_fit)
     likeliest = int(probabilities[:-1].argmax())
-    if likeliest and is_copy[likeliest] and may_change:
+    if likeliest and is_copy[likeliest] and may_promote:
         found = promote(query, found, reported[likeliest - 1])
         fit = fit and fit_focal(query, found.best.pose, is_first=False)
-        return judge(query, found, fit, may_change=False)
+        return judge(query, found, fit, may_promote=False)
     return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
 
 
@@ -85,14 +88,14 @@ def judge_together(
 ) -> Localization:
     """Return the result of a photo whose pose is what it and others say together.
 
-    `gaussian` is that pose, in the map, and that of the best of `found`. `probabilities` (K + 1,) of the best
-    pose, the alternatives and none are those that the others give. What the photo itself rules out stays so.
+    `gaussian` is that pose in the map; `found.best` has the same pose. `probabilities` (K + 1,) are of it, of
+    each alternative and of none, by all photos together. What the photo itself rules out stays so.
     """
     measured = measure(query, found, fit)
     if measured is None:
         return Localization()
     standings = assess_poses(query, found.best, found.alternatives)
-    measured = measured._replace(gaussian=gaussian)
+    measured = measured._replace(errors=measured.errors._replace(gaussian=gaussian))
     return conclude(query, found, fit, measured, standings, probabilities)
 
 
@@ -113,7 +116,7 @@ def conclude(
     warnings = contradictions(scan_map, measured.pose, query.settings.prior)
     if classify(probabilities, least) != NOT_LOCALIZED and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
-    gaussian = measured.gaussian
+    gaussian, std_of_fit = measured.errors
     alternatives = [
         Alternative(scan_map.to_world(h.pose), h.score, s.num_matches)
         for h, s in zip(found.alternatives, standings[1:], strict=True)
@@ -129,7 +132,7 @@ def conclude(
         focal_length=None if fit is None else fit.focal_length(query.given),
         is_ruled_out=bool(warnings) or (fit is not None and fit.conflict > MOST_CONFLICT),
         gaussian=gaussian,
-        std_of_fit=measured.std_of_fit,
+        std_of_fit=std_of_fit,
         standings=tuple(standings),
     )
     decided = decide(described, probabilities, least)
@@ -214,10 +217,8 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     errors, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return None
-    gaussian, std_of_fit = errors or (None, None)
-    if gaussian is not None and fit is not None:
-        gaussian = gaussian.widen(fit.pose_covariance)
-    return Measured(pose, gaussian, std_of_fit, loss, collect_evidence(query, found, agreement, fractions))
+    errors = errors.widen(fit.pose_covariance) if fit else errors
+    return Measured(pose, errors, loss, collect_evidence(query, found, agreement, fractions))
 
 
 def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:
@@ -228,9 +229,9 @@ def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) ->
 
 
 def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:
-    """Give copies of a place all the most matches that one of them has.
+    """Give every copy of a place the greatest number of matches among the copies.
 
-    How many of a photo's features agree with the scan drawn at each tells how well each was scanned.
+    How many agree tells how well a copy was scanned, not which of them it is.
     """
     most = max((s.num_matches or 0 for s in compress(standings, is_copy)), default=0)
     pairs = zip(standings, is_copy, strict=True)

@@ -10,10 +10,9 @@ from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..panorama import Panorama
-from ..panorama.manhattan import find_axes
+from ..panorama.edges import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate
@@ -30,7 +29,9 @@ GUESSES = (
     -0.15,
     0.15,
 )  # added to the log of the focal length: one comes near enough to any that is 20 % off
-MOST_RANGE = 10.0  # [m] of what a photo shows, so far a pose moves with the logarithm of the focal length
+MOST_RANGE = (
+    10.0  # [m] distance of what a photo shows: with the log of the focal length a pose moves as many times
+)
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -42,7 +43,7 @@ class Found(NamedTuple):
     fit: FocalFit | None  # of the photo of one camera, unless the poses are hopeless
 
 
-@one_blas_thread
+@one_blas_thread()
 def localize(
     scan_map: ScanMap,
     panorama: Panorama,
@@ -143,7 +144,7 @@ def localize_guessed(
 
 
 def is_same_place(one: Localization, pose: Pose, focal: FocalLength | None) -> bool:
-    """Return True if another pose is that of a result but for what its focal length moves along the view."""
+    """Return True if a pose is a result's but for what their focal lengths move along the view."""
     if one.pose is None:
         return False
     change = math.log(focal.px / one.focal_length.px) if focal and one.focal_length else 0.0

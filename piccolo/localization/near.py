@@ -9,7 +9,7 @@ from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .comparison import Comparison, compare, compare_from
-from .covariance import estimate_covariance
+from .covariance import UNKNOWN_ERRORS, estimate_covariance
 from .ladder import FULL, NEARLY, climb_from_afar, refine, settle
 from .last_descent import HOPELESS_SCORE
 from .query import Query
@@ -38,13 +38,12 @@ def refine_near(query: Query, start: Pose) -> Near:
     if query.photo.is_partial:
         end = settle(query, end, seen)
         seen = seen if end.pose is pose else compare(query, end.pose)
-    errors = None
+    errors = UNKNOWN_ERRORS
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
         errors = estimate_covariance(query, end.pose, seen, middle if sees_same else None)
-    gaussian, std_of_fit = errors or (None, None)
-    probability = float(posterior([assess_end(query, end)], std_of(gaussian), std_of_fit)[0])
-    return Near(end.pose, seen, gaussian, probability)
+    probability = float(posterior([assess_end(query, end)], std_of(errors.gaussian), errors.std_of_fit)[0])
+    return Near(end.pose, seen, errors.gaussian, probability)
 
 
 def assess_end(query: Query, end: Hypothesis) -> Standing:

@@ -14,7 +14,7 @@ from ..scan_map.scan_map import ScanMap
 STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
 
 
-def check_options(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
+def allow_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
     """Return the candidates (N,) that each option allows, with a margin of half a grid spacing."""
     allowed: dict[str, Mask] = {}
     if prior.near is not None and prior.radius is not None:
@@ -42,7 +42,7 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
     num = len(scan_map.centers)
     if num == 0:
         return "the scan: found no place for a camera (free space 0.3 to 2.4 m above a surface, closed in)"
-    counts = [f"{name} allows {mask.sum()}" for name, mask in check_options(scan_map, prior).items()]
+    counts = [f"{name} allows {mask.sum()}" for name, mask in allow_by_option(scan_map, prior).items()]
     text = f"no position is left of the scan's {num}: {', '.join(counts)}"
     if prior.near is None:
         return text
@@ -55,7 +55,7 @@ def nothing_allowed(scan_map: ScanMap, prior: Prior) -> str:
 def apply_prior(scan_map: ScanMap, prior: Prior) -> ScanMap:
     """Return the map with only those cells of the coarse grid in which the prior allows a candidate."""
     is_allowed = np.ones(len(scan_map.centers), dtype=bool)
-    for mask in check_options(scan_map, prior).values():
+    for mask in allow_by_option(scan_map, prior).values():
         is_allowed &= mask
     if is_allowed.all():
         return scan_map

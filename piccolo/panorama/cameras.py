@@ -9,10 +9,9 @@ import numpy as np
 
 from ..arrays import Array, Mask
 from ..camera import Calibration, Mount
-from ..camera.files import find_calibration
-from ..camera.model import MODELS, SPHERE, Camera, camera_of_fov, pinhole
+from ..camera.calibration import compute_extent, find_calibration
+from ..camera.model import SPHERE, Camera, camera_of_fov, pinhole
 from ..camera.resampling import View, shrunk
-from ..camera.rig import compute_extent
 from ..errors import InputError
 from ..photo import Photo
 from .cube import face_pixels
@@ -65,7 +64,9 @@ def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     width, height = picture.size
     if (calibration := find_calibration(photo.calibration, photo.path)) is not None:
         mounts = _calibrate(photo.path, picture, calibration)
-        return Cameras() if _is_sphere(mounts) else Cameras(mounts, OF_CALIBRATION, "`camera`")
+        # one camera that takes the whole sphere as it is stored here
+        is_sphere = mounts == (Mount(mounts[0].camera),) and mounts[0].camera.lens == SPHERE
+        return Cameras() if is_sphere else Cameras(mounts, OF_CALIBRATION, "`camera`")
     if photo.focal_px is not None:
         return Cameras((Mount(pinhole(width, height, photo.focal_px)),), OF_PIXELS, "`focal_px`")
     lens = photo.projection
@@ -86,11 +87,6 @@ def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     focal = f"focal length {found.focal:.0f} px from {found.source}"
     note = f"read as a pinhole photo {fov:.1f} deg wide, {focal}"
     return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, "EXIF", (note + HOW,))
-
-
-def _is_sphere(mounts: tuple[Mount, ...]) -> bool:
-    """Return True for one camera that takes the whole sphere as it is stored here."""
-    return mounts == (Mount(mounts[0].camera),) and MODELS[mounts[0].camera.model][0] == SPHERE
 
 
 def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:
@@ -137,10 +133,7 @@ def read_views(
 
 
 def rig_cameras(path: Path, pictures: list[Picture], rig: Calibration) -> list[tuple[Mount, ...]]:
-    """Return the camera of each picture of a rig, at the picture's size.
-
-    Raises InputError if a picture has another shape than its camera.
-    """
+    """Return the camera of each picture of a rig, at the picture's size; InputError for another shape."""
     found = []
     for picture, mount in zip(pictures, rig.mounts, strict=True):
         width, height = picture.size

@@ -109,11 +109,7 @@ def _sample_faces(faces: Faces, directions: Array32, rim: int) -> Bytes:
 
 
 def read_cube_folder(folder: Path) -> Picture:
-    """Return the panorama of the six square pictures in a folder, one cube's faces.
-
-    Raises InputError if the folder holds no complete cube or several, or the faces are not squares of one
-    size.
-    """
+    """Return the panorama of a folder's one cube of six equal squares; InputError if it holds none."""
     paths = face_paths(folder).items()
     pictures = {letter: read_picture(path, (MIN_FACE, MIN_FACE)) for letter, path in paths}
     faces = {letter: face_pixels(picture.rgb, picture.is_valid) for letter, picture in pictures.items()}

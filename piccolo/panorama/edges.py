@@ -1,4 +1,8 @@
-"""Edges of a photo, as `cloud.shape` paints those of a scan without colours."""
+"""Edges of a photo, as `cloud.surfaces` paints those of a scan without colours, and the axes of most of them.
+
+A line's gradients are at right angles to it, wherever it is seen: an axis is the direction at right angles to
+most gradients (Coughlan and Yuille, "Manhattan World", ICCV 1999).
+"""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -10,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Mask
 from ..geometry.colors import colors_of_edges
-from ..geometry.sphere import pixel_rays
+from ..geometry.sphere import make_grid, pixel_rays
 from .model import Panorama, resize
 
 WIDTH = 1024  # [px] of the sphere on which gradients are taken
@@ -23,6 +27,16 @@ LEAST_COS = 0.2  # of the elevation: nearer to the poles a pixel counts as this 
 MARGIN = 32  # [px] beyond the seam
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
+AXES_WIDTH = 512  # [px] of the sphere on which axes are found
+FLAT_SHARE = 0.85  # of the pixels, with the weakest gradients: no edges
+LEAST_EDGE = 1e-4  # of the gradient of the logarithm
+LEAST_EDGES = 100  # [px] fewer say nothing
+LEAST_VOTING_COS = 0.35  # of the elevation: nearer to the poles gradients are rough
+NUM_RINGS = 60  # of the grid of directions that are tried: 3 degrees apart
+ACROSS = 0.035  # cosine of the angle between an axis and a gradient that is at right angles to it, at most
+VOTERS = 4  # one of so many edges votes
+SHARPENINGS = 4
+SQUARE = 0.1  # cosine of the angle between two axes, at most
 
 
 def draw_edges(panorama: Panorama, R_cam_from_level: Array, has_gray: bool) -> Panorama:
@@ -103,3 +117,46 @@ def wrap(image: NDArray[Pixel]) -> NDArray[Pixel]:
     """Return an equirectangular image (H, W, ...) with a margin on all sides, across the seam."""
     wide = np.concatenate([image[:, -MARGIN:], image, image[:, :MARGIN]], axis=1)
     return cast(NDArray[Pixel], cv2.copyMakeBorder(wide, MARGIN, MARGIN, 0, 0, cv2.BORDER_REPLICATE))
+
+
+def find_axes(panorama: Panorama) -> list[Array]:
+    """Return unit vectors (3,) along three directions, both ways, nearest to +z first; none without edges."""
+    normals, weights = edge_normals(panorama)
+    if len(normals) < LEAST_EDGES:
+        return []
+    tried = make_grid(NUM_RINGS).directions.astype(np.float64)
+    tried = tried[tried[:, 2] >= 0.0]
+    some = normals[::VOTERS]
+    votes = np.array([weights[::VOTERS] @ (np.abs(some @ direction) < ACROSS) for direction in tried])
+    first = sharpen_axis(normals, weights, tried[np.argmax(votes)])
+    votes[np.abs(tried @ first) > SQUARE] = -1.0
+    second = sharpen_axis(normals, weights, tried[np.argmax(votes)])
+    second -= first * (first @ second)
+    second /= np.linalg.norm(second)
+    axes = [first, second, np.cross(first, second)]
+    return sorted([*axes, *(-axis for axis in axes)], key=lambda axis: -float(axis[2]))
+
+
+def edge_normals(panorama: Panorama) -> tuple[Array, Array]:
+    """Return unit gradients (N, 3), in the camera's axes, at a photo's edges, and their solid angles (N,)."""
+    source = resize(panorama, AXES_WIDTH)
+    across, along = gradients(source)
+    right, down = tangent_axes(AXES_WIDTH)
+    strength = np.hypot(across, along)
+    cosines = row_cosines(AXES_WIDTH // 2)
+    is_inner = find_inner(source) & (cosines > LEAST_VOTING_COS)[:, None]
+    if not is_inner.any():
+        return np.empty((0, 3)), np.empty(0)
+    least = max(float(np.quantile(strength[is_inner], FLAT_SHARE)), LEAST_EDGE)
+    is_edge = is_inner & (strength > least)
+    gradient = across[is_edge][:, None] * right[is_edge] + along[is_edge][:, None] * down[is_edge]
+    return gradient / strength[is_edge][:, None], cosines[np.nonzero(is_edge)[0]]
+
+
+def sharpen_axis(normals: Array, weights: Array, axis: Array) -> Array:
+    """Return the axis (3,) at right angles to the normals (N, 3) that nearly are, by least squares."""
+    for _ in range(SHARPENINGS):
+        near = np.abs(normals @ axis) < ACROSS
+        moments = (normals[near] * weights[near, None]).T @ normals[near]
+        axis = np.linalg.eigh(moments)[1][:, 0]
+    return np.asarray(axis)

@@ -190,10 +190,7 @@ def normalize_locally(rgb: Array32, counts: Mask, sigma_deg: float) -> Array32:
 
 
 def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
-    """Average opponent channels over `cell_deg` and normalise them locally, over `sigma_deg`.
-
-    The width of the panorama is a multiple of STATS_WIDTH.
-    """
+    """Average opponent channels over `cell_deg`, normalise over `sigma_deg`; STATS_WIDTH divides W."""
     height, width = panorama.is_valid.shape
     weight = panorama.is_valid.astype(np.float32)
     channels = opponent_channels(panorama.rgb.astype(np.float32) / np.float32(255.0))

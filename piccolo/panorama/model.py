@@ -43,10 +43,7 @@ class Panorama:
     focal_prior: FocalPrior | None = None  # of the photo of one camera
 
     def resample(self, camera: Camera, width: int) -> "Panorama":
-        """Return the panorama, `width` x width / 2, by another calibration of its camera.
-
-        The panorama must have a focal_prior.
-        """
+        """Return the panorama at a width by another calibration of its camera, which has a focal_prior."""
         assert self.focal_prior is not None
         mount = self.cameras[0].with_camera(camera)
         rgb, is_valid = make_sphere([self.focal_prior.view._replace(mount=mount)], width)
@@ -57,10 +54,7 @@ class Panorama:
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def expect_focal(self, focal_px: float, deviation: float) -> "Panorama":
-        """Return the panorama by the focal length of other photos, with the deviation of its logarithm.
-
-        The panorama must have a focal_prior.
-        """
+        """Return the panorama, which has a focal_prior, by the focal length of other photos."""
         assert self.focal_prior is not None
         camera = self.cameras[0].camera
         taken = self.resample(camera.change(math.log(focal_px / camera.focal[0])), self.rgb.shape[1])

@@ -143,16 +143,10 @@ def read_labels(path: Path, labels: Labels) -> Picture:
         return Picture(label_colors(pixels), labels.are_kept(pixels), _xmp(image), _warnings(image))
 
 
-def picture_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of the picture in a file, without decoding it."""
+def picture_shape(path: Path) -> tuple[tuple[int, int], object]:
+    """Return width and height [px], and EXIF's orientation or None, of the picture in a file, not decoded."""
     with open_picture(path, read_bytes(path, WANTED)) as image:
-        return image.size
-
-
-def picture_orientation(path: Path) -> object:
-    """Return EXIF's orientation number of the picture in a file, without decoding it; else None."""
-    with open_picture(path, read_bytes(path, WANTED)) as image:
-        return _orientation(image)
+        return image.size, _orientation(image)
 
 
 @contextmanager

@@ -7,29 +7,20 @@ import numpy as np
 
 from ..arrays import Bytes, Mask
 from ..camera import Calibration, Mount
+from ..camera.calibration import MAX_OFFSET
 from ..camera.resampling import View, make_sphere, sphere_width
-from ..camera.rig import MAX_OFFSET
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..jobs.memory import check_memory
 from ..photo import File, Photo, as_photo
+from . import gpano
 from .cameras import Cameras, cameras_of, read_views, rig_cameras
 from .cube import cube_of_cells, face_paths, read_cube_folder
-from .gpano import (
-    ASPECT_TOLERANCE,
-    CropRegion,
-    attitude,
-    attitude_of_gravity,
-    crop_region,
-    embed_crop,
-    full_size,
-    gpano_fields,
-    region_of_fov,
-)
+from .gpano import ASPECT_TOLERANCE, CropRegion
 from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
 from .model import FocalPrior, GPano, Panorama
 from .photo import elevation_deg
-from .picture import BYTES_PER_PIXEL, Picture, picture_orientation, picture_size, read_labels, read_picture
+from .picture import BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
 
 Shot = tuple[Path, Picture, tuple[Mount, ...]]  # a file with the cameras that took it
 PHOTO_FOV_DEG = 65, 50  # of a phone's main camera, 24 to 28 mm on film: 63 to 72 wide, upright 50 to 57
@@ -60,7 +51,7 @@ def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> 
     panorama = _read(photo, labels)
     if photo.gravity_vector is None:
         return panorama
-    return replace(panorama, gpano=attitude_of_gravity(photo.gravity_vector))
+    return replace(panorama, gpano=gpano.attitude_of_gravity(photo.gravity_vector))
 
 
 def check_labels(photo: Photo, labels: Labels | None) -> None:
@@ -89,17 +80,17 @@ def _read_picture(photo: Photo) -> Panorama:
     picture = read_picture(path)
     if cube := cube_of_cells(path, picture, photo.cube_order):
         return _embed_and_mask(photo, cube, CropRegion(), None)
-    fields = gpano_fields(picture.xmp)
+    fields = gpano.gpano_fields(picture.xmp)
     cameras = cameras_of(photo, picture, bool(fields))
-    gpano = attitude(fields) if fields else None
+    attitude = gpano.attitude(fields) if fields else None
     picture = replace(picture, warnings=(*picture.warnings, *cameras.notes))
     if cameras.mounts:
-        if gpano is None and (elevation := elevation_deg(picture.exif)) is not None:
-            gpano = GPano(elevation)
-        return _on_sphere(photo, [(path, picture, cameras.mounts)], gpano, cameras)
+        if attitude is None and (elevation := elevation_deg(picture.exif)) is not None:
+            attitude = GPano(elevation)
+        return _on_sphere(photo, [(path, picture, cameras.mounts)], attitude, cameras)
     region, more = _region_of(photo, picture, fields)
     picture = replace(picture, warnings=(*picture.warnings, *more))
-    return _embed_and_mask(photo, picture, region, gpano)
+    return _embed_and_mask(photo, picture, region, attitude)
 
 
 def _read_array(photo: Photo, rgb: Bytes) -> Panorama:
@@ -130,7 +121,7 @@ def _read_rig(photo: Photo, rig: Calibration) -> Panorama:
 
 
 def _on_sphere(
-    photo: Photo, shots: list[Shot], gpano: GPano | None, of_one: Cameras | None = None
+    photo: Photo, shots: list[Shot], attitude: GPano | None, of_one: Cameras | None = None
 ) -> Panorama:
     """Project the pictures of one instant, each with its file and cameras, to one sphere, and apply masks.
 
@@ -152,7 +143,7 @@ def _on_sphere(
         views += found
         notes += [*picture.warnings, *more]
     rgb, is_valid = make_sphere(views, width)
-    panorama = Panorama(rgb, is_valid, gpano, tuple(dict.fromkeys(notes)), cameras)
+    panorama = Panorama(rgb, is_valid, attitude, tuple(dict.fromkeys(notes)), cameras)
     masked = _mask(photo, panorama, counts)
     if of_one is None or len(cameras) > 1:
         return masked
@@ -163,17 +154,14 @@ def _on_sphere(
 
 
 def panorama_size(path: Path) -> tuple[int, int]:
-    """Return width and height [px] of a panorama's file, or of the sphere of a folder of faces, not decoded.
-
-    Raises InputError if EXIF rotates it, which many programs ignore.
-    """
-    if not path.is_dir():
-        if (orientation := picture_orientation(path)) not in (None, 1):
-            turned = f"found it stored rotated (EXIF orientation {orientation})"
-            raise InputError(f"{path}: {turned}, wanted it upright")
-        return picture_size(path)
-    size, _ = picture_size(face_paths(path)["f"])
-    return 4 * size, 2 * size
+    """Return width and height [px] of a file's panorama, not decoded; InputError if EXIF rotates it."""
+    size, orientation = picture_shape(face_paths(path)["f"] if path.is_dir() else path)
+    if path.is_dir():
+        return 4 * size[0], 2 * size[0]
+    if orientation not in (None, 1):
+        turned = f"found it stored rotated (EXIF orientation {orientation})"
+        raise InputError(f"{path}: {turned}, wanted it upright")
+    return size
 
 
 def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
@@ -185,9 +173,9 @@ def _read_labelled(photo: Photo, labels: Labels) -> Panorama:
         raise InputError(f"{path}: found labels of {width} x {height}, wanted the full sphere, W = 2 H")
     notes = list(picture.warnings)
     counts = _user_masks(path, [picture.size], photo, notes).get(0)
-    fields = gpano_fields(picture.xmp)
-    gpano = attitude(fields) if fields else None
-    return _mask(photo, Panorama(picture.rgb, picture.is_valid, gpano, tuple(notes)), counts)
+    fields = gpano.gpano_fields(picture.xmp)
+    attitude = gpano.attitude(fields) if fields else None
+    return _mask(photo, Panorama(picture.rgb, picture.is_valid, attitude, tuple(notes)), counts)
 
 
 def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[CropRegion, list[str]]:
@@ -195,12 +183,12 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
     width, height = picture.size
     if photo.fov_deg is not None:
         notes = [LIKE_A_PHOTO] if photo.projection is None and not fields and _is_like_photo(picture) else []
-        return region_of_fov(photo.fov_deg, width, height), notes
+        return gpano.region_of_fov(photo.fov_deg, width, height), notes
     name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
         raise InputError(f"{photo.path}: its metadata names the projection {name!r}, wanted equirectangular")
     notes = []
-    region = crop_region(fields, width / height)
+    region = gpano.crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
     if region is None and is_two_to_one:
         region = CropRegion()
@@ -222,10 +210,10 @@ def _is_like_photo(picture: Picture) -> bool:
     return any(abs(ratio / camera_ratio - 1.0) <= ASPECT_TOLERANCE for camera_ratio in CAMERA_RATIOS)
 
 
-def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, gpano: GPano | None) -> Panorama:
+def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, attitude: GPano | None) -> Panorama:
     """Embed the picture in the full sphere, and mask all pixels that do not count."""
     path = photo.path
-    size = full_size(path, region, picture.size)
+    size = gpano.full_size(path, region, picture.size)
     notes = [*picture.warnings]
     masks = _user_masks(path, [size, picture.size], photo, notes)
     is_valid = picture.is_valid & masks[1] if 1 in masks else picture.is_valid
@@ -235,13 +223,13 @@ def _embed_and_mask(photo: Photo, picture: Picture, region: CropRegion, gpano: G
         fraction = _sphere_fraction(borders, region)
         if fraction >= MIN_REPORTED:
             notes.append(f"masked black borders: {100 * fraction:.1f} % of the sphere")
-    rgb, is_valid = embed_crop(path, picture.rgb, is_valid, region)
+    rgb, is_valid = gpano.embed_crop(path, picture.rgb, is_valid, region)
     for pole in ("zenith", "nadir"):
         half_angle = polar_disc(rgb, is_valid, pole)
         if half_angle:
             notes.append(f"masked a {pole} patch of {half_angle:.1f} deg")
             is_valid = mask_pole(is_valid, pole, half_angle)
-    return _mask(photo, Panorama(rgb, is_valid, gpano, tuple(notes)), masks.get(0))
+    return _mask(photo, Panorama(rgb, is_valid, attitude, tuple(notes)), masks.get(0))
 
 
 def _mask(photo: Photo, panorama: Panorama, counts: Mask | None) -> Panorama:

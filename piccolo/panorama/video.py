@@ -1,6 +1,8 @@
-"""Frames of a video as picture files: the sharpest around each time step."""
+"""Videos: their frames as picture files, the sharpest around each time step; and frames as a video."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterator
+from contextlib import contextmanager
+from fractions import Fraction
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +11,7 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import InputError
+from ..files.atomic import replacing
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 
@@ -27,10 +30,7 @@ class VideoFrame(NamedTuple):
 
 
 def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
-    """Write a frame every `every` seconds into a folder, the sharpest around each time, and yield it.
-
-    InputError if the file is no video or is damaged, or PyAV is not there.
-    """
+    """Write and yield the sharpest frame around each time step [s]; InputError for what is no video."""
     best: tuple[float, float, Bytes] | None = None  # sharpness, time, RGB
     slot = 0
     for time, frame in _decode(video):
@@ -94,3 +94,20 @@ def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFra
     if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
         raise OSError(f"{path}: can't be written")
     return VideoFrame(time, path)
+
+
+@contextmanager
+def writing_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Callable[[Bytes], None]]:
+    """Yield a function that takes frames (H, W, 3) of an MP4 (H.264), `rate` a second; W and H are even."""
+    av = import_optional("video", "av", "video")
+    with replacing(path) as file, av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", Fraction(rate).limit_denominator(1001))
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "18"}  # nothing to be seen is lost
+
+        def add(rgb: Bytes) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
+
+        yield add
+        container.mux(stream.encode())

@@ -1,31 +1,192 @@
-"""The paper's method in order, one line a step."""
+"""The paper's method: poses on a grid in free space are scored, the diverse best refined, one selected.
 
+Beside the sampling loss there is the paper's comparison: the cloud is rendered, and pixels are compared.
+
+    L(R, t) = (1 / N') sum_u || V(u) - I(u) ||_2
+
+over the N' pixels u in which the view V, z-buffered at the pose, shows points, and the panorama I counts. A
+pixel's depth says which point p it shows. A step (w, d) moves it by dp = w x p - d and in the image by
+du = J dp, so at a fixed pixel V changes by -grad V . J dp. Rasterisation and occlusions have no derivative.
+"""
+
+import functools
 import math
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Array32, Mask
 from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
-from ..confidence.alternatives import Hypothesis, alternative_poses
+from ..confidence.alternatives import Hypothesis, alternative_poses, best_distinct
 from ..confidence.confidence import AMBIGUOUS, LEAST_SCORE, LOCALIZED, NOT_LOCALIZED
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import compare_occlusion, measure_agreement
+from ..geometry.nearness import Nearness
+from ..geometry.pose import Pose
 from ..geometry.rotations import uniform_rotations, uniform_yaws
+from ..geometry.sphere import pixel_rays, ray_jacobian, solid_angles
 from ..jobs.threads import Stopwatch, Workers
-from ..optimize.refine import Loss, Refined, make_sampling_loss, refine
+from ..optimize.refine import Equations, Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
-from .photometric import make_photometric_loss
-from .search import free_grid, search
+from ..views.zbuffer import View, is_free_space, render_view, visible_points
 from .settings import PaperSettings
 
 # No covariance is known here, and too few alternatives to tell places that repeat: a rough guide, by margin
 # and log of the agreement, learnt without such places.
 PAPER_BIAS = -0.20
 PAPER_WEIGHTS = (6.37, 2.51)
+MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
+PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
+MIN_SHOWN_SHARE = 0.5  # of what is rendered, as of the sampling loss: masked pixels may not hide more
+MIN_FILLED_SHARE = 0.1  # of the pixels that the points could fill: fewer are seen from outside of a scan
+LEAST_DEPTH = 1e-3  # [m]
+LEAST_NORM = 0.5 / 255.0  # a residual below half an 8-bit level has the weight of half a level
+
+
+def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> float:
+    """Return the loss in [0, sqrt(3)] at `pose`, over the panorama's own pixels; inf if too few are shown."""
+    found = _compare(points, panorama, pose)
+    return math.inf if found is None else float(np.linalg.norm(found[1], axis=-1).mean(dtype=np.float64))
+
+
+def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) -> Equations:
+    """Return the loss at `pose`, its gradient (6,) and the matrix (6, 6) of reweighted least squares."""
+    found = _compare(points, panorama, pose)
+    if found is None:
+        return math.inf, np.zeros(6), np.eye(6)
+    view, residuals, counts = found
+    norms = np.linalg.norm(residuals, axis=-1)
+    by_u, by_v = (gradient[counts] for gradient in view_gradient(view))
+    rows_u, rows_v = pixel_motion(view.depth, counts)
+    weights = 1.0 / np.maximum(norms, LEAST_NORM)
+    e_u, e_v = (weights * (by * residuals).sum(axis=1) for by in (by_u, by_v))
+    gradient = -(e_u @ rows_u + e_v @ rows_v)
+    a_uu, a_uv, a_vv = (weights * (a * b).sum(axis=1) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
+    cross = (rows_u * a_uv[:, None]).T @ rows_v
+    matrix = (rows_u * a_uu[:, None]).T @ rows_u + (rows_v * a_vv[:, None]).T @ rows_v + cross + cross.T
+    count = len(norms)
+    return float(norms.mean(dtype=np.float64)), gradient / count, matrix / count
+
+
+def _compare(points: PackedPoints, panorama: Panorama, pose: Pose) -> tuple[View, Array32, Mask] | None:
+    """Render the view at `pose`; return it, its differences (N, 3) in [-1, 1], and their mask (H, W).
+
+    None where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan.
+    """
+    view = render_view(points, pose, panorama.rgb.shape[1])
+    counts = view.is_seen & panorama.is_valid
+    num_seen = int(view.is_seen.sum())
+    least_shown = MIN_SHOWN_SHARE * float(panorama.is_valid.mean()) ** 2 * num_seen
+    least_seen = MIN_FILLED_SHARE * min(view.is_seen.size, len(points))
+    if num_seen <= least_seen or int(counts.sum()) <= least_shown:
+        return None
+    return view, view.rgb[counts] - panorama.rgb[counts].astype(np.float32) / np.float32(255.0), counts
+
+
+def view_gradient(view: View) -> tuple[Array32, Array32]:
+    """Return derivatives (H, W, 3) by u and v [1/px]: central, one-sided at a hole, 0 between two."""
+    seen = view.is_seen[..., None].astype(np.float32)
+    gradients = []
+    for axis in (1, 0):
+        ahead, behind = (np.roll(view.rgb, -step, axis=axis) for step in (1, -1))
+        has_ahead, has_behind = (np.roll(seen, -step, axis=axis) for step in (1, -1))
+        if axis == 0:  # rows do not wrap
+            has_ahead[-1] = 0.0
+            has_behind[0] = 0.0
+        total = (ahead - view.rgb) * has_ahead + (view.rgb - behind) * has_behind
+        gradients.append(total / np.maximum(has_ahead + has_behind, 1.0))
+    return gradients[0], gradients[1]
+
+
+@functools.lru_cache(maxsize=2)
+def _unit_motion(width: int) -> tuple[Array, Array]:
+    """Return derivatives (H, W, 6) of u and v by a step, for points at 1 m in each pixel's centre."""
+    rays = pixel_rays(width)
+    rows_u, rows_v = (np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in ray_jacobian(rays))
+    return rows_u, rows_v
+
+
+def pixel_motion(depth: Array32, counts: Mask) -> tuple[Array, Array]:
+    """Return derivatives (N, 6) of u and v [px] by a step, for pixels of `counts` at `depth` (H, W)."""
+    rows_u, rows_v = (rows[counts] for rows in _unit_motion(depth.shape[1]))
+    per_depth = 1.0 / np.maximum(depth[counts], LEAST_DEPTH)[:, None]
+    rows_u[:, 3:] *= per_depth  # a turn moves pixels alike at every depth
+    rows_v[:, 3:] *= per_depth
+    return rows_u, rows_v
+
+
+def box_grid(low: Array, high: Array, num_cells: int) -> Array:
+    """Return centres (M, 3) of near-cubic cells that fill a box, M near `num_cells`, one an axis at least."""
+    size = np.maximum(high - low, 1e-3)
+    edge = (size.prod() / num_cells) ** (1.0 / 3.0)
+    for _ in range(3):  # an axis shorter than the edge gets one cell: the others share the number
+        is_long = size > edge
+        if is_long.any():
+            edge = (size[is_long].prod() / num_cells) ** (1.0 / is_long.sum())
+    counts = np.maximum(np.round(size / edge), 1).astype(int)
+    axes = [low[k] + size[k] * (np.arange(counts[k]) + 0.5) / counts[k] for k in range(3)]
+    return np.column_stack([axis.ravel() for axis in np.meshgrid(*axes, indexing="ij")])
+
+
+def farthest_point_sampling(positions: Array, count: int) -> Array:
+    """Return at most `count` positions (N, 3), in order, each chosen farthest from those chosen before."""
+    if len(positions) <= count:
+        return positions
+    chosen = [0]
+    distance = np.linalg.norm(positions - positions[0], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(positions - positions[chosen[-1]], axis=1))
+    return np.asarray(positions[np.sort(chosen)])
+
+
+def free_grid(points: PackedPoints, num_translations: int, margin: float) -> Array:
+    """Return camera positions (M, 3) in free space on a uniform grid over the box, M <= num_translations.
+
+    The box is that of the points, made smaller by `margin` of its size on every side. The grid is refined
+    until enough of its positions are free, and thinned out evenly if they are too many. Empty if none is
+    free.
+    """
+    low = np.array([points.x.min(), points.y.min(), points.z.min()], dtype=np.float64)
+    high = np.array([points.x.max(), points.y.max(), points.z.max()], dtype=np.float64)
+    inset = margin * (high - low)
+    low += inset
+    high -= inset
+    probed = points.take(slice(None, None, max(1, len(points) // 200_000)))  # evenly in space
+    free = np.empty((0, 3))
+    for growth in (1.0, 1.5, 2.25, 3.4, 5.0, 7.6, 11.4, 17.0, 26.0):
+        grid = box_grid(low, high, round(num_translations * growth))
+        free = grid[[is_free_space(probed, center, PROBE_WIDTH, MIN_CLEARANCE) for center in grid]]
+        if len(free) >= num_translations:
+            break
+    return farthest_point_sampling(free, num_translations)
+
+
+def color_histogram(rgb: Array32, counts: Mask, bins: int) -> Array:
+    """Return the fraction (bins ** 3,) of the solid angle in each colour, of an image (H, W, 3) in [0, 1].
+
+    Only pixels of `counts` (H, W) are counted; all zero if there is none.
+    """
+    level = np.minimum((rgb * bins).astype(np.int64), bins - 1)
+    index = (level[..., 0] * bins + level[..., 1]) * bins + level[..., 2]
+    weights = counts * solid_angles(rgb.shape[1])[:, None]
+    histogram = np.bincount(index.ravel(), weights.ravel(), minlength=bins**3)
+    return np.asarray(histogram / max(histogram.sum(), 1e-12))
+
+
+def histogram_similarity(points: PackedPoints, panorama: Panorama, pose: Pose, bins: int) -> float:
+    """Return the histogram intersection [0, 1] of panorama and cloud at `pose`, where both show something.
+
+    It is the overlap of two histograms that each sum to 1 (Swain and Ballard, 1991).
+    """
+    view = render_view(points, pose, panorama.rgb.shape[1])
+    counts = view.is_seen & panorama.is_valid
+    of_cloud = color_histogram(view.rgb, counts, bins)
+    of_panorama = color_histogram(panorama.rgb.astype(np.float32) / 255.0, counts, bins)
+    return float(np.minimum(of_cloud, of_panorama).sum())
 
 
 @dataclass(frozen=True)
@@ -43,10 +204,42 @@ def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     return PaperMap(points, np.eye(3), cloud.origin_world, cloud.warnings, positions)
 
 
+def search(
+    paper_map: PaperMap, panorama: Panorama, loss: Loss, settings: PaperSettings, workers: Workers
+) -> list[Hypothesis]:
+    """Select the K2 poses to descend from, of all N_t positions with all N_r rotations."""
+    points = paper_map.points
+    is_level = settings.gravity == "known"
+    rotations = (uniform_yaws if is_level else uniform_rotations)(settings.effective_num_rotations)
+
+    def losses(center_world: Array) -> list[Hypothesis]:
+        seen = visible_points(points, center_world) if settings.use_visibility else points
+        poses = [Pose(R_cam_from_world, center_world) for R_cam_from_world in rotations]
+        found = [Hypothesis(pose, -loss.value(seen, pose)) for pose in poses]
+        return [h for h in found if np.isfinite(h.score)]
+
+    scored = [h for batch in workers.map(losses, list(paper_map.positions), "search") for h in batch]
+    near = Nearness(settings.min_distance, math.radians(settings.min_angle_deg))
+    if settings.initialization == "loss-only":
+        return best_distinct(scored, settings.num_by_histogram, near)
+    by_loss = best_distinct(scored, settings.num_by_loss, near)
+    small = shrink(panorama, settings.histogram_width)
+
+    def rescore(h: Hypothesis) -> Hypothesis:
+        return Hypothesis(h.pose, histogram_similarity(points, small, h.pose, settings.histogram_bins))
+
+    by_histogram = list(workers.map(rescore, by_loss, "compare colours"))
+    return best_distinct(by_histogram, settings.num_by_histogram, near)
+
+
 def make_loss(panorama: Panorama, settings: PaperSettings) -> Loss:
     """Return the loss that the settings select."""
     if settings.loss == "photometric":
-        return make_photometric_loss(shrink(panorama, settings.photometric_width))
+        small = shrink(panorama, settings.photometric_width)
+        return Loss(
+            lambda points, pose: photometric_loss(points, small, pose),
+            lambda points, pose: photometric_equations(points, small, pose),
+        )
     return make_sampling_loss(pack_texels(panorama.rgb, panorama.is_valid))
 
 
@@ -55,11 +248,9 @@ def localize(
 ) -> Localization:
     """Localize by Algorithm 1 of the paper: search, refine, select; then evaluate the selected pose."""
     points = paper_map.points
-    known = settings.gravity == "known"
-    rotations = (uniform_yaws if known else uniform_rotations)(settings.effective_num_rotations)
     loss = make_loss(panorama, settings)
     with watch.stage("search"):
-        starts = search(points, panorama, loss, paper_map.positions, rotations, settings, workers)
+        starts = search(paper_map, panorama, loss, settings, workers)
     with watch.stage("refine"):
         refined = list(workers.map(lambda s: refine(points, loss, s.pose, settings), starts, "refine"))
         best = min(refined, key=lambda r: r.loss, default=None)

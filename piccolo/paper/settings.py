@@ -36,7 +36,6 @@ class PaperSettings(DescentSettings):
     seed: int = 0  # repeated in the result; this preset draws nothing at random
 
     def __post_init__(self) -> None:
-        """Refuse values that mean nothing, naming the setting."""
         check_fields(self)
         counts = ("num_translations", "num_by_loss", "num_by_histogram", "num_iterations", "num_culls")
         for name in (*counts, "patience"):

@@ -13,9 +13,8 @@ import numpy as np
 from .. import __version__
 from ..arguments import check_fields, check_kind
 from ..errors import InputError
-from ..files.atomic import write_atomically
+from ..files.atomic import temporary_folder, write_atomically
 from ..files.cache import digest_of_sources
-from ..files.temporary import temporary_folder
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..opened_scan import photo_of
@@ -27,8 +26,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
 from .entries import Entry, collect_entries, document_of_entry, shorten_names, unique_names
-from .pictures import extract_frames, make_pictures
-from .plan_image import PlanImage, draw_plan, own_plan
+from .pictures import PlanImage, draw_plan, extract_frames, make_pictures, own_plan
 from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 
 FORMAT = "piccolo-report/1"
@@ -74,7 +72,6 @@ class ReportSettings:
     force: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse values of another type, naming the option."""
         check_fields(self)
 
     @property
@@ -291,10 +288,6 @@ def write_report(
     opened = scan._opened
     if not isinstance(opened.prepared, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
-    entries = collect_entries(_items(results))
-    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page
-
-
-def _items(results: File | Iterable[File | Result]) -> list[Path | Result]:
     several = [results] if isinstance(results, str | PathLike) else results
-    return [item if isinstance(item, Result) else Path(item) for item in several]
+    entries = collect_entries([item if isinstance(item, Result) else Path(item) for item in several])
+    return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page

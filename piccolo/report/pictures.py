@@ -1,9 +1,13 @@
-"""The pictures of a photo: thumbnail, sphere, the scan from its pose, and what of it contradicts the scan.
+"""The pictures of a report: of each photo, and the plans of storeys.
 
-Photos may be frames of a video, as results of localize.py --video name them: these are taken out.
+A photo has a thumbnail, its sphere, the scan from its pose, and what of it contradicts the scan. It may be a
+frame of a video, as results of localize.py --video name them: these are taken out. A plan is the scan from
+above, cut below the ceiling; or an image of the user's own, put into the scan by points that are
+known in both.
 """
 
 import base64
+import csv
 import json
 import math
 import re
@@ -11,25 +15,29 @@ from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 
-from ..arrays import Array, Bytes, Mask
+from ..arrays import Array, Bytes, Int64s, Mask
 from ..camera.model import pinhole
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
 from ..confidence.occlusion import occlusion_mask
 from ..errors import InputError
-from ..files.temporary import temporary_folder
+from ..files.atomic import temporary_folder
+from ..files.json_file import read_text
+from ..geometry.colors import unpack_rgb
 from ..geometry.pose import Pose, yaw_rotation
 from ..jobs.threads import Workers
 from ..opened_scan import labels_of, photo_of
 from ..panorama import Panorama, read_panorama
 from ..panorama.model import shrink
+from ..panorama.picture import read_picture
 from ..panorama.video import frames_at
 from ..result import Result
+from ..scan_map.scan_map import ScanMap
 from ..views.pictures import cut, encode_image, fill_holes
 from ..views.surfels import Surfels, render_surfels, visible_indices
 from ..views.zbuffer import View
@@ -48,6 +56,30 @@ MAX_WIDTH = 8192  # [px] of a sphere at full size
 GAP = 0.004  # by the width: wider gaps are marked as not scanned
 UNSCANNED = np.array([96, 100, 106], np.float32)
 FRAME = re.compile(r"(?P<video>.+)#t=(?P<time>\d+\.\d{3})", re.DOTALL)
+# of plans
+CUT = 1.9  # [m] above the floor: below ceilings and lintels, above most furniture
+BELOW_FLOOR = 0.4  # [m] that still belongs to the storey: steps, ramps
+REACH = 5.0  # [m] around the places of a camera that is drawn
+PIXEL = 0.02  # [m] of a plan, or more if it would be larger than
+MAX_SIDE = 3072  # [px]
+MARGIN = 0.5  # [m] around what is drawn
+FLOOR_CELL = 0.5  # [m] on which the height of the floor is looked up
+WALL_FROM = 0.6  # [m] above the floor
+WALL_BINS = 13  # what fills most of these is a wall
+WALL_BIN = 0.1  # [m]
+WALL_FILLED = 8  # bins
+WALL_COLOR = (52, 60, 72)
+HOLE_COLOR = (150, 158, 168)  # of gaps in a floor
+HOLE_ALPHA = 90
+LARGEST_HOLE = 12.0  # [m2]
+PALENESS = 0.25  # of the colours, so that what is drawn on them is seen
+PLAN_GAP = 13  # [px] that is closed
+SHADOW = 0.35  # of walls on the floor: strength
+SHADOW_WIDTH = 0.25  # [m]
+COLUMNS = ("u", "v", "x", "y")
+WANTED = "wanted a CSV file with the columns u, v [px] and x, y [m], and two rows or more"
+MAX_OWN_SIDE = 4096  # [px]
+LEAST_SPREAD = 1e-6  # of the control points, by their distance: less is one point, or a line of three
 
 
 def make_pictures(
@@ -66,7 +98,9 @@ def make_pictures(
         view_width = min(full, SCAN_WIDTH) & ~1
         view = scan_view(surfels, poses[0], view_width)
         document["scan"] = _base64(scan_picture(view))
-        document["reach"] = _base64(measure_reach(view).tobytes())
+        # the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned
+        tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
+        document["reach"] = _base64(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA).tobytes())
         mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
         document["mask"] = _base64(encode_image(mask, ".png"))
         document["alternatives"] = [
@@ -87,12 +121,6 @@ def scan_view(surfels: Surfels, pose: Pose, width: int) -> View:
     """Return what the scan shows from a pose of its frame."""
     visible = surfels.take(visible_indices(surfels.points, pose.center_world))
     return render_surfels(visible, pose, width, Workers())
-
-
-def measure_reach(view: View) -> Bytes:
-    """Return the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned."""
-    tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
-    return np.asarray(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA), np.uint8)
 
 
 def scan_picture(view: View) -> bytes:
@@ -153,3 +181,159 @@ def extract_frames(photos: Sequence[Path]) -> Iterator[dict[Path, Path]]:
             except (OSError, InputError):
                 continue
         yield files
+
+
+class PlanImage(NamedTuple):
+    """A plan in pixels."""
+
+    pixels: Bytes  # (H, W, 4) RGBA, transparent where nothing is; or (H, W, 3)
+    # a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f [m, map], of pixels (u, v)
+    matrix: tuple[float, ...]
+
+
+def draw_plan(points: PackedPoints, places: Array, floors: Array) -> PlanImage | None:
+    """Return the plan of a storey of a map's points.
+
+    Around the places (P, 3) [m] in it where a camera can be, above each of which the floor is at `floors`
+    (P,) [m]. None if nothing is there.
+    """
+    shown = _of_storey(points, places, floors) if len(places) else None
+    if shown is None:
+        return None
+    x, y, above, rgb = shown
+    width, height = np.ptp(x) + 2 * MARGIN, np.ptp(y) + 2 * MARGIN
+    pixel = max(PIXEL, float(max(width, height)) / MAX_SIDE)
+    left = float(x.min()) - MARGIN
+    top = float(y.max()) + MARGIN
+    columns = ((x - left) / pixel).astype(np.int64)
+    rows = ((top - y) / pixel).astype(np.int64)
+    shape = math.ceil(height / pixel), math.ceil(width / pixel)
+    painted = _paint(columns, rows, above, rgb, shape, pixel)
+    return PlanImage(painted, (pixel, 0.0, 0.0, -pixel, left, top))
+
+
+def _of_storey(
+    points: PackedPoints, places: Array, floors: Array
+) -> tuple[Array, Array, Array, Bytes] | None:
+    """X, y and height above the floor [m] of a storey's points below the cut, and their colours (N, 3)."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no plan need not wait for it
+
+    low, high = places[:, :2].min(axis=0) - REACH, places[:, :2].max(axis=0) + REACH
+    count = np.ceil((high - low) / FLOOR_CELL).astype(np.int64) + 1
+    grid = np.stack(np.meshgrid(*(np.arange(n) for n in count), indexing="ij"), axis=-1).reshape(-1, 2)
+    distance, nearest = cKDTree(places[:, :2]).query(low + (grid + 0.5) * FLOOR_CELL)
+    floor = np.where(distance < REACH, floors[nearest], np.inf).reshape(count)
+    cells = np.stack([(points.x - low[0]) / FLOOR_CELL, (points.y - low[1]) / FLOOR_CELL]).astype(np.int64)
+    is_inside = ((cells >= 0) & (cells < count[:, None])).all(axis=0)
+    above = np.full(len(points), np.inf)
+    above[is_inside] = points.z[is_inside] - floor[tuple(cells[:, is_inside])]
+    kept = np.flatnonzero((above > -BELOW_FLOOR) & (above < CUT))
+    if not len(kept):
+        return None
+    x, y = points.x[kept].astype(np.float64), points.y[kept].astype(np.float64)
+    return x, y, above[kept], unpack_rgb(points.rgbx[kept])
+
+
+def _paint(
+    columns: Int64s, rows: Int64s, above: Array, rgb: Bytes, shape: tuple[int, int], pixel: float
+) -> Bytes:
+    """Return the picture (H, W, 4): the highest points below the cut, gaps closed, walls with shadows."""
+    order = np.argsort(above, kind="stable")  # what is higher is written later
+    color = np.zeros((*shape, 3), np.uint8)
+    is_seen = np.zeros(shape, np.bool_)
+    color[rows[order], columns[order]] = rgb[order]
+    is_seen[rows, columns] = True
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (PLAN_GAP, PLAN_GAP))
+    is_drawn = cv2.morphologyEx(is_seen.view(np.uint8), cv2.MORPH_CLOSE, disc) > 0
+    filled = cv2.medianBlur(fill_holes(color, is_seen), 3).astype(np.float32)
+    filled += (np.float32(255.0) - filled) * np.float32(PALENESS)
+    is_wall = _walls(columns, rows, above, shape)
+    shadow = cv2.GaussianBlur(is_wall.astype(np.float32), (0, 0), SHADOW_WIDTH / pixel)
+    filled *= (np.float32(1.0) - np.float32(SHADOW) * np.minimum(2.0 * shadow, 1.0))[..., None]
+    filled[is_wall] = WALL_COLOR
+    is_hole = _holes(is_drawn | is_wall, pixel)
+    filled[is_hole] = HOLE_COLOR
+    alpha = np.where(is_drawn | is_wall, 255, np.where(is_hole, HOLE_ALPHA, 0)).astype(np.uint8)
+    smooth = cv2.GaussianBlur(alpha, (3, 3), 0)
+    return np.dstack([np.rint(filled).astype(np.uint8), np.where(is_wall, 255, smooth)])
+
+
+def _holes(is_drawn: Mask, pixel: float) -> Mask:
+    """(H, W), true in gaps that what is drawn encloses: floor that no scanner saw."""
+    _, labels, stats, _ = cv2.connectedComponentsWithStats((~is_drawn).astype(np.uint8), connectivity=4)
+    is_hole = stats[:, cv2.CC_STAT_AREA] * pixel**2 < LARGEST_HOLE
+    is_hole &= (stats[:, cv2.CC_STAT_LEFT] > 0) & (stats[:, cv2.CC_STAT_TOP] > 0)
+    is_hole[0] = False  # what is drawn
+    return np.asarray(is_hole[labels])
+
+
+def _walls(columns: Int64s, rows: Int64s, above: Array, shape: tuple[int, int]) -> Mask:
+    """(H, W), true where most heights of a person are filled, small gaps closed."""
+    bins = np.floor((above - WALL_FROM) / WALL_BIN).astype(np.int64)
+    is_in = (bins >= 0) & (bins < WALL_BINS)
+    filled = np.zeros((WALL_BINS, *shape), np.uint8)
+    filled[bins[is_in], rows[is_in], columns[is_in]] = 1
+    square = np.ones((3, 3), np.uint8)
+    count = np.zeros(shape, np.uint8)
+    for level in filled:
+        count += np.asarray(cv2.dilate(level, square), np.uint8)
+    is_wall = cv2.erode((count >= WALL_FILLED).astype(np.uint8), square)
+    closed = cv2.morphologyEx(is_wall, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    return np.asarray(cv2.dilate(closed, square) > 0)
+
+
+def read_control_points(path: Path) -> Array:
+    """Rows u, v [px], x, y [m, world] (N, 4) of a CSV file."""
+    rows = csv.DictReader(read_text(path, WANTED).splitlines())
+    names = [name.strip() for name in rows.fieldnames or ()]
+    rows.fieldnames = names
+    if set(COLUMNS) - set(names):
+        raise InputError(f"{path}: found the columns {names}, {WANTED}")
+    try:
+        points = np.array([[float(row[name]) for name in COLUMNS] for row in rows])
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{path}: found {error}, {WANTED}") from error
+    if len(points) < 2 or not np.isfinite(points).all():
+        raise InputError(f"{path}: found {len(points)} control points, {WANTED}")
+    return points
+
+
+def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]:
+    """Return a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f, and the rms error [m] at the points.
+
+    Of pixels (N, 2), v downwards, and places (N, 2) [m]: two points give a turn and a scale, more any affine
+    map by least squares. InputError if they lie in one point or, more than two, on one line.
+    """
+    centred = pixels - pixels.mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False)
+    rank = 1 if len(pixels) == 2 else 2
+    if spread[rank - 1] <= LEAST_SPREAD * max(spread[0], 1.0):
+        raise InputError("control points: found them in one point or on one line, wanted them far apart")
+    if rank == 1:
+        z, w = (complex(*(pair[1] - pair[0])) for pair in (pixels * np.array([1.0, -1.0]), places))
+        turn = w / z
+        a = turn.real
+        b = turn.imag
+        linear = np.array([[a, b], [b, -a]])  # v points down
+    else:
+        linear = np.linalg.lstsq(centred, places - places.mean(axis=0), rcond=None)[0].T
+    shift = places.mean(axis=0) - linear @ pixels.mean(axis=0)
+    error = float(np.sqrt(((pixels @ linear.T + shift - places) ** 2).sum(axis=1).mean()))
+    return (*linear.T.ravel().tolist(), *shift.tolist()), error
+
+
+def own_plan(image: Path, control_points: Path, scan_map: ScanMap) -> PlanImage:
+    """Return the user's plan, an image and a CSV file, in the map's frame."""
+    points = read_control_points(control_points)
+    world = np.column_stack([points[:, 2:], np.full(len(points), scan_map.origin_world[2])])
+    places = ((world - scan_map.origin_world) @ scan_map.R_map_from_world.T)[:, :2]
+    rgb: Bytes = read_picture(image).rgb
+    scale = min(1.0, MAX_OWN_SIDE / max(rgb.shape[:2]))
+    size = math.ceil(rgb.shape[1] * scale), math.ceil(rgb.shape[0] * scale)
+    if scale < 1.0:
+        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
+    try:
+        matrix, _ = plan_matrix(points[:, :2] * scale, places)
+    except InputError as error:
+        raise InputError(f"{control_points}: {error}") from error
+    return PlanImage(rgb, matrix)

@@ -12,8 +12,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..files.atomic import write_atomically
-from ..files.temporary import temporary_folder
+from ..files.atomic import temporary_folder, write_atomically
 from ..optional import import_optional, new_figure
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
@@ -91,9 +90,10 @@ def draw_shapes(document: dict[str, Any], index: int) -> Iterator[Shape]:
     """Yield the shapes drawn of a storey, in the map's frame: paths first, marks last."""
     numbered = enumerate(document["photos"], 1)
     photos = [(n, photo) for n, photo in numbered if photo["isOnPlan"] and photo["storey"] in (index, None)]
-    for s in segments_of([photo for _, photo in photos]):
-        ends = np.array([s.begin["pose"]["center"], s.end["pose"]["center"]])
-        yield Line(ends, color_of(s.confidence), PATH_WIDTH, s.is_gap)
+    for begin, end in segments_of([photo for _, photo in photos]):
+        ends = np.array([begin["pose"]["center"], end["pose"]["center"]])
+        color = color_of(min(begin["confidence"], end["confidence"]))
+        yield Line(ends, color, PATH_WIDTH, is_dashed=end["gap"])  # no walking person can have gone there
     for number, photo in photos:
         center = np.array(photo["pose"]["center"])
         color = COLORS[photo["status"]]
@@ -199,7 +199,8 @@ def make_dxf(document: dict[str, Any]) -> bytes:
     drawing.header["$PDSIZE"] = 0.1
     R_map_from_world = np.array(document["R"]).reshape(3, 3)
     for k, storey in enumerate(document["storeys"]):
-        layer = _layer_name(storey["name"], k)
+        name = "".join("_" if letter in '<>/\\":;?*|=`,' else letter for letter in storey["name"])
+        layer = f"PHOTOS {k + 1} {name}"[:200]  # as DXF takes it
         drawing.layers.add(layer)
         for shape in draw_shapes(document, k):
             _add(drawing.modelspace(), shape, layer, R_map_from_world, np.array(document["origin"]))
@@ -226,29 +227,14 @@ def _add(space: Any, shape: Shape, layer: str, R_map_from_world: Array, origin: 
         space.add_ellipse(center.tolist(), axis.tolist(), b / a, dxfattribs=how)
 
 
-def _layer_name(name: str, index: int) -> str:
-    """Return a storey's name as DXF takes it."""
-    kept = "".join("_" if letter in '<>/\\":;?*|=`,' else letter for letter in name)
-    return f"PHOTOS {index + 1} {kept}"[:200]
-
-
-class Segment(NamedTuple):
-    """From a frame of a walk to the next that is on its path."""
-
-    begin: dict[str, Any]
-    end: dict[str, Any]
-    confidence: float  # the less of both
-    is_gap: bool  # no walking person can have gone there
-
-
-def segments_of(photos: Sequence[dict[str, Any]]) -> Iterator[Segment]:
-    """Yield the paths of the walks among the photos of a plan, from storey to storey not drawn."""
+def segments_of(photos: Sequence[dict[str, Any]]) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Yield frames and the next on a walk's path, of the photos of a plan, but from storey to storey."""
     frames = sorted((p for p in photos if p["walk"] is not None), key=lambda p: (p["walk"], p["time"]))
     for _, walk in groupby(frames, key=lambda p: p["walk"]):
         known = [p for p in walk if p["pose"] and p["confidence"] >= LEAST_ON_PATH]
         for begin, end in pairwise(known):
             if begin["storey"] == end["storey"] or None in (begin["storey"], end["storey"]):
-                yield Segment(begin, end, min(begin["confidence"], end["confidence"]), end["gap"])
+                yield begin, end
 
 
 def color_of(confidence: float) -> tuple[int, int, int]:

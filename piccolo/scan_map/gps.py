@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from ..cloud.crs import from_wgs84
+from ..cloud.settings import from_wgs84
 from ..panorama.photo import GpsPosition
 from ..prior import Prior
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from ..cloud import open_cloud
-from ..cloud.crs import read_crs
 from ..cloud.settings import IN_COLORS, IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
+from ..cloud.stream import read_crs
 from ..errors import InputError
 from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points

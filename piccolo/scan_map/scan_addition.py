@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
 from ..cloud.octree import Octree, build_octree
-from ..cloud.surface_noise import surface_variance
+from ..cloud.surfaces import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
 from ..geometry.sphere import whole_areas

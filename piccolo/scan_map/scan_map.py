@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from ..arrays import Array, Bytes, Int8s, Int64s, Mask
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
-from ..cloud.shape import paint_shape
 from ..cloud.soa import PackedPoints, pack_points
-from ..cloud.surface_noise import surface_variance
+from ..cloud.surfaces import paint_shape, surface_variance
 from ..cloud.voxels import Voxels
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls

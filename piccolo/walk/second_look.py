@@ -9,8 +9,7 @@ import numpy as np
 
 from ..confidence.confidence import MIN_CONFIDENCE
 from ..geometry.pose import Pose, carry
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Progress, no_progress
+from ..jobs.threads import Progress, no_progress, one_blas_thread
 from ..localization.query import Query
 from .frames import Frame
 from .path import EVEN, Belief, Path, believe, build_lattice
@@ -19,7 +18,7 @@ from .tracker import Expected, Followed, Tracker, find_near, refine_state
 Find = Callable[[Query], Followed | None]
 
 
-@one_blas_thread
+@one_blas_thread()
 def finish(tracker: Tracker, show: Progress = no_progress) -> tuple[Path, list[Belief]]:
     """Find the path of all frames of a tracker, and what each may be.
 

@@ -14,8 +14,7 @@ from ..geometry.nearness import ONE_ANSWER, ONE_PLACE
 from ..geometry.pose import Pose, carry, exp_so3, log_so3
 from ..geometry.rotations import uniform_yaws
 from ..geometry.suppression import non_maximum_suppression
-from ..jobs.blas import one_blas_thread
-from ..jobs.threads import Stopwatch, Workers
+from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..localization.attempts import is_whole
 from ..localization.beam import Ends, brief_query, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.comparison import compare
@@ -99,7 +98,7 @@ class Tracker:
             image()
         return query
 
-    @one_blas_thread
+    @one_blas_thread()
     def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
         """Localize the next frame, whose query is prepared; the first one waits until free space is known."""
         frame = Frame(time, odometry=odometry)

@@ -25,8 +25,8 @@ from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
 from piccolo.cloud import read_cloud
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
 from piccolo.geometry.pose import Pose, move, transform_points

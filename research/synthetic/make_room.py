@@ -10,16 +10,16 @@ import numpy as np
 
 from piccolo import scene as scenes
 from piccolo.camera import Calibration
-from piccolo.camera.files import read_cameras
+from piccolo.camera.calibration import read_cameras
 from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
 from piccolo.cli.command import command, option
 from piccolo.cli.terminal import workers_from
-from piccolo.cloud.ply_writer import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, write_ply
 from piccolo.export.formats import tum_lines, write_lines
-from piccolo.export.video import writing_video
 from piccolo.files.atomic import write_atomically
 from piccolo.jobs.threads import Workers
 from piccolo.optional import import_optional
+from piccolo.panorama.video import writing_video
 from piccolo.views.pictures import encode_image
 
 from . import world as worlds

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from piccolo.arrays import Array, Array32, Bytes, Int64s
 from piccolo.camera import Calibration, Mount
-from piccolo.camera.rig import compute_extent
+from piccolo.camera.calibration import compute_extent
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.rotations import uniform_rotations

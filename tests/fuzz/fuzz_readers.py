@@ -13,7 +13,7 @@ import atheris
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from piccolo.batch.priors import read_priors
-from piccolo.camera.files import read_cameras, read_rig
+from piccolo.camera.calibration import read_cameras, read_rig
 from piccolo.cloud import FORMATS
 from piccolo.cloud.settings import IN_METRES
 from piccolo.errors import InputError

@@ -51,6 +51,12 @@ SELECTED = ("XY_RETURNS_CHANNEL", "Z", "INTENSITY", "FLAGS", "CLASSIFICATION", "
 # Of the flags' byte the bit of withheld points, and the bits of the class.
 OLD_BITS = 0x80, 0x1F  # in the formats 0-5
 BITS = 0x04, 0xFF  # in 6-10
+PROJECTION_USER = b"LASF_Projection"
+WKT_ID = 2112
+GEO_KEYS_ID = 34735
+PROJECTED_KEY = 3072  # GeoTIFF keys whose value is a code of EPSG
+GEOGRAPHIC_KEY = 2048
+USER_DEFINED = 32767
 MAX_SAMPLES = 1 << 20
 NUM_SAMPLE_RUNS = 64
 TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
@@ -173,6 +179,20 @@ def record_content(header: LasHeader, file: BinaryIO, wanted_user: bytes, wanted
         if user.rstrip(b"\0") == wanted_user and record_id == wanted_id:
             return file.read(length)
     return None
+
+
+def read_crs(path: Path) -> str:
+    """Return the coordinate system that a file names, as WKT or EPSG:code; empty if it names none."""
+    header = read_header(path)
+    with path.open("rb") as file:
+        wkt = record_content(header, file, PROJECTION_USER, WKT_ID)
+        keys = record_content(header, file, PROJECTION_USER, GEO_KEYS_ID) or b""
+    if wkt:
+        return wkt.rstrip(b"\0").decode(errors="replace")
+    entries = list(struct.iter_unpack("<4H", keys[: len(keys) // 8 * 8]))[1:]
+    codes = {key: value for key, place, _, value in entries if place == 0}
+    code = codes.get(PROJECTED_KEY, codes.get(GEOGRAPHIC_KEY, 0))
+    return f"EPSG:{code}" if 0 < code < USER_DEFINED else ""
 
 
 def _check_items(header: LasHeader, laszip: bytes, lazrs: ModuleType) -> None:

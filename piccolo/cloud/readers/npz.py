@@ -96,10 +96,7 @@ def _source(
         pairs = zip(points.read_rows(), colors.read_rows(), strict=True)
         return ((reader.points_of([*xyz.T]), rgb) for xyz, rgb in pairs)
 
-    num_points = points.shape[0]
-    if channel == "shape":
-        return reader.make_source(path, read, channel, num_points=num_points)
-    return reader.color_source(path, read, [type_], num_points)
+    return reader.make_source(path, read, channel, None, points.shape[0], [type_])
 
 
 def has_npz_magic(head: bytes) -> bool:

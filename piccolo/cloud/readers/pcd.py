@@ -177,11 +177,11 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
-    if fields[-1].name in PACKED_NAMES:
-        read_parts = partial(_read_packed, header, fields[-1].type, read_columns)
-        return reader.make_source(path, read_parts, channel, num_points=header.num_points)
-    types = [field.type for field in fields[3:]]
-    return reader.column_source(path, read_columns, types, channel, options.labels, header.num_points)
+    is_packed = fields[-1].name in PACKED_NAMES
+    join = partial(_read_packed, header, fields[-1].type) if is_packed else reader.join_columns
+    types = [] if is_packed else [field.type for field in fields[3:]]
+    read_parts = partial(join, read_columns)
+    return reader.make_source(path, read_parts, channel, options.labels, header.num_points, types)
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:

@@ -63,8 +63,8 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if not header.is_ascii:
         place_of_vertices(header)
     types = [header.vertices.ply_property(name).val_dtype for name in names[3:]]
-    read = partial(read_columns, header, names)
-    return reader.column_source(path, read, types, channel, options.labels, header.counts[header.index])
+    read = partial(reader.join_columns, partial(read_columns, header, names))
+    return reader.make_source(path, read, channel, options.labels, header.counts[header.index], types)
 
 
 def _has_faces(header: PlyHeader) -> bool:

@@ -171,53 +171,35 @@ def make_source(
     channel: Channel,
     labels: Labels | None = None,
     num_points: int | None = None,
+    types: Sequence[str] = (),
 ) -> PointSource:
-    """Return the points that `read` yields with colours of 8 bits, or with a label, else an intensity.
+    """Return the points that `read` yields with colours, or with a label, else an intensity.
 
-    If only the shape counts, the points are grey.
+    Colours have 8 bits, unless they are of other `types`. If only the shape counts, the points are grey.
     """
+    if labels:
+        return PointSource(path, partial(_read_labels, path, read, labels), num_points)
+    if types and channel == "colors":
+        brightest = find_full_brightness(path, types)
+        locate = partial(point_label, path)
+        return PointSource(path, lambda: color_chunks(read(), brightest, locate), num_points)
+    limits = functools.cache(lambda: _limits(read()))
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: (RawCloud(*part) for part in read()),
-        "intensity": intensity_reader(read),
+        "intensity": lambda: (RawCloud(points, as_gray(values, *limits())) for points, values in read()),
         "shape": lambda: (RawCloud(points, np.full(points.shape, GRAY, np.uint8)) for points, _ in read()),
     }
-    return PointSource(
-        path, partial(_read_labels, path, read, labels) if labels else readers[channel], num_points
-    )
+    return PointSource(path, readers[channel], num_points)
 
 
-def color_source(path: Path, read: PartReader, types: Sequence[str], num_points: int) -> PointSource:
-    """Return the points that `read` yields with three colours of these types, such as "u1"."""
-    brightest = find_full_brightness(path, types)
-    locate = partial(point_label, path)
-    return make_source(path, lambda: color_chunks(read(), brightest, locate), "colors", None, num_points)
-
-
-def column_source(
-    path: Path,
-    read_columns: Callable[[], Iterator[Columns]],
-    types: Sequence[str],
-    channel: Channel,
-    labels: Labels | None,
-    num_points: int,
-) -> PointSource:
-    """Return points in columns x y z, with three colours of these types, or with a scalar, or alone."""
-    is_colored = len(types) == len(COLOR_NAMES[0])
-
-    def read() -> Iterator[Part]:
-        for columns in read_columns():
-            values = np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64)
-            yield points_of(columns), values
-
-    if is_colored:
-        return color_source(path, read, types, num_points)
-    return make_source(path, read, channel, labels, num_points)
-
-
-def intensity_reader(read: PartReader) -> ChunkReader:
-    """Return `read_chunks` of a PointSource for a reader of points and their intensity."""
-    limits = functools.cache(lambda: _limits(read()))
-    return lambda: (RawCloud(points, as_gray(intensity, *limits())) for points, intensity in read())
+def join_columns(read_columns: Callable[[], Iterator[Columns]]) -> Iterator[Part]:
+    """Yield points in columns x y z, with three colours, or with a scalar, or alone."""
+    for columns in read_columns():
+        is_colored = len(columns) == 6
+        yield (
+            points_of(columns),
+            np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64),
+        )
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:

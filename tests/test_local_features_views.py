@@ -1,6 +1,7 @@
-"""The scan as a grey picture: the nearest is shown, gaps are closed, what shines through them is dropped."""
+"""Views from which local features are found: where, and what they show."""
 
 import cv2
+import naive
 import numpy as np
 import pytest
 import rooms
@@ -8,10 +9,139 @@ import rooms
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import Cloud
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.geometry.sphere import compute_indices, pixel_rays
+from piccolo.geometry.sphere import compute_indices, make_grid, pixel_rays
 from piccolo.jobs.threads import Workers
+from piccolo.local_features import feature_map
+from piccolo.local_features.feature_map import cell_table, view_positions
+from piccolo.local_features.perspective_view import MULTIPLE, cover_sphere, view_around
 from piccolo.local_features.view_image import fill_gaps, render_gray
 from research.synthetic.raycast import cast_rays
+
+SPHERE = 512
+FOCAL = 120.0
+RAYS = pixel_rays(SPHERE)
+STRAIGHT_UP = np.array([0.0, -np.pi / 2.0, 0.0])
+
+
+def _shown(turn, half_width=0.7, half_height=0.5):
+    """The mask of a pinhole picture whose axes are turned by a rotation vector."""
+    x, y, z = np.moveaxis(RAYS @ exp_so3(np.asarray(turn)), -1, 0)
+    return (x > 0.0) & (np.abs(y) < half_width * x) & (np.abs(z) < half_height * x)
+
+
+@pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.0, 0.0, np.pi), (0.0, 0.4, -2.0), STRAIGHT_UP])
+def test_a_view_holds_all_that_a_photo_shows(turn):
+    is_valid = _shown(turn)
+    view = view_around(is_valid, FOCAL, SPHERE)
+    assert view.focal == FOCAL
+    height, width = view.is_own.shape
+    assert height % MULTIPLE == width % MULTIPLE == 0
+    np.testing.assert_allclose(view.R_sphere_from_view @ view.R_sphere_from_view.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(view.R_sphere_from_view) == pytest.approx(1.0)
+    np.testing.assert_allclose(view.R_sphere_from_view[:, 0], exp_so3(np.asarray(turn))[:, 0], atol=0.02)
+    rows, columns = view.project(RAYS[is_valid])
+    assert 3 < rows.min() < rows.max() < height - 4
+    assert 3 < columns.min() < columns.max() < width - 4
+    assert (view.cut_mask(is_valid)[rows, columns] == 255).mean() > 0.97
+    assert not view.cut_mask(is_valid)[[0, 0, -1, -1], [0, -1, 0, -1]].any()
+
+
+def test_a_level_photo_is_not_turned_about_its_axis():
+    """A side of the sphere's picture is a side of the view; its shape is that of the photo."""
+    view = view_around(_shown((0.0, 0.0, 1.0), half_width=0.8, half_height=0.3), FOCAL, SPHERE)
+    np.testing.assert_allclose(view.R_sphere_from_view[:, 2], [0.0, 0.0, 1.0], atol=1e-3)
+    height, width = view.is_own.shape
+    assert width > 2 * height
+    steps = np.abs(np.diff(view.columns[height // 2]))
+    np.testing.assert_allclose(steps, SPHERE / (2.0 * np.pi * FOCAL), rtol=0.5)
+
+
+def test_what_is_too_wide_for_one_picture_has_no_view_around_it():
+    assert view_around(_shown((0, 0, 0), half_width=1.0, half_height=0.5), FOCAL, SPHERE) is not None
+    assert view_around(_shown((0, 0, 0), half_width=1.3, half_height=0.5), FOCAL, SPHERE) is None
+    assert view_around(np.ones((SPHERE // 2, SPHERE), bool), FOCAL, SPHERE) is None
+    assert view_around(np.zeros((SPHERE // 2, SPHERE), bool), FOCAL, SPHERE) is None
+
+
+def test_pixels_of_a_view_show_what_they_are_cut_from():
+    """A picture of the azimuth, across the seam: each pixel has that of its ray."""
+    ramp = np.abs(np.arange(SPHERE) - SPHERE // 2).astype(np.float32) / (SPHERE // 2) * 255.0
+    picture = np.repeat(ramp[None].astype(np.uint8), SPHERE // 2, axis=0)
+    for view in (view_around(_shown((0.0, 0.1, 3.0)), FOCAL, SPHERE), cover_sphere(SPHERE)[4]):
+        image = view.cut(picture)
+        rows, columns = np.mgrid[5 : image.shape[0] : 20, 5 : image.shape[1] : 20].reshape(2, -1)
+        height, width = image.shape
+        across = (0.5 * width - 0.5 - columns) / view.focal
+        up = (0.5 * height - 0.5 - rows) / view.focal
+        rays = np.stack([np.ones(len(up)), across, up], axis=1) @ view.R_sphere_from_view.T
+        azimuth = np.abs(np.arctan2(rays[:, 1], rays[:, 0]))
+        np.testing.assert_allclose(image[rows, columns], azimuth / np.pi * 255.0, atol=2.5)
+        np.testing.assert_array_equal(view.project(rays), (rows, columns))
+
+
+def test_each_direction_is_one_views_own():
+    owners = sum(
+        np.isin(np.arange(RAYS[..., 0].size), view.find_own(RAYS.reshape(-1, 3))).astype(int)
+        for view in cover_sphere(SPHERE)
+    )
+    np.testing.assert_array_equal(owners, 1)
+
+
+RINGS = 24
+CELLS = len(make_grid(RINGS))
+
+
+def _open(count, distance=50.0):
+    return np.full((count, CELLS), distance, np.float32)
+
+
+def _positions(centers, ranges, num_known=0):
+    """Positions, of which each is looked from but once."""
+    looked = []
+    found = view_positions(centers, lambda k: looked.append(k) or ranges[k], RINGS, num_known)
+    assert len(looked) == len(set(looked)) <= len(centers)
+    return found
+
+
+def test_positions_equal_their_twin():
+    rng = np.random.default_rng(4)
+    centers = rng.uniform([0, 0, 0], [9, 7, 3], (120, 3))
+    ranges = rng.choice([0.0, 0.3, 1.0, 2.0], (120, CELLS)).astype(np.float32)
+    found = _positions(centers, ranges)
+    assert 5 < len(found) < 120
+    assert found.tolist() == naive.view_positions(centers, ranges, RINGS)
+
+
+def test_what_is_near_and_seen_needs_no_position():
+    centers = np.array([[0.0, 0, 1], [2.0, 0, 1], [2.6, 0, 1], [0.0, 0, 3.3], [0.0, 0, 3.5]])
+    assert _positions(centers, _open(5)).tolist() == [0, 2, 4]
+    behind_a_wall = _open(5)
+    behind_a_wall[0, cell_table(RINGS)[24]] = 0.5  # level, all around
+    assert _positions(centers[:2], behind_a_wall[:2]).tolist() == [0, 1]
+    thin = _open(5)
+    thin[0, cell_table(RINGS)[24]] = 1.1  # what is hardly behind is seen
+    assert _positions(centers[:2], thin[:2]).tolist() == [0]
+    assert len(_positions(np.empty((0, 3)), _open(0))) == 0
+
+
+def test_known_positions_spare_others_and_are_not_named_again():
+    rng = np.random.default_rng(4)
+    centers = rng.uniform([0, 0, 0], [9, 7, 3], (120, 3))
+    alone = _positions(centers, _open(120))
+    known = np.concatenate([centers[alone[:4]], centers])
+    more = _positions(known, _open(124), 4)
+    assert more.min() >= 4
+    assert (more - 4).tolist() == alone[4:].tolist()
+    assert len(_positions(np.concatenate([centers[alone], centers]), _open(200), len(alone))) == 0
+
+
+def test_positions_are_bounded(monkeypatch):
+    centers = np.stack(np.meshgrid(np.arange(30) * 3.0, np.arange(30) * 3.0, [1.5]), axis=-1).reshape(-1, 3)
+    ranges = _open(len(centers))
+    assert len(_positions(centers, ranges)) == 900
+    monkeypatch.setattr(feature_map, "MAX_VIEWS", 300)
+    assert 50 < len(_positions(centers, ranges)) <= 300
+
 
 WIDTH = 256
 EVERYWHERE = np.ones((WIDTH // 2, WIDTH), bool)

@@ -1,9 +1,12 @@
-"""The shape of a scan as its colours: creases and borders of its surfaces, which photos show as edges.
+"""The surfaces of a scan: their edges, which photos show too, painted as colours; and noise across them.
 
 A crease is where neighbouring normals differ, by the second eigenvalue of their mean outer product. A border
 is where a surface ends: the points around lie to one side. Both are painted as two of the three opponent
 channels of a colour: how strong the edge is, and how much stronger vertical ones are than the others. The
 third is the intensity of the points, if they have one.
+
+Noise is similar at all points and averages out over those that a photo shows, but for a part of it; where
+scans are shifted against each other, each surface is there twice, and a pose may follow one or the other.
 """
 
 from typing import Any, NamedTuple
@@ -11,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32
+from ..arrays import Array, Array32, Int64s
 from ..geometry.colors import colors_of_edges
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
@@ -21,6 +24,16 @@ FULL_CREASE = 0.6  # root of the second eigenvalue; 0.7 for two planes at a righ
 BORDER = 0.08, 0.28  # distance of the surroundings' middle, divided by the radius: nothing, and a full border
 VERTICAL = 0.8, 0.95  # cosine of an edge's angle to the vertical: not vertical at all, and fully
 VERTICAL_BORDER = 0.9, 0.98
+CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the scan is thin
+MIN_LEAVES = 20
+MIN_CELLS = 200
+MAX_CELLS = 20_000
+NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, from trials with noise of 1 to 5 cm
+ONE_SHEET = 2.5  # kurtosis of noise within a cell, about; of two thin sheets it is 1
+ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
+NUM_ITERATIONS = 20
+LEAST_RESIDUAL = 1e-5  # [m^2] of cells that fit, all alike
+RIDGE = 3e-3  # on the squared norm of the tensor: two walls at a right angle leave a part undetermined
 
 
 class Surroundings(NamedTuple):
@@ -57,10 +70,7 @@ def color_edges(nodes: Array32, around: Surroundings, workers: Workers) -> Array
 
 
 def find_edges(points: Array, around: Surroundings, workers: Workers) -> Array:
-    """Return the edges (N, 2) of surfaces at points (N, 3) [m], z up, each in [0, 1].
-
-    They are how strong an edge is, and how strong a vertical one.
-    """
+    """Return how strong edges, and vertical ones, are at points (N, 3) [m], z up: (N, 2), each in [0, 1]."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 
     tree = cKDTree(points)
@@ -111,3 +121,70 @@ def edges_of(points: Array, tree: Any, normals: Array, around: Surroundings, par
 def rise(values: Array, limits: tuple[float, float]) -> Array:
     """Return values that rise from 0 at the first limit to 1 at the second."""
     return np.clip((values - limits[0]) / (limits[1] - limits[0]), 0.0, 1.0)
+
+
+def surface_variance(octree: Octree) -> Array:
+    """Return the covariance (3, 3) [m^2] of a position aligned with a scan, from the scan's own errors.
+
+    It is zero for a scan with too few points. Each cell measures one direction, its normal: the tensor
+    is the one that fits most cells (least absolute deviations).
+    """
+    for levels_up in CELLS:
+        cells = residual_moments(octree, levels_up)
+        if len(cells[1]) >= MIN_CELLS:
+            return fit_tensor(*cells)
+    return np.zeros((3, 3))
+
+
+def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
+    """Return normals (C, 3) of the planes through the leaves of cells, and variances (C,) across them [m^2].
+
+    The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; those of two sheets at
+    +-b with noise of variance s^2 have E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. The result is b^2 and a part of s^2.
+    """
+    leaves, first, counts = leaves_by_cell(octree, levels_up)
+    cell = np.repeat(np.arange(len(counts)), counts)
+    offsets = leaves - (np.add.reduceat(leaves, first) / counts[:, None])[cell]
+    products = (offsets[:, :, None] * offsets[:, None, :]).reshape(-1, 9)
+    moments = (np.add.reduceat(products, first) / counts[:, None]).reshape(-1, 3, 3)
+    variances, axes = np.linalg.eigh(moments)
+    normals = axes[:, :, 0]
+    across = np.maximum(variances[:, 0], ROUGHNESS**2)
+    residuals = np.einsum("ij,ij->i", offsets, normals[cell])
+    kurtosis = np.add.reduceat(residuals**4, first) / counts / across**2
+    across -= ROUGHNESS**2
+    of_sheets = np.sqrt(np.clip((ONE_SHEET - kurtosis) / (ONE_SHEET - 1.0), 0.0, 1.0)) * across
+    return normals, of_sheets + NOISE_SHARE**2 * (across - of_sheets)
+
+
+def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, Int64s, Int64s]:
+    """Return the leaves (N, 3) [m] of a level's fuller cells, and each cell's first one and their number."""
+    level = len(octree.level_start) - 2 - levels_up
+    edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
+    for _ in range(levels_up):
+        edges = octree.first_child[edges]
+    full = np.flatnonzero(np.diff(edges) >= MIN_LEAVES)
+    full = full[np.linspace(0, len(full) - 1, min(len(full), MAX_CELLS)).astype(np.int64)]
+    if len(full) == 0:
+        return np.empty((0, 3)), full, full
+    counts = (edges[full + 1] - edges[full]).astype(np.int64)
+    first = np.cumsum(counts) - counts
+    index = np.arange(counts.sum()) + np.repeat(edges[full] - first, counts)
+    return octree.nodes[index, :3].astype(np.float64), first, counts
+
+
+def fit_tensor(normals: Array, variances: Array) -> Array:
+    """Fit a positive tensor T (3, 3), so that n T n is near the variance (C,) along each normal n (C, 3)."""
+    rows, columns = np.triu_indices(3)
+    twice = np.where(rows == columns, 1.0, 2.0)
+    design = normals[:, rows] * normals[:, columns] * twice
+    weights = np.ones(len(variances))
+    tensor = np.zeros((3, 3))
+    for _ in range(NUM_ITERATIONS):  # reweighted least squares
+        weighted = design * weights[:, None]
+        normal_matrix = design.T @ weighted + RIDGE * weights.sum() * np.diag(twice)
+        found = np.linalg.solve(normal_matrix, weighted.T @ variances)
+        weights = 1.0 / np.maximum(np.abs(design @ found - variances), LEAST_RESIDUAL)
+    tensor[rows, columns] = tensor[columns, rows] = found
+    values, axes = np.linalg.eigh(tensor)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

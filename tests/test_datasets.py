@@ -1,4 +1,4 @@
-"""Lists of anybody's panoramas: columns, directions, axes, and what is refused."""
+"""Data sets: the ways in which poses may be meant, lists of anybody's panoramas, and damaged files."""
 
 import json
 from pathlib import Path
@@ -6,12 +6,57 @@ from pathlib import Path
 import dataset_rooms as made
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from poses import jpeg, tilted_poses
+from refusals import mutated, read_or_refused
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli import export_poses
 from piccolo.scene import read_scene
+from research.datasets import checking
+from research.datasets.convert_dataset import list_scenes
+from research.datasets.files import AXES, DIRECTIONS, pose_of_transform
+from research.datasets.model import ConvertOptions
 
-AXES = {"optical": made.OPTICAL, "piccolo": made.FORWARD_LEFT_UP, "opengl": made.OPENGL}
+ORIGIN = np.array([10.0, -4.0, 2.0])
+
+
+def fit(score, best=checking.AS_GIVEN, best_score=None):
+    return checking.ConventionCheck("images/a.jpg", score, score if best_score is None else best_score, best)
+
+
+@pytest.mark.parametrize("axes", AXES)
+@pytest.mark.parametrize("direction", DIRECTIONS)
+@pytest.mark.parametrize("taken_axes", AXES)
+def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, taken_axes):
+    (pose,) = tilted_poses(1, center=np.array([11.0, -3.0, 3.5]))
+    T = np.column_stack([pose.R_cam_from_world, pose.center_world])
+    true = pose_of_transform("T", T, direction, axes)
+    (other,) = set(DIRECTIONS) - {direction}
+    for taken_direction in (direction, other):
+        taken = pose_of_transform("T", T, taken_direction, taken_axes)
+        local = type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN)
+        found = checking.convention_variants(local, ORIGIN)
+        assert any(
+            np.allclose(p.R_cam_from_world, true.R_cam_from_world)
+            and np.allclose(p.center_world + ORIGIN, true.center_world)
+            for p in found.values()
+        )
+
+
+def test_more_than_half_must_fit_and_advice_names_the_way_that_fits_most():
+    assert checking.Check((fit(0.5), fit(0.4), fit(0.02))).is_passed
+    assert not checking.Check((fit(0.5), fit(0.02))).is_passed
+    assert not checking.Check((fit(0.3, "axes are x", 0.4),)).is_passed
+    wrong = fit(0.02, "the camera's x, y, z are z, x, y", 0.6)
+    advice = checking.Check((wrong, wrong, fit(0.1))).advice
+    assert "scores 0.02, 0.02, 0.10, wanted 0.1 or more; 0.60 if the camera's x, y, z are z, x, y" in advice
+    fits = wrong, fit(0.02), fit(0.05, "others", 0.06)
+    assert checking.Check(fits).advice.endswith("no other axes fit better")
+
+
+ALL_AXES = {"optical": made.OPTICAL, "piccolo": made.FORWARD_LEFT_UP, "opengl": made.OPENGL}
 COLUMNS = ("image", "tx", "ty", "tz", "qw", "qx", "qy", "qz", "direction", "axes", "variant", "room")
 
 
@@ -39,9 +84,9 @@ def folder(tmp_path):
     made.write_text_cloud(root / "scan.xyz", *made.points_and_colors(), decimals=6)
     rows = []
     directions = ("world_from_cam", "cam_from_world")
-    for k, (axes, direction) in enumerate((a, d) for a in AXES for d in directions):
+    for k, (axes, direction) in enumerate((a, d) for a in ALL_AXES for d in directions):
         camera = made.cameras(6)[k]
-        made.write_picture(root / "images" / f"{100 + k}.5.png", made.picture(*camera, AXES[axes])[0])
+        made.write_picture(root / "images" / f"{100 + k}.5.png", made.picture(*camera, ALL_AXES[axes])[0])
         rows.append(entry(f"images/{100 + k}.5.png", camera, direction, axes))
     (root / "rows.json").write_text(json.dumps(rows))
     return root
@@ -170,3 +215,91 @@ def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
     for one, other in zip(read_scene(first).queries, second, strict=True):
         np.testing.assert_allclose(other.pose.R_cam_from_world, one.pose.R_cam_from_world, atol=1e-14)
         assert np.array_equal(other.pose.center_world, one.pose.center_world)
+
+
+TRANSFORM = np.eye(4)[[1, 2, 0, 3]]
+STEM = "camera_00_office_1_frame_equirectangular_domain"
+ROW = {
+    "image": "a.jpg", "tx": "1.5", "ty": 2, "tz": 3, "qw": 0.5, "qx": 0.5, "qy": 0.5, "qz": 0.5,
+    "direction": "world_from_cam", "axes": "optical", "room": "r",
+}  # fmt: skip
+CSV = f"{','.join(ROW)}\n{','.join(map(str, ROW.values()))}\n"
+SKYBOX = "house/matterport_skybox_images/ab_skybox"
+# by dataset: the file of poses, its content, and what else must be there
+FILES = {
+    "stanford2d3ds": (
+        f"area_1/pano/pose/{STEM}_pose.json",
+        '{"camera_location": [1.5, 2.0, 1.0], "final_camera_rotation": [1.5, 0.1, -2.0]}',
+        (f"area_1/pano/rgb/{STEM}_rgb.png", "Area_1/office_1/office_1.txt"),
+    ),
+    "omniscenes": (
+        "a_pose/b_hall_1_scene_1/c.txt",
+        "0 1 0 1.5\n0 0 1 2\n1 0 0 3\n",
+        ("a_pano/b_hall_1_scene_1/c.jpg", "pcd/hall_1.txt"),
+    ),
+    "360loc": (
+        "hall/query_360/s/camera_pose.json", json.dumps({"a.jpg": TRANSFORM.tolist()}), ["hall/cloud.xyz"]
+    ),
+    "matterport3d": (
+        "house/matterport_camera_poses/ab_pose_1_5.txt",
+        "\n".join(" ".join(map(str, row)) for row in TRANSFORM),
+        ("house/house_segmentations/house.ply", *(f"{SKYBOX}{k}_sami.jpg" for k in range(6))),
+    ),
+    "generic": ("poses.csv", CSV, ("cloud.xyz",)),
+    "generic json": ("poses.json", json.dumps([ROW]), ("cloud.xyz",)),
+    "generic tum": ("poses.txt", "1.5 1 2 3 0 0 0 1\n2.5 1 2 3 0 0 1 0\n", ("cloud.xyz", "images/1.5.jpg")),
+}  # fmt: skip
+
+
+def read_poses(name, folder):
+    options = ConvertOptions(folder, axes="optical" if name == "generic tum" else None)
+    listed = list_scenes(name.split()[0], options)
+    return [panorama.pose for spec in listed.specs for panorama in spec.panoramas]
+
+
+@pytest.fixture(scope="module", params=FILES)
+def dataset(request, tmp_path_factory):
+    """Name, folder, path of the poses and their whole content."""
+    folder = tmp_path_factory.mktemp("data set")
+    name, content, others = FILES[request.param]
+    for other in (name, *others):
+        (folder / other).parent.mkdir(parents=True, exist_ok=True)
+        jpeg(folder / other)
+    (folder / name).write_text(content)
+    return request.param, folder, folder / name, content.encode()
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_damaged_files_are_read_or_refused(dataset, data):
+    name, folder, path, content = dataset
+    path.write_bytes(mutated(data.draw, st.integers, content))
+    poses, _ = read_or_refused(lambda _: read_poses(name, folder), path)
+    for pose in poses or []:
+        assert np.isfinite(pose.center_world).all()
+        assert np.linalg.det(pose.R_cam_from_world) == pytest.approx(1.0)
+
+
+def test_a_link_out_of_the_folder_is_refused_and_one_within_followed(dataset, tmp_path):
+    name, folder, path, content = dataset
+    path.write_bytes(content)
+    root, outside = tmp_path / "root", tmp_path / "outside"
+    root.symlink_to(folder)  # may be a link itself
+    for file in sorted(file for file in folder.rglob("*") if file.is_file()):
+        for target, is_within in ((folder / "kept", True), (outside, False)):
+            file.rename(target)
+            file.symlink_to(target)
+            try:
+                poses, message = read_or_refused(lambda _: read_poses(name, root), file.name)
+            finally:
+                target.rename(file)
+            assert len(poses or ()) == is_within, file
+            assert is_within or f"leads to {outside}, out of" in message
+
+
+@pytest.mark.parametrize("number", ["1e999", "1" + "0" * 400, "9" * 5000, "NaN", "[[[[]]]]", "null", '"x"'])
+def test_odd_numbers_are_refused(dataset, number):
+    name, folder, path, content = dataset
+    token = {"generic tum": " 1 ", "matterport3d": "1.0", "360loc": "1.0"}.get(name, "1.5")
+    path.write_text(content.decode().replace(token, token.replace(token.strip(), number), 1))
+    assert read_or_refused(lambda _: read_poses(name, folder), path)[1]
