@@ -218,9 +218,9 @@ def test_what_the_system_did_is_no_refusal_of_a_photo_without_an_answer(scenes, 
 def test_a_signal_ends_a_run_after_the_photo_at_work(scenes, tmp_path, monkeypatch, capsys):
     out, answer = tmp_path / "run.jsonl", Localizer.answer
 
-    def answer_late(self, scan, task):
+    def answer_late(self, *given):
         signal.raise_signal(signal.SIGTERM)
-        return answer(self, scan, task)
+        return answer(self, *given)
 
     with monkeypatch.context() as patched:
         patched.setattr(Localizer, "answer", answer_late)
