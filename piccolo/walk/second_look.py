@@ -48,7 +48,7 @@ def _refine_likely(tracker: Tracker, show: Progress) -> Path:
 
 
 def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
-    """List the rough states of a frame that are likely, or likely enough together to leave the best unsure."""
+    """List the rough states of a frame that are likely, or that together may leave the best unsure."""
     found = path.probabilities[k]
     states = tracker.frames[k].states if len(found) else []
     rough = sorted((j for j, state in enumerate(states) if not state.is_refined), key=lambda j: -found[j])
