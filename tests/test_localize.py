@@ -20,7 +20,7 @@ from test_result import RESULT
 
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
-from piccolo.cli import localize, prepare_map
+from piccolo.cli import execution, localize, prepare_map
 from piccolo.confidence.localization import FocalLength
 from piccolo.result import Result
 from piccolo.scene import read_scene
@@ -124,7 +124,7 @@ GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
     ],
 )
 def test_a_doubtful_result_says_what_to_do(change, advice):
-    found = localize.advise(replace(RESULT, **{"status": "not_localized", **change}))
+    found = execution.advise(replace(RESULT, **{"status": "not_localized", **change}))
     assert len(found) == len(advice)
     assert all(map(re.match, advice, found))
 

@@ -128,8 +128,8 @@ def times_of(frames: Sequence[Path], source: str | None) -> list[float] | None:
 def exif_times(frames: Sequence[Path]) -> list[float] | None:
     """Seconds by EXIF; None if one has none, or can't be read.
 
-    Times without an offset from UTC are counted as they are: no time zone is guessed, where an hour may come
-    twice. If frames differ in this, no offset counts.
+    Times without an offset from UTC count as they are: in a guessed time zone an hour may come twice. If only
+    some have one, none counts.
     """
     times: list[datetime] = []
     for frame in frames:

@@ -68,7 +68,7 @@ def read_odometry(
 
     A transforms.json names its frames. A trajectory has a pose of each frame in order, or, of TUM, poses by
     time [s]: each frame takes the nearest, within half of the time to the next frame. If `times` are by a
-    clock, that may be the trajectory's; or else the trajectory begins at 0 with the first frame.
+    clock, it is tried as the trajectory's first. Else both begin at 0.
     Raises InputError if the file is no odometry, or of other frames.
     """
     if path.suffix == ".json":

@@ -142,7 +142,7 @@ class Records:
     ) -> Iterator[Name]:
         """Yield the panoramas without a result, as they come.
 
-        One has a result if its file is as it was, by its digest, or can't be read now, and did not fail.
+        One is done if its line did not fail, and its file has the same digest or can't be read now.
         """
         for pano in panoramas:
             lines = self._others.get(str(pano), [])

@@ -17,8 +17,8 @@ from ..result import Result, localization_of, with_localization
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
 LEAST_CONFIDENCE = 0.95  # of these: about the log odds of 3 that frames of walks need
-BETTER = 0.7  # of the deviation of a focal length: most that others must have
-ONE_CAMERA = 1.02  # most between focal lengths given of one camera, as focusing changes them
+BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
+ONE_CAMERA = 1.02  # largest ratio of neighbouring given focal lengths of one camera: focusing changes them
 TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
 
 
@@ -72,7 +72,7 @@ def parse_line(text: str) -> Line:
 
 
 def list_looks_by_focal(texts: Sequence[str]) -> list[Look]:
-    """List the photos that are not sure, or another focal length fits, and that others tell it better."""
+    """List the photos whose focal length others know better, if they are not localized or theirs is off."""
     lines = [parse_line(text) for text in texts]
     looks = []
     for camera in group_by_camera(lines):

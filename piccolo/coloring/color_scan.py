@@ -39,7 +39,7 @@ PAINT_STD = 0.008  # [m] of positions in a scan whose colours are all of photos 
 PAINTED = "photos are localized by the colours that others gave to the scan"
 WIDTH = 4096  # [px] of a photo, at most
 SAMPLES = 1 << 21  # of photos at points, that a task holds
-LEAST_PAINTED = 0.25  # of what a photo sees: of 17 right ones with less, colours refused 14
+LEAST_PAINTED = 0.25  # of what a photo sees that must have paint; with less, most right ones were refused
 MOST_PHOTOS = 255  # that are counted for a point
 FULL = np.float32(255.0)
 

@@ -129,12 +129,13 @@ def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -
 
 def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[int, Localization]:
     """Return the results of photos together, or each by itself with the reason."""
+    cams = [member.cam_from_bundle for member in members.values()]
     bundles = propose_bundles(list(members.values()), errors)
     tested = [dict[int, Support]() for _ in bundles]
     for k, member in members.items():
         query = member.query.forget()
         for bundle, supports in zip(bundles, tested, strict=True):
-            supports[k] = find_support(member, query, bundle)
+            supports[k] = find_support(member, query, bundle, cams)
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
     if not bundles or probabilities[best] < EVEN:
@@ -146,7 +147,7 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
     if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
         near = agreed.adjusted.bundle
         supports |= {
-            k: find_support(members[k], members[k].query.forget(), near)
+            k: find_support(members[k], members[k].query.forget(), near, cams)
             for k, support in supports.items()
             if not support.is_found
         }

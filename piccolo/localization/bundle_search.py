@@ -73,10 +73,11 @@ class Support(NamedTuple):
     odds: float  # of that pose, against that none of the photo's poses is right
     odds_elsewhere: float  # of the photo's other poses
     num_places: int  # of the scan where a photo alone may be
+    odds_exchanged: float = 0.0  # of the places of the bundle's other photos, each as likely
 
     @property
     def weights(self) -> Array:
-        """Odds (4,): own pose right; own pose missed; photo outside of the scan; photo at its other poses.
+        """Odds (4,): own pose right; own pose missed; photo outside of the scan; photo at another pose.
 
         A photo alone has the odds of the best of all places. Once the others say which place it is, they are
         `num_places` times larger.
@@ -84,7 +85,8 @@ class Support(NamedTuple):
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
         right = belongs * (1.0 - self.local_share) * here
-        of_others = [CONTRADICTED, CONTRADICTED * self.odds_elsewhere]
+        exchanged = self.odds_exchanged * self.num_places
+        of_others = [CONTRADICTED, CONTRADICTED * (self.odds_elsewhere + exchanged)]
         return np.array([right, belongs * (self.local_share * here + SILENT), *of_others])
 
     @property
@@ -168,14 +170,20 @@ def vote(member: Member, bundle: Bundle) -> float:
     return max((p for own, p in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), default=0.0)
 
 
-def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
-    """Return a photo's evidence for a bundle pose: its best own pose near the prediction."""
+def find_support(member: Member, query: Query, bundle: Bundle, cams_from_bundle: Sequence[Pose]) -> Support:
+    """Return a photo's evidence for a bundle pose: its best own pose near the prediction.
+
+    It may be at the place of another of the photos, whose relative poses are given: named wrongly.
+    """
     expected = bundle.place(member.cam_from_bundle)
     poses = [own for own, _ in member.own_poses]
     own = next((h for h in poses if ONE_IN_BUNDLE.holds(h.pose, expected)), None)
     found = own or max(list_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
+    places = [bundle.place(cam) for cam in cams_from_bundle]
+    places = [place for place in places if not ONE_IN_BUNDLE.holds(place, expected)]
+    poses += [score_pose(query, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in poses)]
     errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
         errors = estimate_covariance(query, found.pose, compare(query, found.pose))
@@ -185,7 +193,11 @@ def find_support(member: Member, query: Query, bundle: Bundle) -> Support:
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
     num_places = len(query.scan_map.sparse)
-    return Support(found, errors.gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places)
+    there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in poses]
+    exchanged = float(p[:-1][there].sum()) / none / max(len(places), 1)
+    return Support(
+        found, errors.gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places, exchanged
+    )
 
 
 def list_near(query: Query, expected: Pose) -> list[Hypothesis]:

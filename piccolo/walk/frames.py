@@ -1,8 +1,8 @@
 """The frames of a walk: the poses that each may have, and their odds.
 
 A key frame was compared with the whole scan: its states are all the places that look like its photo, each
-once, most of them as rough as the grid of candidates. The frames after it are tracked, and have one pose:
-wherever the key frame was, they are as far from there.
+once, most of them as rough as the grid of candidates. The frames after it are tracked, and have one pose
+each: wherever the key frame is, their motion from it is the same.
 """
 
 import math

@@ -73,8 +73,8 @@ class _Column(NamedTuple):
 def emissions(frame: Frame, tracked: float = -math.inf) -> tuple[Array, float]:
     """Return log odds (S,) of a key frame's states against none.
 
-    Their sum is what the frame's best pose has, or the best of those tracked from it, if these are known and
-    have more; the second result is the log of the number that share it.
+    They share the odds of the frame's best state, or of the best frame tracked from it if that has more; the
+    second result is the log of the number that share these.
     """
     odds = np.array([state.log_odds for state in frame.states])
     tolerance = 0.0 if frame.is_localized_alone else COPY_LOG_ODDS

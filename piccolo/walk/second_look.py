@@ -48,12 +48,12 @@ def _refine_likely(tracker: Tracker, show: Progress) -> Path:
 
 
 def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
-    """List the rough states of a frame that are likely, or together leave the likeliest unsure."""
+    """List the rough states of a frame that are likely, or likely enough together to leave the best unsure."""
     found = path.probabilities[k]
     states = tracker.frames[k].states if len(found) else []
     rough = sorted((j for j, state in enumerate(states) if not state.is_refined), key=lambda j: -found[j])
     left = np.cumsum(found[rough][::-1])[::-1]  # with those that are less likely
-    limit = 1.0 - MIN_CONFIDENCE  # less leaves another sure
+    limit = 1.0 - MIN_CONFIDENCE  # with less in all, the best stays sure
     return [
         j
         for j, total in zip(rough, left, strict=True)

@@ -47,7 +47,7 @@ Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it ca
 NUM_QUERIES = 4  # are kept, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
-ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] a camera of so long a reach may be at another place
+ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
 
 
 class Expected(NamedTuple):
@@ -79,8 +79,8 @@ class Tracker:
         self.lattice: Lattice = Lattice(FreeSpace(scan_map, workers), motion)
         self.read: Read = lambda k: None  # until somebody keeps the pictures
         self.queries: dict[int, Query] = {}  # by the number of the frame
-        self.found_at: float = -math.inf  # time when the camera was found last, or searched first
-        self.next_search: float = 0.0  # [m] that it may have gone since, when it is searched everywhere
+        self.found_at: float = -math.inf  # time when it was last found; before that, of the first search
+        self.next_search: float = 0.0  # [m] reach since then at which all places are searched again
 
     @property
     def frames(self) -> list[Frame]:
@@ -223,7 +223,7 @@ class Tracker:
 def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -> list[State]:
     """List the states of a key frame: the poses that were found for it, best first, and all other places.
 
-    If the photo is sure by itself, the others have all of one frame's evidence against them.
+    If the photo is sure by itself, other places get the lowest odds that one frame may give.
     """
     best = own[0]
     limit = -MOST_ODDS - COPY_LOG_ODDS if is_sure else 0.0
