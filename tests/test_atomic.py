@@ -1,3 +1,5 @@
+import contextlib
+import fcntl
 import os
 import signal
 import subprocess
@@ -7,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from batches import run
 from refusals import assert_input_error
 
 from piccolo.cli.checks import UsageError, check_distinct, check_outputs, check_suffix
 from piccolo.cli.command import command
 from piccolo.errors import InputError
 from piccolo.files import atomic
+from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.geometry.pose import Pose
 from piccolo.scene import Query, write_queries
 
@@ -227,3 +231,49 @@ def test_two_outputs_that_are_one_and_inputs_are_refused(tmp_path):
     for name in ("x.jpg", "x", ".png"):
         with pytest.raises(UsageError, match=rf"--overlay {name}: wanted a name that ends with \.png"):
             check_suffix("--overlay", Path(name), (".png",))
+
+
+def test_two_processes_do_not_write_one_file(tmp_path):
+    out = tmp_path / "poses.jsonl"
+    for line in ('{"a": 1}', '{"b": 2}'):
+        with open_locked(out) as file:
+            file.append(line)
+            with pytest.raises(InputError, match="another process is writing it"), open_locked(out):
+                pass
+    assert list(whole_lines(out, whole_size(out, b"{", "a test"))) == [b'{"a": 1}\n', b'{"b": 2}\n']
+    with open_locked(tmp_path / "new"):
+        pass
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, monkeypatch):
+    """The first of two writes nothing and removes the file, which the second has opened before."""
+    out = tmp_path / "poses.jsonl"
+    flock = fcntl.flock
+    first = contextlib.ExitStack()
+    first.enter_context(open_locked(out))
+
+    def flock_late(handle, how):
+        first.close()
+        flock(handle, how)
+
+    monkeypatch.setattr(fcntl, "flock", flock_late)
+    with open_locked(out) as file:
+        file.append("{}")
+    assert out.read_text() == "{}\n"
+
+
+def test_a_full_disk_keeps_the_lines_before(tmp_path):
+    out = tmp_path / "poses.jsonl"
+    code = """
+import resource, sys
+from pathlib import Path
+from piccolo.files.line_file import open_locked
+resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
+with open_locked(Path(sys.argv[1])) as file:
+    for k in range(9):
+        file.append(str(k) * 300)
+"""
+    done = run([sys.executable, "-c", code, str(out)], cwd=ROOT)
+    assert "File too large" in done.stderr
+    assert out.read_text() == "".join(f"{str(k) * 300}\n" for k in range(3))

@@ -1,8 +1,6 @@
 """Batches: what is named, what is written, and how a stopped one goes on."""
 
-import contextlib
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -13,13 +11,12 @@ from pathlib import Path
 from typing import ClassVar
 
 import pytest
-from batches import PAPER, ROOT, run, start_localize
+from batches import PAPER, start_localize
 
 from piccolo.batch import localizer as module
 from piccolo.batch.inputs import list_panoramas
 from piccolo.cli import localize, options
 from piccolo.errors import InputError
-from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.result import read_results
 from piccolo.scene import read_scene
 
@@ -63,7 +60,8 @@ def _lines(out):
 def two(scene, tmp_path_factory):
     """Two photos, the second of which lies elsewhere, and the content of their file of results."""
     folder = tmp_path_factory.mktemp("two")
-    photo, out = folder / "clean_1.jpg", folder / "poses.jsonl"
+    photo = folder / "clean_1.jpg"
+    out = folder / "poses.jsonl"
     photo.write_bytes((scene / "images" / "clean_1.jpg").read_bytes())
     panos = [str(scene / "images" / "clean_0.jpg"), str(photo)]
     assert _run(scene, out, "--quiet", pano=panos) == 0
@@ -337,48 +335,6 @@ def test_a_signal_ends_a_batch_after_the_photo_at_work(scene, out):
     assert "Traceback" not in err
     assert 1 <= len(_lines(out)) < 30
     assert out.read_bytes().endswith(b"\n")
-
-
-def test_two_processes_do_not_write_one_file(tmp_path, out):
-    for line in ('{"a": 1}', '{"b": 2}'):
-        with open_locked(out) as file:
-            file.append(line)
-            with pytest.raises(InputError, match="another process is writing it"), open_locked(out):
-                pass
-    assert list(whole_lines(out, whole_size(out, b"{", "a test"))) == [b'{"a": 1}\n', b'{"b": 2}\n']
-    with open_locked(tmp_path / "new"):
-        pass
-    assert not (tmp_path / "new").exists()
-
-
-def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(out, monkeypatch):
-    """The first of two writes nothing and removes the file, which the second has opened before."""
-    flock, first = fcntl.flock, contextlib.ExitStack()
-    first.enter_context(open_locked(out))
-
-    def flock_late(handle, how):
-        first.close()
-        flock(handle, how)
-
-    monkeypatch.setattr(fcntl, "flock", flock_late)
-    with open_locked(out) as file:
-        file.append("{}")
-    assert out.read_text() == "{}\n"
-
-
-def test_a_full_disk_keeps_the_lines_before(out):
-    code = """
-import resource, sys
-from pathlib import Path
-from piccolo.files.line_file import open_locked
-resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-with open_locked(Path(sys.argv[1])) as file:
-    for k in range(9):
-        file.append(str(k) * 300)
-"""
-    done = run([sys.executable, "-c", code, str(out)], cwd=ROOT)
-    assert "File too large" in done.stderr
-    assert out.read_text() == "".join(f"{str(k) * 300}\n" for k in range(3))
 
 
 def test_a_full_device_is_named(scene, capsys):

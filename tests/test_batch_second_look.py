@@ -51,7 +51,9 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     """A narrow photo of what a wide one shows, which is added to the run; a copy of itself is none."""
     room, pose = place(1)
     near = Pose(yaw_rotation(0.2) @ pose.R_cam_from_world, pose.center_world + np.array([0.15, 0.1, 0.05]))
-    photos, cameras, out = tmp_path / "photos", tmp_path / "cameras", tmp_path / "poses.jsonl"
+    photos = tmp_path / "photos"
+    cameras = tmp_path / "cameras"
+    out = tmp_path / "poses.jsonl"
     photos.mkdir()
     cameras.mkdir()
     for name, focal, at in (("narrow", 180.0, near), ("wide", 100.0, pose)):

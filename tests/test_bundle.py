@@ -120,6 +120,9 @@ def test_a_photo_belongs_to_the_others_or_does_not():
     assert MISSES.shares.argmax() == 1, "shows nothing"
     assert MISSES.shares[1] < 0.9, "so it may be of another place"
     assert _support(0.0, 30.0, is_found=False).shares.argmax() == 3, "it is surely elsewhere"
+    weak = _support(0.01)
+    assert weak._replace(odds_exchanged=0.01).shares.argmax() == 0, "no likelier at another photo's place"
+    assert weak._replace(odds_exchanged=3.0).shares.argmax() == 3, "they may have been exchanged"
 
 
 def test_an_own_pose_far_from_the_one_expected_is_doubted():

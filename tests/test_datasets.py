@@ -283,7 +283,8 @@ def test_damaged_files_are_read_or_refused(dataset, data):
 def test_a_link_out_of_the_folder_is_refused_and_one_within_followed(dataset, tmp_path):
     name, folder, path, content = dataset
     path.write_bytes(content)
-    root, outside = tmp_path / "root", tmp_path / "outside"
+    root = tmp_path / "root"
+    outside = tmp_path / "outside"
     root.symlink_to(folder)  # may be a link itself
     for file in sorted(file for file in folder.rglob("*") if file.is_file()):
         for target, is_within in ((folder / "kept", True), (outside, False)):

@@ -154,7 +154,8 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
 
 
 def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
-    photos, cameras = tmp_path / "photos", tmp_path / "cameras"
+    photos = tmp_path / "photos"
+    cameras = tmp_path / "cameras"
     photos.mkdir()
     cameras.mkdir()
     rgb = render_picture(Mount(pinhole(240, 180, 75.0)), *place(), Workers(2))

@@ -168,7 +168,8 @@ def test_facts_are_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
 
 
 def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, monkeypatch):
-    path, read = tmp_path / "a.ply", []
+    path = tmp_path / "a.ply"
+    read = []
     path.write_bytes(b"one")
     of_file = hashlib.file_digest
     monkeypatch.setattr(hashlib, "file_digest", lambda *args: read.append(args) or of_file(*args))
@@ -186,7 +187,8 @@ def test_a_digest_is_taken_once_and_anew_when_the_file_changes(facts, tmp_path, 
 
 
 def test_a_map_is_checked_once_by_who_remembers_it(facts, tmp_path, monkeypatch):
-    path, checked = tmp_path / "a.map", []
+    path = tmp_path / "a.map"
+    checked = []
     save_map(scan_map(1), path)
     check = map_file.check_arrays
     monkeypatch.setattr(map_file, "check_arrays", lambda *args: checked.append(args) or check(*args))

@@ -215,7 +215,8 @@ def test_errors_in_common_are_not_averaged_away():
     pose, *_ = tilted_poses(1, NEAR)
     own = np.diag([1e-8] * 3 + [0.006**2] * 3)
     common = np.diag([1e-8] * 3 + [0.011**2] * 3)
-    squares, alone = [], []
+    squares = []
+    alone = []
     for _ in range(400):
         shared = np.sqrt(np.diag(common)) * rng.normal(size=6)
         found = [

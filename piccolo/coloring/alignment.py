@@ -331,7 +331,8 @@ def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> A
             break
         pairs.append(np.stack([a, a + apart], axis=1)[is_plain[a] & is_plain[a + apart]])
     a, b = np.concatenate(pairs).T
-    i, j = photo[a], photo[b]
+    i = photo[a]
+    j = photo[b]
     ratios = logs[b] - logs[a]
     gains = np.zeros((num_photos, 3))
     for _ in range(NUM_ROUNDS):

@@ -52,6 +52,7 @@ from .settings import CoarseToFineSettings
 
 EVEN = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
+NUM_NEIGHBORS = 8  # chosen: photos with one of which another may have been exchanged
 MOST_GAIN = 3.0  # [log] by being where it was to be expected
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
 NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
@@ -129,13 +130,12 @@ def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -
 
 def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[int, Localization]:
     """Return the results of photos together, or each by itself with the reason."""
-    cams = [member.cam_from_bundle for member in members.values()]
     bundles = propose_bundles(list(members.values()), errors)
     tested = [dict[int, Support]() for _ in bundles]
     for k, member in members.items():
         query = member.query.forget()
         for bundle, supports in zip(bundles, tested, strict=True):
-            supports[k] = find_support(member, query, bundle, cams)
+            supports[k] = find_support(member, query, bundle)
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
     if not bundles or probabilities[best] < EVEN:
@@ -147,7 +147,7 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
     if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
         near = agreed.adjusted.bundle
         supports |= {
-            k: find_support(members[k], members[k].query.forget(), near, cams)
+            k: find_support(members[k], members[k].query.forget(), near, list_neighbors(members, k))
             for k, support in supports.items()
             if not support.is_found
         }
@@ -159,6 +159,12 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
     ranked = probabilities[[best, *others, -1]]
     elsewhere = [bundles[i] for i in others]
     return {k: judge_member(members[k], k, supports[k], agreed, elsewhere, ranked) for k in members}
+
+
+def list_neighbors(members: dict[int, Member], k: int) -> list[Pose]:
+    """Return the relative poses of the photos next to one in order, which may be its own by mistake."""
+    others = sorted((j for j in members if j != k), key=lambda j: abs(j - k))
+    return [members[j].cam_from_bundle for j in others[:NUM_NEIGHBORS]]
 
 
 def agree(

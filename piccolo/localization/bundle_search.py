@@ -73,14 +73,14 @@ class Support(NamedTuple):
     odds: float  # of that pose, against that none of the photo's poses is right
     odds_elsewhere: float  # of the photo's other poses
     num_places: int  # of the scan where a photo alone may be
-    odds_exchanged: float = 0.0  # of the places of the bundle's other photos, each as likely
+    odds_exchanged: float = 0.0  # of the places of other photos of the bundle, in the mean
 
     @property
     def weights(self) -> Array:
         """Odds (4,): own pose right; own pose missed; photo outside of the scan; photo at another pose.
 
-        A photo alone has the odds of the best of all places. Once the others say which place it is, they are
-        `num_places` times larger.
+        A photo alone has the odds of the best of all places. Once the others say which place it is, or
+        which few it may be if photos were exchanged, they are `num_places` times larger.
         """
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
@@ -170,10 +170,10 @@ def vote(member: Member, bundle: Bundle) -> float:
     return max((p for own, p in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), default=0.0)
 
 
-def find_support(member: Member, query: Query, bundle: Bundle, cams_from_bundle: Sequence[Pose]) -> Support:
+def find_support(member: Member, query: Query, bundle: Bundle, exchanged: Sequence[Pose] = ()) -> Support:
     """Return a photo's evidence for a bundle pose: its best own pose near the prediction.
 
-    It may be at the place of another of the photos, whose relative poses are given: named wrongly.
+    `exchanged` are relative poses of other photos, one of which may be its own.
     """
     expected = bundle.place(member.cam_from_bundle)
     poses = [own for own, _ in member.own_poses]
@@ -181,8 +181,7 @@ def find_support(member: Member, query: Query, bundle: Bundle, cams_from_bundle:
     found = own or max(list_near(query, expected), key=lambda h: h.score)
     if own is None:
         poses.append(found)
-    places = [bundle.place(cam) for cam in cams_from_bundle]
-    places = [place for place in places if not ONE_IN_BUNDLE.holds(place, expected)]
+    places = [place for place in map(bundle.place, exchanged) if not ONE_IN_BUNDLE.holds(place, expected)]
     poses += [score_pose(query, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in poses)]
     errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
@@ -193,11 +192,10 @@ def find_support(member: Member, query: Query, bundle: Bundle, cams_from_bundle:
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
     num_places = len(query.scan_map.sparse)
-    there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in poses]
-    exchanged = float(p[:-1][there].sum()) / none / max(len(places), 1)
-    return Support(
-        found, errors.gaussian, own is not None, float(p[k]) / none, odds_elsewhere, num_places, exchanged
-    )
+    is_there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in poses]
+    odds_there = float(p[:-1][is_there].sum()) / none / max(len(places), 1)
+    odds = float(p[k]) / none
+    return Support(found, errors.gaussian, own is not None, odds, odds_elsewhere, num_places, odds_there)
 
 
 def list_near(query: Query, expected: Pose) -> list[Hypothesis]:

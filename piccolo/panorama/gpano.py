@@ -308,7 +308,8 @@ def _with_fields(
     fields |= {n: f"{angle:.{DECIMALS}f}" for n, angle in zip(POSE_NAMES, angles_deg, strict=True)}
     attributes = "".join(f' GPano:{name}="{value}"' for name, value in fields.items()).encode()
     about = ABOUT.search(packet)  # has to be the same in all descriptions
-    rdf, place = end[1], end.start()
+    rdf = end[1]
+    place = end.start()
     description = b"<%s:Description %s:about=%s" % (rdf, rdf, about.group(1) if about else b'""')
     description += b' xmlns:GPano="%s"%s/>' % (NAMESPACE, attributes)
     return packet[:place] + description + packet[place:]
