@@ -136,9 +136,9 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     assert all(pose_errors(result.best_pose, pose)[0] < 0.02 for result in results)
     assert results[0].source.pano_sha256 == results[1].source.pano_sha256
     capsys.readouterr()
-    wide = render_picture(Mount(pinhole(240, 180, 75.0)), this, pose, Workers(2))
+    wide = render_picture(Mount(pinhole(480, 360, 150.0)), this, pose, Workers(2))
     exif = Image.Exif()
-    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 300 px diagonal: 76.3 px
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 600 px diagonal: 152.5 px
     Image.fromarray(wide).save(tmp_path / "phone.jpg", exif=exif, quality=95)
     main([*cloud, "--pano", str(tmp_path / "phone.jpg")])
     out, err = capsys.readouterr()
@@ -147,7 +147,7 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     first, *_, last = lines  # a warning stands below the line of its photo
     assert first.startswith(f"{tmp_path / 'phone.jpg'}: localized at")
     assert last.startswith(
-        "  warning: read as a pinhole photo 115.1 deg wide, focal length 76 px from EXIF's 35 mm"
+        "  warning: read as a pinhole photo 115.1 deg wide, focal length 153 px from EXIF's 35 mm"
     )
     assert main([*cloud, "--pano", str(tmp_path / "phone.jpg"), "--camera", str(rig)]) == 2
     assert "give it as --rig" in capsys.readouterr().err
