@@ -32,7 +32,7 @@ QUERY = Query(
     workers=Workers(1),
     method=METHOD,
     features=(NO_FEATURES, NO_FEATURES),
-    evidence="map features",
+    evidence="drawn scan",
     cache=Cache(VIEWS),
 )
 
@@ -58,7 +58,11 @@ def seen(explains, num_blocks=4):
 
 def compared(monkeypatch, explains, counts):
     """A query with made-up comparisons, and made-up counts of matches, by the x of a pose."""
+
+    def count_each(query, best, others):
+        return [counts.get(place(h.pose), 0) for h in (best, *others)]
+
     for module in (selection, last_descent):
-        monkeypatch.setattr(module, "count_agreeing", lambda query, pose: counts.get(place(pose), 0))
+        monkeypatch.setattr(module, "count_each", count_each)
     known = {at(x, 0.0).pose.key: seen(part) for x, part in explains.items()}
     return replace(QUERY, cache=Cache(VIEWS, known))

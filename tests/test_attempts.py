@@ -162,19 +162,21 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
 LOOK = (0, "look_first")
 HALF = (1, "search_part")
 ALL = (2, "search_matches")
+DRAWN = (0, "draw_found")
+FIRST_UPRIGHT = (0, {"tilts": "known"})
+FIRST_TILTED = (0, {"tilts": "any", "is_brief": True})
 UPRIGHT = (2, {"tilts": "known"})
 ABOUT_LEVEL = (2, {"tilts": "level"})
 TILTED = (2, {"tilts": "any", "is_brief": False})
-BRIEFLY = (2, {"tilts": "any", "is_brief": True})
 
 
 @pytest.mark.parametrize(
     ("photo", "gravity", "parts", "expected"),
     [
-        (WHOLE, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
-        (WHOLE, "known", {}, [LOOK, HALF, ALL, UPRIGHT]),
+        (WHOLE, "auto", {}, [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
+        (WHOLE, "known", {}, [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
         (WHOLE, "unknown", {}, [HALF, ALL, TILTED]),
-        (TILTED_WHOLE, "auto", {}, [LOOK, HALF, ALL, UPRIGHT, BRIEFLY]),
+        (TILTED_WHOLE, "auto", {}, [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
         (PARTIAL, "auto", {}, [HALF, ALL, ABOUT_LEVEL, TILTED]),
         (PARTIAL, "known", {}, [HALF, ALL, ABOUT_LEVEL]),
         (PARTIAL, "unknown", {}, [HALF, ALL, ABOUT_LEVEL, TILTED]),

@@ -177,13 +177,15 @@ def test_what_contradicts_is_masked_and_the_rest_stays():
     assert (comparison.mask_occluders(clean, comparison.compare(clean, true_pose)) is clean) == fits
 
 
-@pytest.mark.parametrize("fov_deg", [None, 90.0])
-def test_a_photo_that_was_turned_over_is_told(fov_deg):
-    """Whole or narrow: whole views explain nearly all of the mirrored photo where its features put it."""
+@pytest.mark.parametrize(("fov_deg", "asks_map"), [(None, True), (None, False), (90.0, True)])
+def test_a_photo_that_was_turned_over_is_told(fov_deg, asks_map):
+    """Whole or narrow: whole views explain nearly all of the mirrored photo where it is found."""
     outside = None if fov_deg is None else mask_outside_field(WIDTH, fov_deg, 0.5)
     rgb = rooms.query(1).rgb
     right = _query(rgb, outside)
     turned_over = _query(rgb[:, ::-1].copy(), None if outside is None else outside[:, ::-1].copy())
+    if not asks_map:
+        right, turned_over = (one.without_features() for one in (right, turned_over))
     assert right.photo.is_partial == turned_over.photo.is_partial == (fov_deg is not None)
     doubtful = Hypothesis(_clean()[1], 0.69)
     assert count_agreeing(right, doubtful.pose) > 15

@@ -18,14 +18,14 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.settings import PaperSettings
 
 SURE = 0.002  # [m] largest deviation
-RIGHT, WRONG = Standing(1.0, 0.8, 60, "map features"), Standing(1.0, 0.03, 3, "map features")
-ELSEWHERE = Standing(0.1, 0.05, 3, "map features")
+RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")
+ELSEWHERE = Standing(0.1, 0.05, 3, "drawn scan")
 MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
 
 
 def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
-    standings = [Standing(*values, "map features") for values in ((1.0, 0.5, 12), (0.5, 0.1, 2))]
+    standings = [Standing(*values, "drawn scan") for values in ((1.0, 0.5, 12), (0.5, 0.1, 2))]
     p = posterior(standings, 0.01, model=MODEL)
     e = math.exp
     odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
@@ -50,10 +50,10 @@ def test_each_kind_of_evidence_has_a_model_of_its_own():
     """Shape and whole views alone have two features; local features count once asked, even if none agrees."""
     views = Standing(0.5, 0.2, None, "views")
     np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
-    asked = views._replace(num_matches=0, evidence="map features")
-    standings = [views._replace(evidence="shape"), views, asked, asked._replace(evidence="drawn scan")]
+    asked = views._replace(num_matches=0, evidence="drawn scan")
+    standings = [views._replace(evidence="shape"), views, asked]
     assert [standing.evidence for standing in standings] == list(rule.MODELS)
-    assert [len(model.weights) for model in rule.MODELS.values()] == [2, 2, 3, 3]
+    assert [len(model.weights) for model in rule.MODELS.values()] == [2, 2, 3]
     for standing in standings:
         model = rule.MODELS[standing.evidence]
         expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0
@@ -75,7 +75,7 @@ def test_copies_share_the_probability_alike_and_none_of_them_is_localized(copies
 
 @pytest.mark.parametrize(("name", "more"), [("score", 0.1), ("num_matches", 5), ("ratio", 0.1)])
 def test_more_evidence_is_more_probability(name, more):
-    middling = Standing(1.0, 0.15, 8, "map features")
+    middling = Standing(1.0, 0.15, 8, "drawn scan")
     stronger = middling._replace(**{name: getattr(middling, name) + more})
     assert posterior([middling], SURE)[0] < posterior([stronger], SURE)[0]
     assert posterior([middling], None)[0] < posterior([middling], SURE)[0]
@@ -95,7 +95,7 @@ def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(st
 def test_numbers_beyond_reason_change_nothing_more(a, b):
     np.testing.assert_array_equal(*(rule.none_features(std) for std in (a, b)))
     assert (rule.none_features(None) == rule.none_features(0.3)).all()
-    least, less = (Standing(*values, 0, "map features") for values in ((0.0, 0.02), (-0.5, -0.3)))
+    least, less = (Standing(*values, 0, "drawn scan") for values in ((0.0, 0.02), (-0.5, -0.3)))
     faint, nothing = (rule.pose_features(standing) for standing in (least, less))
     np.testing.assert_array_equal(faint, nothing)
     np.testing.assert_array_equal(faint, np.log([0.1, 0.02, 8.0]))

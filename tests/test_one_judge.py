@@ -56,8 +56,9 @@ def test_a_status_is_that_of_its_probabilities_but_what_is_ruled_out_has_none(pr
     [
         (0.95, 0.0, 0.0, False, "localized", False, 1),
         (0.95, 0.0, 0.0, True, "not_localized", True, 1),
-        (0.3, 0.0, 0.0, True, "not_localized", False, 0),  # nobody would believe it
-        (0.95, 0.1, 0.0, False, "not_localized", False, 0),  # no pose is surer than its focal length
+        (0.21, 0.0, 0.0, True, "not_localized", True, 1),
+        (0.2, 0.0, 0.0, True, "not_localized", False, 0),  # nobody would believe it
+        (0.95, 0.1, 0.0, False, "not_localized", False, 1),  # no pose is surer than its focal length
         (0.95, 0.0, 99.0, False, "not_localized", False, 1),
     ],
 )
@@ -71,7 +72,7 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
     fit = SimpleNamespace(doubt=doubt, conflict=conflict, focal_length=lambda given: focal)
     found = Selection(Hypothesis(HERE, 0.5), ())
     measured = judging.Measured(HERE, UNKNOWN_ERRORS, 0.05, None)
-    standings = [Standing(1.0, 0.5, 60, "map features")]
+    standings = [Standing(1.0, 0.5, 60, "drawn scan")]
     p = np.array([probability, 1.0 - probability])
     result = judging.conclude(query, found, fit, measured, standings, p)
     assert (result.status, MIRRORED in result.warnings, len(asked)) == (status, warns, num_asked)

@@ -1,6 +1,7 @@
 """Which pose is taken, each in a made-up case where one rule decides."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
@@ -93,7 +94,7 @@ def test_a_pose_without_rivals_is_refined_by_itself(monkeypatch, done, best, num
         ((0.5, 0.5), (20, 20), 0.0),  # by score
         ((0.5, 0.6), (20, 20), 3.0),  # by what both views show
         ((0.5, 0.5), (20, 60), 3.0),  # by matches
-        ((0.5, 0.3), (20, 60), 0.0),
+        ((0.5, 0.2), (20, 60), 0.0),
     ],
 )
 def test_the_pose_with_the_greatest_odds_is_selected(monkeypatch, explains, matches, best):
@@ -155,23 +156,39 @@ def test_the_best_pose_has_come_to_rest_and_is_still_the_best(monkeypatch):
     assert (rested, found.best.pose.center_world[0]) == ([0.0], 0.01)
 
 
-def test_margin_is_the_lesser_of_two_leads_and_a_result_is_sure_by_three_things(monkeypatch):
+def test_margin_is_the_lesser_of_two_leads():
     for score, other, rival, margin in ((0.5, 0.1, 0.3, 0.7), (0.5, 0.4, 0.3, 0.2), (0.1, 0.4, 0.0, -1.0)):
         found = Selection(at(0.0, score), (at(3.0, other),), rival)
         assert found.margin == pytest.approx(margin)
     assert Selection(at(0.0, 0.3), ()).margin == 1.0
-    for score, other, num_matches, is_sure in (
-        (0.05, 0.02, 12, True),
-        (0.04, 0.01, 12, False),
-        (0.5, 0.24, 11, False),
-        (0.5, 0.26, 99, False),
-    ):
-        query = compared(monkeypatch, {0.0: score, 3.0: other}, {0.0: num_matches})
-        assert selection.is_sure(query, [at(0.0, score), at(3.0, other)]) == is_sure
+
+
+@pytest.mark.parametrize(
+    ("is_partial", "scores", "counts", "is_sure"),
+    [
+        (False, (0.1, 0.02), (12, 0), True),
+        (False, (0.09, 0.02), (12, 0), False),
+        (True, (0.05, 0.01), (12, 0), True),
+        (True, (0.04, 0.01), (12, 0), False),
+        (False, (0.5, 0.1), (11, 0), False),
+        (False, (0.5, 0.4), (20, 0), True),  # many features agree with the one, none with the other
+        (False, (0.5, 0.4), (40, 25), False),
+    ],
+)
+def test_a_pose_is_sure_by_its_score_its_matches_and_its_odds_elsewhere(
+    monkeypatch, is_partial, scores, counts, is_sure
+):
+    query = compared(monkeypatch, *(dict(zip((0.0, 3.0), pair, strict=True)) for pair in (scores, counts)))
+    query = replace(query, photo=SimpleNamespace(is_partial=is_partial))
+    assert selection.is_sure(query, [at(0.0, scores[0]), at(3.0, scores[1])]) == is_sure
+
+
+def _all_rivals(query, _, others):
+    return list(others) if query.uses_matches else []
 
 
 def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
-    """Of a photo of a part of the sphere; how many a copy has by itself says how it was scanned."""
+    """How many a copy has by itself says how it was scanned."""
     asked = []
     copies = {1.0: True, 2.0: False, 3.0: True}
 
@@ -180,31 +197,31 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
         return [copies[place(other)] for other in others]
 
     monkeypatch.setattr(judging, "find_copies", find_copies)
+    monkeypatch.setattr(judging, "list_rivals", _all_rivals)
     best, *others = (at(x, 0.0) for x in (0.0, 1.0, 2.0, 3.0))
     standings = [Standing(1.0, 0.5, n, "drawn scan") for n in (12, 3, 4, 20)]
     for evidence, expected in (
         ("drawn scan", [20, 20, 4, 20]),
-        ("map features", [12, 3, 4, 20]),
         ("views", [12, 3, 4, 20]),
     ):
         query = replace(QUERY, evidence=evidence)
         found = judging.credit_copies(standings, judging.list_copies(query, best, others))
         assert [s.num_matches for s in found] == expected
-    assert asked == [0.0]
+    assert asked == [0.0, 0.0]
 
 
 @pytest.mark.parametrize(("is_copy", "order"), [(True, [3.0, 0.0, 6.0]), (False, [0.0, 3.0, 6.0])])
 def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(monkeypatch, is_copy, order):
     query = compared(monkeypatch, {0.0: 0.3, 3.0: 0.5, 6.0: 0.1}, {0.0: 20, 3.0: 20})
     monkeypatch.setattr(judging, "find_copies", lambda *_: [is_copy, False])
+    monkeypatch.setattr(judging, "list_rivals", _all_rivals)
     monkeypatch.setattr(judging, "settle", lambda _, h: h)
     measured = judging.Measured(at(0.0, 0.0).pose, UNKNOWN_ERRORS, 0.05, None)
     monkeypatch.setattr(judging, "measure", lambda *_: measured)
     monkeypatch.setattr(judging, "conclude", lambda _, found, *more: found)
     found = Selection(at(0.0, 0.3), (at(3.0, 0.5), at(6.0, 0.1)))
-    judged = judging.judge(replace(query, evidence="drawn scan"), found)
+    judged = judging.judge(query, found)
     assert places([judged.best, *judged.alternatives]) == order
-    assert judging.judge(query, found).best is found.best  # matched with features of the map: no copies
 
 
 def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere(monkeypatch):

@@ -11,6 +11,7 @@ import rooms
 
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
+from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
@@ -18,6 +19,7 @@ from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
+from piccolo.localization.photo import Seen
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 from research.synthetic.photos import mask_outside_field
@@ -243,12 +245,42 @@ def test_half_a_metre_off_the_matches_are_those_of_the_true_pose(offset):
     assert verification.count_agreeing(_query(), off) == 0
 
 
-def test_whole_photos_and_whole_views_alone_are_not_drawn(monkeypatch):
+def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone(monkeypatch):
+    whole = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
+    assert len(whole.photo.seen().views) == 4
+    assert verification.count_agreeing(whole, _true_pose()) > 20
+    assert verification.count_agreeing(whole, _moved((1.0, 0.5, 0.0))) < 6
     monkeypatch.setattr(verification, "verify", lambda *_: pytest.fail("drawn"))
-    panorama = rooms.scene(1)[1]
-    whole = rooms.ask(panorama, rooms.scan_map(1, NUM_POINTS), rooms.UNKNOWN)
-    assert verification.count_agreeing(whole, _true_pose()) == count_matches(whole.matches, _true_pose()) > 20
-    assert verification.count_agreeing(_query().by_views(), _true_pose()) == 0
+    assert verification.count_agreeing(whole.by_views(), _true_pose()) == 0
+
+
+@pytest.mark.parametrize(
+    ("count", "num_views", "expected"), [(12, 1, 2), (11, 1, 6), (11, 4, 4), (11, 20, 0), (12, 4, 2)]
+)
+def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(
+    monkeypatch, count, num_views, expected
+):
+    """And no more than sixteen pictures are."""
+    monkeypatch.setattr(verification, "count_agreeing", lambda query, pose: count)
+    asked = _query()
+    photo = replace(asked.photo, seen=lambda: Seen(num_views * asked.photo.seen().views, None))
+    best, *others = (Hypothesis(_true_pose(), score) for score in (0.8, 0.5, 0.4, 0.39, 0.3, 0.2, 0.1))
+    assert verification.list_rivals(replace(asked, photo=photo), best, others) == others[:expected]
+    assert verification.list_rivals(asked.by_views(), best, others) == []
+
+
+def test_the_least_distance_elsewhere_is_that_of_a_plain_search():
+    rng = np.random.default_rng(5)
+    rays = rng.normal(size=(40, 3)).astype(np.float32) * [1.0, 0.03, 0.03] + [1.0, 0.0, 0.0]
+    rays = (rays / np.linalg.norm(rays, axis=1, keepdims=True)).astype(np.float32)
+    distances = rng.integers(0, 1000, (30, 40)).astype(np.float32)
+    nearest = distances.argmin(axis=1)
+    found = np.empty(30, np.float32)
+    verification.find_elsewhere(distances, np.ascontiguousarray(rays.T), nearest, found)
+    cosines = rays[nearest].astype(np.float64) @ rays.astype(np.float64).T
+    expected = np.where(cosines > math.cos(math.radians(2.0)), np.inf, distances).min(axis=1)
+    np.testing.assert_array_equal(found, expected)
+    assert (expected > distances.min(axis=1)).any()
 
 
 def _keypoints(rays, descriptors):

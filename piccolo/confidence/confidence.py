@@ -14,9 +14,8 @@ LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
 MIN_CONFIDENCE = 0.9
-# the scan's shape; its coloured views; these, and local features of the map; these, and local features of the
-# scan drawn at the pose
-EvidenceKind = Literal["shape", "views", "map features", "drawn scan"]
+# the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
+EvidenceKind = Literal["shape", "views", "drawn scan"]
 
 
 class Standing(NamedTuple):
@@ -49,7 +48,6 @@ NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODELS: dict[EvidenceKind, ChoiceModel] = {
     "shape": ChoiceModel((7.82, 6.89), (-10.78, 2.92)),
     "views": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
-    "map features": ChoiceModel((5.75, 0.43, 1.10), (8.30, 3.82)),
     "drawn scan": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),
 }
 

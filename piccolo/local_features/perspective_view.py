@@ -1,6 +1,7 @@
 """Perspective views of a sphere's picture: a set that covers the sphere, or one around what a photo shows."""
 
 import math
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -10,11 +11,13 @@ import numpy as np
 from ..arrays import Array, Array32, Bytes, Floats, Int64s, Mask
 from ..geometry.sphere import compute_pixels, pixel_rays
 
-FIELD_DEG = 65.0  # of a view of the set, across
+FIELD_DEG = 65.0  # of a view of the set that covers the sphere, across
 MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross the seam
 # azimuth and elevation of the views' middles [deg]; at the poles pictures show floor and ceiling, or nothing
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
+NUM_SIDES = 4
+FACES_DEG = [*((90.0 * k, 0.0) for k in range(NUM_SIDES)), (0.0, 90.0), (0.0, -90.0)]
 HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
 STRETCH = 1.2  # tangent of the angle between the middle of a view around a photo and its edge, at most
 AROUND = 0.07  # [rad] that such a view shows more than the photo
@@ -63,13 +66,27 @@ class PerspectiveView(NamedTuple):
 def cover_sphere(width: int) -> list[PerspectiveView]:
     """Return the perspective views of a sphere's picture of `width`, with its resolution in their middles."""
     reach = math.tan(math.radians(FIELD_DEG / 2.0))
-    side = round(2.0 * reach * width / (2.0 * math.pi))
+    side = round(2.0 * reach * width / math.tau)
+    return make_set(VIEWS_DEG, side, 2.0 * reach / side, width)
+
+
+@lru_cache(maxsize=4)
+def list_sides(width: int) -> list[PerspectiveView]:
+    """Return four views to the sides of a sphere's picture of `width`: faces of a cube, and a little more."""
+    pixel = math.tau / width
+    side = math.ceil(2.0 * (1.0 + AROUND) / pixel / MULTIPLE) * MULTIPLE
+    return make_set(FACES_DEG, side, pixel, width)[:NUM_SIDES]
+
+
+def make_set(
+    middles_deg: Sequence[tuple[float, float]], side: int, pixel: float, width: int
+) -> list[PerspectiveView]:
+    """Make square views (side, side) around middles, azimuth and elevation [deg]; `pixel` as of its field."""
     turns = []
-    for angles in np.radians(VIEWS_DEG):
+    for angles in np.radians(middles_deg):
         (c, ce), (s, se) = np.cos(angles), np.sin(angles)
         turns.append(np.array([[c * ce, -s, -c * se], [s * ce, c, -s * se], [se, 0.0, ce]]))
     middles = np.stack(turns)[:, :, 0]
-    pixel = 2.0 * reach / side
     return [make_view(R, pixel, (side, side), width, middles, k) for k, R in enumerate(turns)]
 
 

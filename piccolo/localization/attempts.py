@@ -1,7 +1,7 @@
 """The searches that are tried for a photo, in order, each with its refinement.
 
 A first look by whole views finds most upright photos of the whole sphere, without local features. These would
-show where a mirrored photo lies, so the first look briefly searches its mirror image too.
+show that a photo is mirrored, so the first look briefly searches its mirror image too.
 """
 
 from collections.abc import Callable
@@ -43,27 +43,35 @@ Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Poses]
 def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
     """Return the searches for a photo in order, each with the query of the evidence that it uses.
 
-    A first look by whole views may settle a whole upright sphere. Then come poses from feature matches,
-    first of a part of the views, then of all, and at last searches by whole views: with gravity `auto` as
-    known, then as unknown (briefly, for a whole sphere). Photos of a part of the sphere are mostly taken
-    about level: with a tilt that is not known exactly, "known" searches about level.
+    A first look by whole views may settle a whole upright sphere, or the scan drawn at the poses that it
+    found. Then come searches by whole views: with gravity `auto` as known, then as unknown (briefly, for a
+    whole sphere). Poses from matches with features of the map, first of a part of the photo's views, then of
+    all, come last: those of the map may have to be made. Narrow photos and those of any tilt ask them first.
+    Photos of a part of the sphere are mostly taken about level: with a tilt that is not known exactly,
+    "known" searches about level.
     """
     method = query.method
+    attempts: list[tuple[Query, Attempt]] = []
     looks_first = method.uses_features and method.uses_search and is_whole(query)
-    attempts: list[tuple[Query, Attempt]] = [(query.by_views(), look_first)] if looks_first else []
+    if looks_first:
+        attempts = [(query.by_views(), look_first), (query.without_features(), draw_found)]
     if query.rotations is not None:
         attempts.append((query, look_along_walls))
+    by_features: list[tuple[Query, Attempt]] = []
     if method.uses_features:
         parts = (query.features[:k] for k in range(1, len(query.features)))
-        attempts += [(replace(query, features=part), search_part) for part in parts]
-        attempts.append((query, search_matches))
+        by_features = [(replace(query, features=part), search_part) for part in parts]
+        by_features.append((query, search_matches))
+    if not looks_first:
+        attempts += by_features
+    asked = query.without_features() if looks_first else query
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
         upright: Tilts = "level" if is_partial and not query.photo.has_tilt else "known"
-        attempts.append((query, partial(search_views, tilts=upright)))
+        attempts.append((asked, partial(search_views, tilts=upright)))
     if method.uses_search and query.settings.gravity != "known":
-        attempts.append((query, partial(search_views, tilts="any", is_brief=looks_first)))
-    return attempts
+        attempts.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
+    return attempts + by_features if looks_first else attempts
 
 
 def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
@@ -76,6 +84,12 @@ def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses
         with watch.stage("refine"):
             found = known + refine_starts(first, starts, FIRST_BEAM)
             return found, is_clear(query, found) and score_starts(first, starts) >= MIRROR_RATIO * of_mirror()
+
+
+def draw_found(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+    """Draw the scan at the poses that were found; True if the best is sure."""
+    with watch.stage("refine"):
+        return known, is_sure(query, known)
 
 
 def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:

@@ -30,9 +30,8 @@ from .last_descent import refine_best
 from .localize import Found, fit_camera
 from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
-from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
-from .verification import Located, match_beside, place_keypoints
+from .verification import SURE_MATCHES, Located, match_beside, place_keypoints
 
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 MOST_BESIDE = 3  # photos whose matches count, those with the most
@@ -86,7 +85,7 @@ def localize_beside(
     allowed_map = apply_prior(scan_map, settings.prior)
     with watch.stage("match"):
         query = prepare_query(panorama, allowed_map, settings, workers)
-        is_asked = query.evidence == "drawn scan" and len(allowed_map.sparse) > 0
+        is_asked = query.is_narrow and len(allowed_map.sparse) > 0
         found = find_beside(query, pictures) if is_asked else []
     if not found:
         return Localization(), ()

@@ -20,34 +20,39 @@ import numpy as np
 
 from ..arrays import Array
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
-from ..confidence.confidence import LOCALIZED, NOT_LOCALIZED, Standing, classify, posterior
+from ..confidence.confidence import LOCALIZED, Standing, classify, posterior
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, std_of
-from ..local_features.hypotheses import count_matches, propose_poses
+from ..geometry.rotations import uniform_yaws
+from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
 from ..optimize.sampling_loss import sampling_loss
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
-from .beam import refine_matches
+from .attempts import FIRST_BEAM
+from .beam import brief_query, descend_briefly, refine_matches, refine_starts, score_near
 from .comparison import compare
 from .covariance import Errors, estimate_covariance
 from .focal_length import FocalFit, fit_focal
 from .ladder import settle
+from .photo import ACROSS
 from .prior import contradictions
 from .query import Query
 from .selection import Selection, assess_poses
-from .verification import count_agreeing, find_copies
+from .verification import count_agreeing, count_each, find_copies, list_rivals
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
+WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
 MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo; in symmetric scenes it is about 1
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
 
 
@@ -114,7 +119,7 @@ def conclude(
         poses = (1.0 - fit.doubt) * probabilities[:-1]
         probabilities = np.append(poses, 1.0 - poses.sum())
     warnings = contradictions(scan_map, measured.pose, query.settings.prior)
-    if classify(probabilities, least) != NOT_LOCALIZED and is_mirrored(query, found.best):
+    if probabilities[-1] < 1.0 - WORTH_ASKING and is_mirrored(query, found.best):
         warnings += (MIRRORED,)
     gaussian, std_of_fit = measured.errors
     alternatives = [
@@ -223,9 +228,10 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
 
 def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:
     """Return True for the best pose and for copies of its place; of a photo without matches there False."""
-    if query.evidence != "drawn scan":
-        return [False] * (1 + len(others))
-    return [True, *find_copies(query, best.pose, [h.pose for h in others])]
+    rivals = [h.pose for h in list_rivals(query, best, others)]
+    copies = compress(rivals, find_copies(query, best.pose, rivals))
+    keys = {pose.key for pose in (best.pose, *copies)}
+    return [query.uses_matches and h.pose.key in keys for h in (best, *others)]
 
 
 def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:
@@ -262,7 +268,7 @@ def collect_evidence(
     query: Query, found: Selection, agreement: Agreement, fractions: tuple[float, float]
 ) -> Evidence:
     """Collect the evidence for the best pose, from the fractions explained and contradicted."""
-    num_matches = [count_agreeing(query, h.pose) for h in (found.best, *found.alternatives)]
+    num_matches = count_each(query, found.best, found.alternatives)
     return Evidence(
         score=found.best.score,
         margin=found.margin,
@@ -276,16 +282,32 @@ def collect_evidence(
 
 
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
-    """Return True if more features of the mirrored photo agree with a pose, where views also explain more.
+    """Return True if the mirrored photo has a pose that explains more, and with which more features agree.
 
     In a symmetric scene both are about equal. The test is skipped for a pose that explains nearly all of the
     photo, and after a first look, which has compared the mirrored photo itself.
     """
     if best.score >= ENOUGH_EXPLAINED or not query.uses_matches:
         return False
-    matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
-    found = propose_poses(matches, None, 1, query.workers)
-    num_matches = max(count_matches(query.matches, best.pose), count_agreeing(query, best.pose))
-    if not found or found[0].num_matches <= num_matches:
+    mirrored = query.mirror()
+    found = search_mirrored(query, mirrored, best.pose)
+    if not found or found[0].score <= MIRROR_RATIO * best.score:
         return False
-    return refine_matches(query.mirror(), [found[0].pose])[0].score > MIRROR_RATIO * best.score
+    return count_agreeing(mirrored, found[0].pose) > count_agreeing(query, best.pose)
+
+
+def search_mirrored(query: Query, mirrored: Query, pose: Pose) -> list[Hypothesis]:
+    """Return poses of the mirrored photo, best first, by what found the photo's own: features, or views.
+
+    A wall or a ceiling seen from behind fits the mirrored photo: its tilt is that of the pose found, or that
+    upside down.
+    """
+    if query.features:
+        matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
+        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, None, 1, query.workers)])
+    yaws = uniform_yaws(query.settings.num_yaws)
+    tilt = ACROSS @ pose.R_cam_from_world @ ACROSS
+    turned = brief_query(mirrored.with_rotations(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws])))
+    ends = descend_briefly(turned)
+    is_worse = ends.best_score <= score_near(query, pose)
+    return [] if is_worse else refine_starts(turned, ends.poses, FIRST_BEAM)

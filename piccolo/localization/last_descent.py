@@ -7,8 +7,8 @@ from functools import partial
 from ..confidence.alternatives import Hypothesis
 from .ladder import climb_to_full, climb_unoccluded, settle
 from .query import Query
-from .selection import SURE_MATCHES, Selection, rank, select
-from .verification import count_agreeing
+from .selection import Selection, rank, select
+from .verification import SURE_MATCHES, count_each
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
 FAINT_SCORE = 0.1  # a pose with less, and fewer matches than the next line, is never localized
@@ -31,11 +31,12 @@ def refine_best(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
         found = select(query, rank([best, *found.alternatives]))
         if is_faint(query, found):
             return found
-    least = max(NEAR_MATCHES * count_agreeing(query, found.best.pose), SURE_MATCHES)
+    of_best, *of_others = count_each(query, found.best, found.alternatives)
+    least = max(NEAR_MATCHES * of_best, SURE_MATCHES)
     near: list[Hypothesis] = []
     far: list[Hypothesis] = []
-    for h in found.alternatives:
-        is_near = h.score > NEAR_SCORE * found.best.score or count_agreeing(query, h.pose) >= least
+    for h, count in zip(found.alternatives, of_others, strict=True):
+        is_near = h.score > NEAR_SCORE * found.best.score or count >= least
         (near if is_near and len(near) < MAX_REFINED else far).append(h)
     if not near:
         best = climb_unoccluded(query, found.best.pose)[1]
@@ -47,10 +48,10 @@ def refine_best(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
 
 def is_faint(query: Query, found: Selection) -> bool:
     """Return True if the best pose and all alternatives have a low score and few matches."""
-    return all(
-        h.score < FAINT_SCORE and count_agreeing(query, h.pose) < FAINT_MATCHES
-        for h in (found.best, *found.alternatives)
-    )
+    scores = [h.score for h in (found.best, *found.alternatives)]
+    if max(scores) >= FAINT_SCORE:
+        return False
+    return max(count_each(query, found.best, found.alternatives)) < FAINT_MATCHES
 
 
 def settle_best(query: Query, found: Selection) -> Selection:

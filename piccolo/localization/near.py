@@ -52,7 +52,7 @@ def assess_end(query: Query, end: Hypothesis) -> Standing:
     Matches do not count if they put the photo elsewhere, with photos beside or without.
     """
     (standing,) = assess_alone(query.by_views(), [end])
-    if query.evidence != "drawn scan":
+    if not query.is_narrow:
         return standing
     found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
     own = [v.num_matches for v in found if RIGHT.holds(v.pose, end.pose)]

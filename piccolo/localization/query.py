@@ -73,7 +73,12 @@ class Query:
     @property
     def uses_matches(self) -> bool:
         """True if local features speak for poses, not whole views alone."""
-        return self.evidence in ("map features", "drawn scan")
+        return self.evidence == "drawn scan"
+
+    @property
+    def is_narrow(self) -> bool:
+        """True for a photo of a part of the sphere that is compared with the drawn scan."""
+        return self.uses_matches and self.photo.is_partial
 
     @property
     def pixel(self) -> float:
@@ -92,9 +97,13 @@ class Query:
         parts = [part() for part in self.features]
         return join_matches([p.matches for p in parts], [len(p.keypoints.rays) for p in parts])
 
+    def without_features(self) -> "Query":
+        """Return the query that asks no features of the map for poses."""
+        return replace(self, features=())
+
     def by_views(self) -> "Query":
         """Return the query by whole views alone."""
-        return replace(self, features=(), evidence="views" if self.uses_matches else self.evidence)
+        return replace(self.without_features(), evidence="views" if self.uses_matches else self.evidence)
 
     def with_rotations(self, rotations: Array | None) -> "Query":
         """Return the query that searches only rotations (N, 3, 3), camera from map, with nothing kept."""
@@ -110,10 +119,10 @@ class Query:
         return replace(self, photo=self.photo.mask(is_hidden), cache=Cache(self.cache.views))
 
     def mirror(self) -> "Query":
-        """Return the query by whole views of the mirrored photo, without the prior's heading."""
+        """Return the query of the mirrored photo, without features of the map and the prior's heading."""
         prior = self.settings.prior.without_heading()
         return replace(
-            self.by_views(),
+            self.without_features(),
             photo=self.photo.mirror(),
             settings=replace(self.settings, prior=prior),
             beside=(),
@@ -157,7 +166,6 @@ def prepare_query(
         Once(partial(find_features, photo.panorama, scan_map, workers, [every[k] for k in half]))
         for half in (() if scan_map.has_shape else HALVES)
     )
-    evidence: EvidenceKind = "drawn scan" if photo.is_partial else "map features"
     return Query(
         source,
         panorama,
@@ -168,7 +176,7 @@ def prepare_query(
         workers,
         method,
         features,
-        "shape" if scan_map.has_shape else evidence,
+        "shape" if scan_map.has_shape else "drawn scan",
         Cache(make_views(scan_map)),
         rotations,
     )

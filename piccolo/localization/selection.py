@@ -12,12 +12,12 @@ from ..geometry.pose import Pose
 from .comparison import compare
 from .prior import contradictions
 from .query import Query
-from .verification import count_agreeing
+from .verification import SURE_MATCHES, count_each
 
 MAX_COMPARED = 8  # alternatives of the best pose
 SURE_SCORE = 0.05  # least score of the best pose
-SURE_MARGIN = 0.5  # least margin over the best pose elsewhere
-SURE_MATCHES = 12  # wrong poses have 5; in repeated places more, but then several poses have them
+SURE_WHOLE = 0.1  # of that of a whole photo
+SURE_ODDS = 3.0  # [log] least odds of the best pose against any elsewhere: 20 to 1
 CLEAR_SCORE = 0.3  # least score by whole views without features: see docs/METHOD.md
 CLEAR_SHAPE = 0.1  # least score by edges
 CLEAR_MARGIN = 0.5  # least margin by whole views
@@ -57,15 +57,17 @@ def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -
 
 
 def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
-    """Return the evidence for each of several poses by itself.
+    """Return the evidence for each of several poses by itself, the best first.
 
-    Poses that contradict the prior share the odds that the prior is wrong.
+    Features are not counted for a pose that can't win. Poses that contradict the prior share the odds that
+    the prior is wrong.
     """
     is_wrong = [bool(contradictions(query.scan_map, h.pose, query.settings.prior)) for h in hypotheses]
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
+    counts = count_each(query, hypotheses[0], hypotheses[1:])
     standings = []
-    for h, wrong in zip(hypotheses, is_wrong, strict=True):
-        num_matches = count_agreeing(query, h.pose) if query.uses_matches else None
+    for h, wrong, count in zip(hypotheses, is_wrong, counts, strict=True):
+        num_matches = count if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
         is_narrow = query.evidence == "shape" and query.photo.is_partial
         # with fewer blocks, chance explains more of them
@@ -98,11 +100,15 @@ def select(query: Query, found: Selection) -> Selection:
 
 
 def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Return True if score, margin and matches of the best pose make further searches needless."""
-    found = select(query, rank(hypotheses))
-    if found.best.score < SURE_SCORE or found.margin < SURE_MARGIN:
+    """Return True if the score of the best pose, and its odds by views and matches, end the search."""
+    ranked = rank(hypotheses)
+    if ranked.best.score < (SURE_SCORE if query.photo.is_partial else SURE_WHOLE):
         return False
-    return count_agreeing(query, found.best.pose) >= SURE_MATCHES
+    found = select(query, ranked)
+    best, *others = assess_poses(query, found.best, found.alternatives)
+    if (best.num_matches or 0) < SURE_MATCHES:
+        return False
+    return all(log_odds(best) - log_odds(other) >= SURE_ODDS for other in others)
 
 
 def is_clear(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:

@@ -1,12 +1,13 @@
 """Verify poses by view synthesis: draw the scan at a pose, and match the photo with that picture.
 
-A narrow photo looks like many places. Only at the right one do its local features lie where those of the
-drawn scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2015), and InLoc's
+A photo may look like many places. Only at the right one do its local features lie where those of the drawn
+scan lie. After Torii et al., "24/7 Place Recognition by View Synthesis" (CVPR 2015), and InLoc's
 verification of poses (Taira et al., CVPR 2018). Photos beside it in a walk are such pictures too.
 """
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -14,10 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array32, Bytes
+from ..confidence.alternatives import Hypothesis
 from ..confidence.occlusion import EXPLAINED, occlusion_mask
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
+from ..kernels.jit import kernel
 from ..local_features.hypotheses import LEAST_MATCHES, count_matches, exact_pose
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, merge_matches
@@ -29,7 +32,10 @@ PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this
 AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
-COS_ELSEWHERE = math.cos(math.radians(2.0))
+COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))
+SURE_MATCHES = 12  # of a right pose; wrong poses have 5, in repeated places more, but then several have them
+MOST_PICTURES = 16  # of the scan that are drawn beside those at the best pose
+RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 
 
@@ -49,15 +55,32 @@ class Verified(NamedTuple):
 
 
 def count_agreeing(query: Query, pose: Pose) -> int:
-    """Count the photo's local features that agree with a pose.
-
-    Features of a photo of a part of the sphere are matched with the scan drawn at the pose and with photos
-    beside, those of others with the map's features.
-    """
-    if query.evidence != "drawn scan":
-        return count_matches(query.matches, pose)
+    """Count the photo's local features that agree with a pose; 0 by whole views alone."""
+    if not query.uses_matches:
+        return 0
     verified = verify(query, pose)
     return verified.num_matches if CONFIRMED.holds(verified.pose, pose) else 0
+
+
+def list_rivals(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Return those of other poses, best first, that could win against the best: there the scan is drawn.
+
+    A pose that explains far less than one with which many features agree can't.
+    """
+    if not query.uses_matches:
+        return []
+    if count_agreeing(query, best.pose) >= SURE_MATCHES:
+        others = [h for h in others if h.score >= RIVAL_SCORE * best.score]
+    return list(others[: MOST_PICTURES // len(query.photo.seen().views)])
+
+
+def count_each(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[int]:
+    """Count the photo's features that agree with the best pose and with others; 0 of those that can't win."""
+    rivals = list_rivals(query, best, others)
+    poses = [h.pose for h in (best, *rivals)]
+    counts = query.workers.map(partial(count_agreeing, query), poses, "verify")
+    by_key = {pose.key: count for pose, count in zip(poses, counts, strict=True)}
+    return [by_key.get(h.pose.key, 0) for h in (best, *others)]
 
 
 def verify(query: Query, pose: Pose) -> Verified:
@@ -91,7 +114,7 @@ def match_drawn(query: Query, pose: Pose) -> Matches:
 
 def find_all_drawn(query: Query, pose: Pose) -> Located:
     """Draw all that the photo would show at a pose in the map; return the keypoints."""
-    parts = [find_drawn(query, pose, view) for view in query.photo.seen().views]
+    parts = query.workers.map(partial(find_drawn, query, pose), query.photo.seen().views, "draw")
     ranges = np.concatenate([ranges for _, ranges in parts])
     return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
 
@@ -101,6 +124,8 @@ def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
 
     The scan drawn at the one is matched with the scan drawn at the other.
     """
+    if not others:
+        return []
     keypoints = find_all_drawn(query, pose).keypoints
 
     def is_copy(other: Pose) -> bool:
@@ -193,10 +218,26 @@ def match_pictures(own: Keypoints, others: Keypoints) -> tuple[NDArray[np.intp],
         return nothing, nothing
     a = own.descriptors.astype(np.float32)
     b = others.descriptors.astype(np.float32)
-    distances = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2.0 * (a @ b.T)
+    distances = a @ (np.float32(-2.0) * b).T
+    distances += (b * b).sum(axis=1)
     nearest = distances.argmin(axis=1)
     best = distances[np.arange(len(a)), nearest]
-    is_same = sum(np.multiply.outer(one[nearest], one) for one in others.rays.T) > COS_ELSEWHERE
-    distances[is_same] = np.inf
-    is_distinct = best < DISTINCT_RATIO**2 * distances.min(axis=1)
+    elsewhere = np.empty(len(a), np.float32)
+    find_elsewhere(distances, np.ascontiguousarray(others.rays.T), nearest, elsewhere)
+    own_squares = (a * a).sum(axis=1)
+    is_distinct = best + own_squares < DISTINCT_RATIO**2 * (elsewhere + own_squares)
     return np.flatnonzero(is_distinct), nearest[is_distinct]
+
+
+@kernel
+def find_elsewhere(distances: Array32, rays: Array32, nearest: NDArray[np.intp], elsewhere: Array32) -> None:
+    """Write the least distance (N,) of each row (N, M) but to those with rays (3, M) near the nearest's."""
+    x, y, z = rays
+    for i in range(len(nearest)):
+        k = nearest[i]
+        row = distances[i]
+        least = np.float32(np.inf)
+        for j in range(len(row)):
+            is_apart = x[k] * x[j] + y[k] * y[j] + z[k] * z[j] <= COS_ELSEWHERE
+            least = min(least, row[j] if is_apart else np.float32(np.inf))
+        elsewhere[i] = least

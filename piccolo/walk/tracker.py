@@ -160,7 +160,7 @@ class Tracker:
 
         A narrow photo is matched with those of them that are sure by themselves.
         """
-        if query.evidence == "drawn scan":
+        if query.is_narrow:
             sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= MOST_EXPECTED]
             others = [(other, pose) for k, pose in sure if (other := self.query_of(k))]
             located = (place_keypoints(*other) for other in others)
@@ -180,7 +180,7 @@ class Tracker:
 
     def _keep(self, k: int, query: Query) -> None:
         """Keep the query of a narrow photo among the last few."""
-        if query.evidence == "drawn scan":
+        if query.is_narrow:
             self.queries[k] = query
         for old in list(self.queries)[:-NUM_QUERIES]:
             del self.queries[old]
@@ -329,7 +329,7 @@ def track(query: Query, start: Pose) -> State | None:
     A narrow photo is tracked again from where its matches put it.
     """
     ends = [refine_near(query, start)]
-    if query.evidence == "drawn scan":
+    if query.is_narrow:
         ends.append(refine_near(query, verify(query, ends[0].pose).pose))
     odds = [log_odds_of_place(end.probability, end.probability, end.gaussian) for end in ends]
     best = int(np.argmax(odds))
