@@ -72,7 +72,7 @@ def test_hessian_predicts_the_gradient_a_step_away(found):
     levels = covariance.to_levels(points.channels)
     seen = points.offsets, levels, points.weights
     problem = ChannelProblem(*seen, image.rgbx, image.width, covariance.SCALE)
-    hessian = covariance.compute_hessian(problem, pose, covariance.STEPS[0])
+    hessian = covariance.compute_hessian(problem, pose, covariance.STEPS[0].turn, 3.0)
     for delta in ([0.001, 0, 0, 0, 0.003, 0], [0, -0.0015, 0.001, 0.003, 0, -0.004]):
         moved = step(pose, np.array(delta))
         before, after = _gradients(problem, (pose, moved), pose.center_world)
@@ -116,13 +116,24 @@ def test_covariance_is_in_the_worlds_axes(found):
     np.testing.assert_allclose(R @ other[3:, 3:] @ R.T, own[3:, 3:], rtol=1e-6, atol=1e-12)
 
 
+def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found):
+    prepared, pose, _ = found
+    points = _points(prepared, pose)
+    larger = points._replace(offsets=points.offsets * np.float32(10.0))
+    small, large = (covariance.compute_covariance(prepared, some, pose, False) for some in (points, larger))
+    per_metre = np.repeat([1.0, 0.1], 3)
+    np.testing.assert_allclose(large * np.outer(per_metre, per_metre), small, rtol=0.02, atol=1e-9)
+
+
 @pytest.mark.parametrize("num_rough", [1, 2, 3])
 def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monkeypatch, num_rough):
     prepared, pose, _ = found
     texels, asked = [image().rgbx for image in prepared.photo.images], []
     ways = list(zip(texels[:3], (*covariance.STEPS, covariance.ROUGH_STEPS), strict=True))
 
-    def hessian(problem, pose, steps):
+    def hessian(problem, pose, turn, median_range):
+        steps = next(steps for texels, steps in ways if texels is problem.texels)
+        assert turn == steps.turn
         asked.append((problem.texels, steps))
         return np.diag([1.0] * 5 + [-1.0 if any(problem.texels is t for t, _ in ways[:num_rough]) else 1.0])
 

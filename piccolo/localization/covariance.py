@@ -60,26 +60,25 @@ UNKNOWN_ERRORS = Errors(None, None)
 
 
 class DifferenceSteps(NamedTuple):
-    """Image and steps with which the loss is differentiated for a covariance."""
+    """Image and step with which the loss is differentiated for a covariance."""
 
     image: ImageName  # of the photo
-    turn: float  # step of the differences [rad]
-    move: float  # [m]
+    turn: float  # step of the differences [rad]; a move is as long as turns it seen from the median range
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
 STEPS = (
-    DifferenceSteps("full", math.radians(0.1), 0.005, 1.1),
-    DifferenceSteps("fine", math.radians(0.3), 0.015, 0.36),
+    DifferenceSteps("full", math.radians(0.1), 1.1),
+    DifferenceSteps("fine", math.radians(0.3), 0.36),
 )
 # of dark, noisy photos; they are too few to calibrate
-ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 0.015, 1.0)
+ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
 # of edges, whose poses have larger errors
 SHAPE_STEPS = (
-    DifferenceSteps("full", math.radians(0.5), 0.03, 1.0),
-    DifferenceSteps("fine", math.radians(0.5), 0.03, 1.0),
+    DifferenceSteps("full", math.radians(0.5), 1.0),
+    DifferenceSteps("fine", math.radians(0.5), 1.0),
 )
-ROUGH_SHAPE_STEPS = DifferenceSteps("fine", math.radians(0.8), 0.05, 1.0)
+ROUGH_SHAPE_STEPS = DifferenceSteps("fine", math.radians(0.8), 1.0)
 
 
 @kernel
@@ -118,13 +117,18 @@ def remove_hidden(points: Cells, is_valid: Mask, pose: Pose) -> Cells:
     return take(points, is_valid[compute_indices(rays_cam, is_valid.shape[1])])
 
 
-def compute_hessian(problem: ChannelProblem, pose: Pose, steps: DifferenceSteps) -> Array:
+def compute_median_range(points: Cells) -> float:
+    """Return the median distance [m] of points from the centre around which they are."""
+    return float(np.median(np.linalg.norm(points.offsets, axis=0)))
+
+
+def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_range: float) -> Array:
     """Return the Hessian (6, 6) of the robust loss, by differences over steps as large as errors are.
 
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
-    The points of the problem are around the pose.
+    The points of the problem are around the pose; the median of their ranges [m] makes moves of turns [rad].
     """
-    sizes = np.repeat([steps.turn, steps.move], 3)
+    sizes = np.repeat([turn, turn * median_range], 3)
     ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
     rotations = np.array([end.R_cam_from_world for end in ends])
     centers = np.array([end.center_world for end in ends]) - pose.center_world
@@ -275,11 +279,12 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     sphere, even without occluders: then the covariance is larger, as few blocks tell it
     (`few_blocks_factor`). The points are around the pose.
     """
+    median_range = compute_median_range(points)
     points, begins = sort_by_block(points)
 
     def by(steps: DifferenceSteps) -> Array | None:
         problem = make_problem(points, shown.photo.image(steps.image))
-        hessian = compute_hessian(problem, pose, steps)
+        hessian = compute_hessian(problem, pose, steps.turn, median_range)
         gradients = block_gradients(sum_by_block(problem, pose, begins))
         covariance = sandwich_covariance(hessian, gradients)
         if covariance is None:
@@ -318,7 +323,7 @@ def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
 
 def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
-    median_range = float(np.median(np.linalg.norm(query.view_at(pose, "points").offsets, axis=0)))
+    median_range = compute_median_range(query.view_at(pose, "points"))
     common = scan_covariance(query.scan_map, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
@@ -344,7 +349,7 @@ def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: P
     if covariance is None:
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
-    median_range = float(np.median(np.linalg.norm(points.offsets, axis=0)))
+    median_range = compute_median_range(points)
     prior = query.given.focal_prior
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
     turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.pixel
