@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import poses
@@ -12,8 +11,6 @@ import rooms
 
 from piccolo.cli import prepare_map, render_pose
 from piccolo.geometry.rotations import heading_pitch_roll_deg
-from piccolo.optimize import descent_animation as animation
-from piccolo.optimize.refine import DescentSettings
 from piccolo.scene import read_scene
 
 
@@ -88,31 +85,15 @@ def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scen
     assert np.corrcoef(*both)[0, 1] > 0.98
 
 
-def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(animation, "MAX_FRAMES", 5)
-    monkeypatch.setattr(render_pose, "DESCENT", DescentSettings(solver="gauss-newton"))
-    pano = ["--queries", scene / "queries.json", "--pano", "clean_0.jpg"]
-    code, (line,), err = run(*pano, "--animate", tmp_path / "a.mp4")
-    assert (code, err) == (0, "")
-    assert line["start_distance"] == pytest.approx(0.3)
-    assert line["end_distance"] < 0.02
-    assert line["frames"] == 5 + animation.NUM_LAST
-    with av.open(tmp_path / "a.mp4") as video:
-        shown = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
-    assert (len(shown), shown[0].shape[1]) == (line["frames"], animation.FRAME_WIDTH)
-
-
 def test_refusals_leave_nothing(run, scene, tmp_path):
     (tmp_path / "T.txt").write_text("1 2 3\n")
     result, out, at = ["--result", scene / "poses.jsonl"], ["--out", tmp_path / "a.png"], ["--at", 0, 0, 1]
     for code, arguments, message in (
-        (2, at, "give --out, --animate or both"),
         (2, [*at, *out, "--width", 101], "--width 101: wanted an even number"),
         (2, [*at, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
         (2, [*at, *out, "--depth", "a.exr"], "--depth a.exr: wanted"),
         (2, [*at, "--out", "a", "--depth", "a.png"], "only with a single picture"),
         (2, [*at, *out, "--heading", "nan"], "must be finite"),
-        (2, [*at, "--animate", "a.gif"], "--animate: only with --result or --queries"),
         (2, ["--pose", "T.txt", *out, "--heading", 3], "only with --at"),
         (2, [*at, *out, "--units", 0], "--units: found 0"),
         (3, [*result, *out], "2 poses; choose one"),
