@@ -5,12 +5,13 @@ import itertools
 import naive
 import numpy as np
 import pytest
+import rooms
 from scipy.spatial import cKDTree
 from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
-from piccolo.cloud import Cloud, voxels
 from piccolo.cloud import octree as octree_module
+from piccolo.cloud import voxels
 from piccolo.cloud import voxels as voxel_table
 from piccolo.cloud import voxels as voxels_module
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
@@ -128,11 +129,11 @@ def _cloud(count=5000, seed=0):
 
 
 def _octree(points, colors):
-    return build_octree(Cloud(points, colors, np.zeros(3)).voxels(np.eye(3)))
+    return build_octree(rooms.voxels(points, colors))
 
 
 def test_leaves_are_the_voxels_and_parents_the_means_of_their_children():
-    voxels = Cloud(*_cloud(), np.zeros(3)).voxels(np.eye(3))
+    voxels = rooms.voxels(*_cloud())
     np.testing.assert_array_equal(build_octree(voxels).level(voxel_table.LEAF_SIZE), voxels.nodes)
     octree = _octree(*_cloud())
     for level in range(voxel_table.NUM_LEVELS - 1):

@@ -43,7 +43,7 @@ WIDTH = 1024
 
 @functools.lru_cache
 def _octree():
-    return build_octree(rooms.room(SEED, NUM_POINTS)[1].voxels(np.eye(3)))
+    return build_octree(rooms.stream(rooms.room(SEED, NUM_POINTS)[1]).voxels(np.eye(3)))
 
 
 @functools.lru_cache
@@ -151,7 +151,7 @@ def test_photos_that_were_moved_are_aligned_and_paint_the_room():
 def _gray_map(cloud):
     """A map of a scan's shape alone."""
     gray = replace(cloud, colors=np.full_like(cloud.colors, 128), has_colors=False)
-    return prepare_map(gray, Workers(2), has_features=False)
+    return prepare_map(rooms.stream(gray), Workers(2), has_features=False)
 
 
 def _result(path, rgb, pose):

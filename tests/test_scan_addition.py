@@ -38,7 +38,7 @@ def _shifted(cloud, shift):
 
 
 def _added(old, cloud, name):
-    return add_scan(old, cloud, name, WORKERS, Stopwatch())
+    return add_scan(old, rooms.stream(cloud), name, WORKERS, Stopwatch())
 
 
 @functools.lru_cache
@@ -82,7 +82,7 @@ def test_poses_are_those_of_a_map_of_both():
     a, b = rooms.room(1)[1], _shifted(rooms.room(2)[1], BESIDE)
     points = np.concatenate([a.points + a.origin_world, b.points + b.origin_world])
     both = Cloud(points, np.concatenate([a.colors, b.colors]), np.zeros(3))
-    whole, scan_map = prepare_map(both, WORKERS), of_two_rooms()
+    whole, scan_map = prepare_map(rooms.stream(both), WORKERS), of_two_rooms()
     assert abs(len(scan_map.centers) / len(whole.centers) - 1.0) < 0.05
     for seed, name, shift in ((1, "A", np.zeros(3)), (2, "B", BESIDE)):
         found, expected = _localized(scan_map, seed), _localized(whole, seed)

@@ -117,13 +117,6 @@ class Cloud:
     up: UpAxis = "z"  # the axis that points up according to the files
     has_colors: bool = True  # else greys, by the intensity or all alike
 
-    def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
-        table = VoxelTable("cloud")
-        table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
-        voxels = table.finish()
-        return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)
-
 
 @dataclass(frozen=True)
 class CloudStream:

@@ -2,17 +2,16 @@
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Bytes, Int8s, Int64s, Mask
+from ..cloud import CloudStream
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import PackedPoints, pack_points
 from ..cloud.surfaces import paint_shape, surface_variance
-from ..cloud.voxels import Voxels
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.threads import Once, Stopwatch, Workers
@@ -26,21 +25,6 @@ from .storeys import Storeys, find_storeys
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
 LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
-
-
-class Voxelized(Protocol):
-    """A cloud in memory, or in files that are read once again."""
-
-    @property
-    def up(self) -> UpAxis:
-        """Upward axis, as the file declares it."""
-
-    @property
-    def has_colors(self) -> bool:
-        """False if its colours are greys, by the intensity of the points or all alike."""
-
-    def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Average the points in each voxel, in axes rotated by a matrix (3, 3)."""
 
 
 @dataclass(frozen=True)
@@ -158,7 +142,7 @@ def find_candidates(
 
 
 def prepare_map(
-    cloud: Voxelized,
+    cloud: CloudStream,
     workers: Workers,
     up: UpAxis | Array = "auto",
     watch: Stopwatch | None = None,
