@@ -18,27 +18,25 @@ from .errors import InputError as InputError
 
 if TYPE_CHECKING:
     from .confidence.covariance import PoseCovariance as PoseCovariance
-    from .confidence.localization import Alternative as Alternative
-    from .confidence.localization import Evidence as Evidence
-    from .confidence.localization import FocalLength as FocalLength
+    from .confidence.localization import (
+        Alternative as Alternative,
+        Evidence as Evidence,
+        FocalLength as FocalLength,
+    )
     from .geometry.pose import Pose as Pose
     from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
-    from .opening import Cloud as Cloud
-    from .opening import open_scan as open_scan
-    from .paper.settings import PaperSettings as PaperSettings
+    from .opening import Cloud as Cloud, open_scan as open_scan
+    from .paper.localize import PaperSettings as PaperSettings
     from .photo import Photo as Photo
     from .prior import Prior as Prior
-    from .report.build import ReportSettings as ReportSettings
-    from .report.build import write_report as write_report
-    from .result import Result as Result
-    from .result import Source as Source
+    from .report.build import ReportSettings as ReportSettings, write_report as write_report
+    from .result import Result as Result, Source as Source
     from .scan import Scan as Scan
     from .scan_map.gps import GpsPrior as GpsPrior
     from .scan_walk import Walk as Walk
     from .walk.motion import Motion as Motion
     from .walk.path import Gap as Gap
-    from .walk.results import Alone as Alone
-    from .walk.results import WalkFrame as WalkFrame
+    from .walk.results import Alone as Alone, WalkFrame as WalkFrame
 
 MODULES = {
     "Alone": ".walk.results",

@@ -29,15 +29,12 @@ from .localization.query import prepare_query
 from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
-from .paper.localize import PaperMap
-from .paper.localize import localize as localize_by_paper
-from .paper.settings import PaperSettings
+from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
 from .photo import Photo
 from .prior import Prior
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
 from .scan_map.gps import GpsPrior, gps_prior
-from .scan_map.named_scans import add_places, check_within
-from .scan_map.scan_map import ScanMap
+from .scan_map.scan_map import ScanMap, add_places, check_within
 
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized

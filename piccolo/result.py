@@ -13,8 +13,7 @@ import numpy as np
 
 from . import __version__
 from .camera import Mount
-from .camera.calibration import document_of as camera_document
-from .camera.calibration import read_mounts
+from .camera.calibration import document_of as camera_document, read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization

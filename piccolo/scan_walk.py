@@ -20,7 +20,7 @@ from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
 from .result import Result, with_localization
-from .scan_map.named_scans import add_places, check_within
+from .scan_map.scan_map import add_places, check_within
 from .walk.frames import Frame
 from .walk.motion import Motion, check_times
 from .walk.path import believe

@@ -13,7 +13,7 @@ from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.cloud.voxels import VoxelTable, morton_order
-from piccolo.cloud.writers import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
@@ -59,6 +59,12 @@ def voxels(points, colors=None):
     grey = np.full(points.shape, 128, np.uint8)
     table.add(points.astype(np.float32).astype(np.float64), grey if colors is None else colors)
     return table.finish()
+
+
+def write_ply(path, rows):
+    """Write vertices to a file."""
+    with writing_ply(path) as writer:
+        writer.add(rows)
 
 
 def make_once(name, make):

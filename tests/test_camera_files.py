@@ -3,8 +3,7 @@ import json
 import numpy as np
 import pycolmap
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from refusals import assert_refused, mutated, read_or_refused
 
 from piccolo.camera.calibration import Mount, document_of, read_calibration, read_mounts, read_rig

@@ -9,8 +9,7 @@ import zlib
 import meshes as made
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from las_files import las_bytes, laz_bytes
 from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf, write_obj, write_ply
 from plyfile import PlyData

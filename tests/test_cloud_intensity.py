@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from e57_files import ScanToWrite
-from e57_files import write as write_e57
+from e57_files import ScanToWrite, write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
 from refusals import assert_refused
 from scans import write_scalars

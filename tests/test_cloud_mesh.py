@@ -8,8 +8,7 @@ from scipy.spatial.transform import Rotation
 from test_cloud_morton import whole
 
 from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.readers import mesh as mesh_module
-from piccolo.cloud.readers import mesh_files
+from piccolo.cloud.readers import mesh as mesh_module, mesh_files
 from piccolo.cloud.readers.mesh import compute_weights, linear_to_srgb, look_up, open_mesh, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings

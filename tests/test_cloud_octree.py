@@ -10,10 +10,7 @@ from scipy.spatial import cKDTree
 from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
-from piccolo.cloud import octree as octree_module
-from piccolo.cloud import voxels
-from piccolo.cloud import voxels as voxel_table
-from piccolo.cloud import voxels as voxels_module
+from piccolo.cloud import octree as octree_module, voxels, voxels as voxel_table, voxels as voxels_module
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.errors import InputError

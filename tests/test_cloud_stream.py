@@ -23,7 +23,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.opening import open_files
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
 from piccolo.scan_map.scan_map import prepare_map
 

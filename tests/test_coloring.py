@@ -11,12 +11,11 @@ import pytest
 import rooms
 from scipy.spatial import cKDTree
 
-from piccolo.cli import color_scan as tool
-from piccolo.cli import localize as command_line
+from piccolo.cli import color_scan as tool, localize as command_line
 from piccolo.cli.together import steps_file
 from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree, recolor
-from piccolo.cloud.writers import vertex_rows, write_colored, write_ply, writing_e57
+from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57
 from piccolo.coloring import alignment, color_scan
 from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
 from piccolo.coloring.color_scan import (
@@ -252,7 +251,7 @@ def test_colours_are_written_in_each_format(tmp_path, suffix):
     rng = np.random.default_rng(4)
     points = rng.uniform(0, 9, (3000, 3)) + np.array([500_000.0, 5_800_000.0, 100.0])
     source = tmp_path / "cloud.ply"
-    write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
+    rooms.write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
     wanted = rng.integers(0, 256, (3000, 3)).astype(np.uint8)
     out = tmp_path / f"a b{suffix}"
     box = np.stack([points.min(axis=0), points.max(axis=0)])
@@ -269,7 +268,7 @@ def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
     """The source fails between two chunks: nothing is left, and the library's writer has ended."""
     source = tmp_path / "cloud.ply"
     points = np.random.default_rng(4).uniform(0, 9, (3000, 3))
-    write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
+    rooms.write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
     closed, close = [], laspy.LasWriter.close
     monkeypatch.setattr(laspy.LasWriter, "close", lambda self: closed.append(close(self)))
 

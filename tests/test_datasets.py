@@ -6,8 +6,7 @@ from pathlib import Path
 import dataset_rooms as made
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from poses import jpeg, tilted_poses
 from refusals import mutated, read_or_refused
 from scipy.spatial.transform import Rotation

@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from refusals import assert_input_error
 from test_result import RESULT
 

@@ -6,8 +6,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from pictures import encoded, smooth_rgb, write
 from poses import jpeg, result, tilted_poses
 from refusals import assert_input_error, mutated, read_or_refused

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from PIL import Image
 from poses import SIZE, jpeg, lines_of, result, tilted_poses, write_results
 from refusals import mutated, read_or_refused

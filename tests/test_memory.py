@@ -13,8 +13,7 @@ from PIL.PngImagePlugin import PngImageFile
 from refusals import assert_input_error
 from rooms import as_panorama, query, room, scan_map, stream
 
-from piccolo.cloud import octree
-from piccolo.cloud import voxels as voxels_module
+from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.errors import InputError
 from piccolo.jobs import memory

@@ -18,6 +18,7 @@ from piccolo.panorama.model import shrink
 from piccolo.paper.localize import (
     MIN_CLEARANCE,
     PROBE_WIDTH,
+    PaperSettings,
     color_histogram,
     free_grid,
     histogram_similarity,
@@ -25,7 +26,6 @@ from piccolo.paper.localize import (
     paper_confidence,
     prepare,
 )
-from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import is_free_space
 
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)

@@ -12,7 +12,7 @@ import rooms
 from piccolo.geometry.pose import Pose, pose_errors, step, yaw_rotation
 from piccolo.optimize.refine import Adam, DescentSettings, descend_lbfgs, make_sampling_loss, refine
 from piccolo.panorama.texels import pack_texels
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 from research.experiments import animate_descent
 from research.experiments.animate_descent import encode_gif, perturb_pose, refine_with_history
 

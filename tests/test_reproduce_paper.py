@@ -16,7 +16,7 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 from piccolo.scene import Query, read_scene, write_queries
 from piccolo.views.zbuffer import visible_points
 from research.evaluation.query_result import read_run

@@ -15,7 +15,7 @@ from piccolo.errors import InputError
 from piccolo.files.cache import sha256_of_arrays
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 from piccolo.prior import Prior
 
 

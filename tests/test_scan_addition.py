@@ -11,8 +11,7 @@ import rooms
 from refusals import assert_input_error
 from scipy.spatial import cKDTree
 
-from piccolo.cli import localize as localize_command
-from piccolo.cli import prepare_map as prepare_command
+from piccolo.cli import localize as localize_command, prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
 from piccolo.errors import InputError
@@ -23,9 +22,8 @@ from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.prior import Prior
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
-from piccolo.scan_map.named_scans import add_places, find_scan_at, name_scan
 from piccolo.scan_map.scan_addition import add_scan
-from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scan_map.scan_map import add_places, find_scan_at, name_scan, prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide
 
 BESIDE = np.array([5.3, 0.4, 0.2])  # of a second room, from where it was made [m]

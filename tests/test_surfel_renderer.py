@@ -6,8 +6,7 @@ import numpy as np
 import poses
 import pytest
 import rooms
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from refusals import mutated, read_or_refused
 
 from piccolo.cli.render_pose import read_pose_matrix

@@ -17,7 +17,7 @@ from rooms import write_room
 from piccolo.geometry.pose import Pose
 from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 from piccolo.result import Result
 from piccolo.scene import Query, read_scene, write_queries
 from research.evaluation.query_result import QueryResult

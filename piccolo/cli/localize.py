@@ -340,7 +340,7 @@ def main(arguments: Namespace) -> int:
         num_jobs = execution.count_jobs(arguments, num_left or len(looks) or None)
         opening = partial(open_scan, run)
         with (
-            execution.connecting(arguments, num_jobs) as cluster,
+            execution.connecting(arguments) as cluster,
             execution.executing(arguments, run.localizer, num_jobs, cluster, opening) as place,
             watch.stage("all"),
         ):

@@ -15,7 +15,7 @@ from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import Settings
 from ..panorama import check_labels
-from ..paper.settings import PaperSettings
+from ..paper.localize import PaperSettings
 from ..photo import Photo, Projection
 from ..prior import Prior
 from ..scan_map.open_map import CachePolicy
@@ -192,7 +192,7 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
         text = f" (default one per core, if memory suffices and each gets {PHOTOS_OF_A_JOB} photos or more; "
         text += "1 with paths on stdin or --threads)"
     option(group, "--jobs N", f"processes that use one prepared map{text}", default=default_jobs)
-    text = "run on a Dask cluster: address or file of its scheduler; or local: --jobs workers on this machine"
+    text = "run on a Dask cluster: address or file of its scheduler"
     option(group, "--dask ADDRESS", text)
     option(group, "--threads N", "threads of each process (default: the cores divided by --jobs)")
     text = "memory limit of all processes, or of each --dask worker (default 80 %% of the free memory)"

@@ -112,7 +112,6 @@ class Cloud:
     points: Array32  # (N, 3) world minus origin_world [m], all finite, Morton order
     colors: Bytes  # (N, 3) RGB
     origin_world: Array  # (3,) what was subtracted from the file's coordinates [m]
-    num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
     up: UpAxis = "z"  # the axis that points up according to the files
     has_colors: bool = True  # else greys, by the intensity or all alike
@@ -200,8 +199,7 @@ class CloudStream:
         points = points[order]
         colors = colors[order]
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
-        num_dropped = sum(validator.num_dropped for validator in validators)
-        return Cloud(points, colors, origin_world, num_dropped, warnings, self.up, self.has_colors)
+        return Cloud(points, colors, origin_world, warnings, self.up, self.has_colors)
 
 
 def stream_of_arrays(points: Floats, colors: NDArray[Any] | None) -> CloudStream:

@@ -97,12 +97,6 @@ def writing_ply(path: Path, comments: Sequence[str] = (), more: Sequence[str] = 
         writer.write_header()
 
 
-def write_ply(path: Path, rows: Rows) -> None:
-    """Write vertices to a file, whole or not at all."""
-    with writing_ply(path) as writer:
-        writer.add(rows)
-
-
 def coordinate_type(box: Array, T_target_from_source: Array, scale: float) -> type[np.floating[Any]]:
     """Return float64 if rounding to float32 would move a transformed box (2, 3) [m] by over MAX_LOSS.
 

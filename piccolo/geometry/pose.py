@@ -247,14 +247,6 @@ def pose_errors(pose: Pose, true_pose: Pose) -> tuple[float, float]:
     return distance, angle_between(pose.R_cam_from_world, true_pose.R_cam_from_world)
 
 
-def is_correct(pose: Pose | None, true_pose: Pose) -> bool:
-    """Return True if the paper counts the pose as correct: within MAX_DISTANCE and MAX_ANGLE; None is not."""
-    if pose is None:
-        return False
-    distance, angle = pose_errors(pose, true_pose)
-    return distance < MAX_DISTANCE and angle < MAX_ANGLE
-
-
 def move(pose: Pose, T_target_from_source: Array, metres_per_unit: float) -> Pose:
     """Return a pose of the source in the target's coordinates; T (4, 4) is rigid, in `metres_per_unit`."""
     R = T_target_from_source[:3, :3]

@@ -44,12 +44,6 @@ def uniform_rotations(num_rotations: int) -> Array:
     return rotations
 
 
-def random_rotation(rng: np.random.Generator) -> Array:
-    """Draw a rotation (3, 3) evenly from SO(3) (Shoemake, 1992: a normalised Gaussian quaternion)."""
-    quaternion = rng.normal(size=4)
-    return rotation_from_quaternion_wxyz(quaternion / np.linalg.norm(quaternion))
-
-
 def turn_axes(pose: Pose, other_from_cam: Array) -> Pose:
     """Return the pose with its rotation to another tool's camera axes, by `other_from_cam` (3, 3)."""
     return Pose(other_from_cam @ pose.R_cam_from_world, pose.center_world)

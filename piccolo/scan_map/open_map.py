@@ -19,9 +19,8 @@ from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap
 from ..prior import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
-from .named_scans import name_scan
 from .scan_addition import add_scan
-from .scan_map import ScanMap, add_features, prepare_map
+from .scan_map import ScanMap, add_features, name_scan, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.

@@ -22,8 +22,7 @@ from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import BLOCK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
-from .named_scans import check_name
-from .scan_map import ScanMap, make_range_lookup, sparse_candidates
+from .scan_map import ScanMap, check_name, make_range_lookup, sparse_candidates
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this

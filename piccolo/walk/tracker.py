@@ -10,10 +10,9 @@ import numpy as np
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import MODELS, Standing, pose_features, posterior
-from ..geometry.nearness import ONE_ANSWER, ONE_PLACE
+from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
 from ..geometry.pose import Pose, carry, exp_so3, log_so3
 from ..geometry.rotations import uniform_yaws
-from ..geometry.suppression import non_maximum_suppression
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..localization.attempts import is_whole
 from ..localization.beam import Ends, brief_query, descend_briefly, score_briefly, score_mirror, score_near

@@ -193,9 +193,8 @@ def run_scenes(
         found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
         if left := [(scene, queries) for scene, queries in found if queries]:
             file.cut(size)
-            num_jobs = execution.count_jobs(arguments, max(len(queries) for _, queries in left))
             with (
-                execution.connecting(arguments, num_jobs) as cluster,
+                execution.connecting(arguments) as cluster,
                 execution.interruptible() as interruption,
             ):
                 for scene, queries in left:

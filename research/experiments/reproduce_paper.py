@@ -26,11 +26,10 @@ from piccolo.cli.options import add_execution_options
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
 from piccolo.cloud import read_cloud
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
-from piccolo.cloud.writers import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
-from piccolo.geometry.pose import Pose, move, transform_points
-from piccolo.geometry.rotations import random_rotation
+from piccolo.geometry.pose import Pose, move, rotation_from_quaternion_wxyz, transform_points
 from piccolo.jobs.memory import limit_memory
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.open_map import CachePolicy
@@ -65,7 +64,7 @@ def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """Return the cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
     cloud = read_cloud(scene.cloud, IN_COLORS)
     T = np.eye(4)
-    T[:3, :3] = random_rotation(_rng(scene))
+    T[:3, :3] = rotation_from_quaternion_wxyz(_rng(scene).normal(size=4))
     points = transform_points(cloud.points.astype(np.float64) + cloud.origin_world, T)
     queries = tuple(replace(query, pose=move(query.pose, T, 1.0)) for query in scene.queries)
     return replace(scene, cloud=_write_cloud(folder, points, cloud.colors), queries=queries)
@@ -73,7 +72,8 @@ def with_random_rotation(scene: Scene, folder: Path) -> Scene:
 
 def _write_cloud(folder: Path, points: Array, colors: Bytes) -> Path:
     path = folder / CLOUD_NAME
-    write_ply(path, vertex_rows(points, colors))
+    with writing_ply(path) as writer:
+        writer.add(vertex_rows(points, colors))
     return path
 
 

@@ -13,7 +13,7 @@ from piccolo.cli.terminal import print_note
 from piccolo.cloud import read_cloud
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.localization import Localization
-from piccolo.geometry.pose import is_correct
+from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
@@ -191,7 +191,7 @@ def run(arguments: Namespace) -> int:
             for trial in trials:
                 found = localize_trial(scan_map, trial, workers)
                 truth = trial.true_pose
-                ok = truth is not None and is_correct(found.pose, truth)
+                ok = bool(truth and found.pose and RIGHT.holds(found.pose, truth))
                 rows.append((trial.case, found.status, ok))
                 file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
                 file.flush()

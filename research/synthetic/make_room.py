@@ -14,7 +14,7 @@ from piccolo.camera.calibration import read_cameras
 from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
 from piccolo.cli.command import command, option
 from piccolo.cli.terminal import workers_from
-from piccolo.cloud.writers import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.export.formats import tum_lines, write_lines
 from piccolo.files.atomic import write_atomically
 from piccolo.jobs.threads import Workers
@@ -188,7 +188,8 @@ def write_scene(
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors, labels = worlds.scan_world(world, num_points, workers)
     rows = vertex_rows(points, colors, label=labels.astype(np.int32) if arguments.labels else None)
-    write_ply(folder / scenes.CLOUD_NAME, rows)
+    with writing_ply(folder / scenes.CLOUD_NAME) as writer:
+        writer.add(rows)
     if office is not None and arguments.walk:
         queries = write_walks(arguments, office, folder, workers)
     else:
