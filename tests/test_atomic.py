@@ -18,7 +18,7 @@ from piccolo.errors import InputError
 from piccolo.files import atomic
 from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.geometry.pose import Pose
-from piccolo.scene import Query, write_queries
+from research.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -13,7 +13,6 @@ from refusals import assert_input_error, assert_refused
 from piccolo.errors import InputError
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.scene import Query, Scene
 from piccolo.walk.results import Alone, WalkFrame
 from research.evaluation import tables
 from research.evaluation.plots import errors_figure, figure_png, risk_figure
@@ -26,6 +25,7 @@ from research.evaluation.query_result import (
     read_run,
 )
 from research.evaluation.tables import alone_table, group_walks, walk_table
+from research.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
 

@@ -25,9 +25,9 @@ from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from piccolo.result import Result
-from piccolo.scene import read_scene
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
+from research.scene import read_scene
 from research.synthetic.layout import LABEL_NAMES
 
 POINTS = seeded_cloud(1, num_points=3000).points_world

@@ -11,7 +11,8 @@ import rooms
 
 from piccolo.cli import prepare_map, render_pose
 from piccolo.geometry.rotations import heading_pitch_roll_deg
-from piccolo.scene import read_scene
+from research.datasets import true_poses
+from research.scene import read_scene
 
 
 @pytest.fixture(scope="module")
@@ -48,11 +49,12 @@ def test_all_results_become_a_folder_of_pictures(run, scene, tmp_path):
 
 def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_path):
     pose = read_scene(scene).by_name["tilt_0.jpg"].pose
+    assert true_poses.main(["--scenes", str(scene), "--out", str(tmp_path / "true.jsonl")]) == 0
     np.savetxt(tmp_path / "T.txt", pose.T_world_from_cam, fmt="%.17g")
     heading, pitch, roll = heading_pitch_roll_deg(pose)
     sources = {
         "result": ["--result", scene / "poses.jsonl", "--pano", "tilt_0.jpg"],
-        "queries": ["--queries", scene / "queries.json", "--pano", "images/tilt_0.jpg"],
+        "truth": ["--result", tmp_path / "true.jsonl", "--pano", "images/tilt_0.jpg"],
         "pose": ["--pose", tmp_path / "T.txt"],
         "at": ["--at", *pose.center_world, "--heading", heading, "--pitch", pitch, "--roll", roll],
     }
@@ -78,7 +80,7 @@ def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scen
     assert read.tolist() == [[1234, 0], [65535, 65535]]
     arguments = ["--cloud", str(scene / "cloud.ply"), "--out", str(scene / "cloud.map"), "--quiet"]
     assert prepare_map.main(arguments) == 0
-    pano = ["--queries", scene / "queries.json", "--pano", "tilt_0.jpg", "--width", 128]
+    pano = ["--result", scene / "poses.jsonl", "--pano", "tilt_0.jpg", "--width", 128]
     for cloud in ("cloud.ply", "cloud.map"):
         assert run(*pano, "--out", tmp_path / f"{cloud}.png", cloud=cloud)[0] == 0
     both = [cv2.imread(str(tmp_path / f"cloud.{kind}.png")).ravel() for kind in ("ply", "map")]
@@ -123,7 +125,7 @@ def test_pictures_on_stdout_are_those_of_files(scene, tmp_path, capfdbinary):
     assert render_pose.main([*arguments, str(tmp_path / "b.png"), "--depth", "-", "--quiet"]) == 0
     assert capfdbinary.readouterr() == (before, b"")
     assert render_pose.main([*arguments, "-", "--depth", "/dev/stdout", "--quiet"]) == 2
-    pano = ["--cloud", str(scene / "cloud.ply"), "--queries", str(scene / "queries.json")]
+    pano = ["--cloud", str(scene / "cloud.ply"), "--result", str(scene / "poses.jsonl")]
     pano += ["--pano", "clean_0.jpg", "--out", str(scene / "images" / "clean_0.jpg")]
     assert render_pose.main(pano) == 2
     assert b"found an input as the output" in capfdbinary.readouterr().err

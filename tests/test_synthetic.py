@@ -18,7 +18,7 @@ from piccolo.geometry.pose import Pose, angle_between, rotation_from_quaternion_
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.scene import read_scene
+from research.scene import read_scene
 from research.synthetic import make_room as tool
 from research.synthetic.layout import make_room
 from research.synthetic.office import make_office

@@ -19,9 +19,9 @@ from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
 from piccolo.paper.localize import PaperSettings
 from piccolo.result import Result
-from piccolo.scene import Query, read_scene, write_queries
 from research.evaluation.query_result import QueryResult
 from research.measuring import benchmark, confidence, page, sensitivity, speed, trials
+from research.scene import Query, read_scene, write_queries
 from research.synthetic import photos
 
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}

@@ -20,7 +20,6 @@ from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
 from ..jobs.threads import Workers
 from ..result import read_results
 from ..scan_map.open_map import open_points
-from ..scene import read_scene
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
 from .checks import check_distinct, check_suffix, checking_options
@@ -64,10 +63,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     group = parser.add_argument_group("pose, one of")
     one = group.add_mutually_exclusive_group(required=True)
     option(one, "--result FILE", "results of localize.py, JSON lines")
-    option(one, "--queries FILE", "queries.json with true poses")
     option(one, "--pose FILE", "text file with the 4 x 4 numbers of T_world_from_cam")
     option(one, "--at X Y Z", "position in world coordinates [m]")
-    option(group, "--pano NAME", "choose the pose of this panorama (file name), if --queries has several")
+    option(group, "--pano NAME", "choose the pose of this panorama (file name), if --result has several")
     for angle in ("heading", "pitch", "roll"):
         option(group, f"--{angle} DEG", f"{angle} with --at (default 0)")
     group = parser.add_argument_group("picture")
@@ -118,16 +116,11 @@ def suffix_of(option: str, path: Path) -> str:
 
 def check_files(arguments: Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
-    given = (arguments.result, arguments.queries, arguments.pose, arguments.camera)
-    photos = [find_photo(arguments, shot.pano) for shot in poses]
+    given = (arguments.result, arguments.pose, arguments.camera)
+    photos = [Path(shot.pano) for shot in poses]
     check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
     for path in filter(None, outputs_of(arguments).values()):
         (check_output_folder if is_folder(path) else check_output)(path)
-
-
-def find_photo(arguments: Namespace, name: str) -> Path:
-    """Return the panorama that a pose's file names."""
-    return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
 
 def poses_from(arguments: Namespace) -> list[Shot]:
@@ -141,19 +134,16 @@ def poses_from(arguments: Namespace) -> list[Shot]:
         return [shot_of("at", pose, given)]
     if arguments.pose:
         return [shot_of(str(arguments.pose), read_pose_matrix(arguments.pose), given)]
-    file = arguments.queries or arguments.result
-    if arguments.queries:
-        queries = read_scene(file).by_name.items()
-        found = [shot_of(name, query.pose, given or query.cameras) for name, query in queries]
-    else:
-        results = [r for r in read_results([file]) if r.best_pose is not None]
-        found = [shot_of(r.pano, r.best_pose, given or r.cameras) for r in results if r.best_pose]
+    results = read_results([arguments.result])
+    found = [shot_of(r.pano, r.best_pose, given or r.cameras) for r in results if r.best_pose]
     if arguments.pano:
         found = [shot for shot in found if Path(shot.pano).name == Path(arguments.pano).name]
     if not found:
-        raise InputError(f"{file}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
+        raise InputError(f"{arguments.result}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
     if len(found) > 1 and not is_folder(arguments.out):
-        raise InputError(f"{file}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER")
+        raise InputError(
+            f"{arguments.result}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER"
+        )
     return found
 
 

@@ -16,8 +16,8 @@ from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
-from piccolo.scene import Query, Scene
 
+from ..scene import Query, Scene
 from .files import AXES
 
 MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom more than the right one

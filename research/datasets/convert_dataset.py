@@ -25,9 +25,9 @@ from piccolo.errors import InputError, unreadable
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
 from piccolo.geometry.pose import move, transform_points
 from piccolo.jobs.threads import Progress, Workers
-from piccolo.scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from piccolo.views.pictures import encode_image
 
+from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from . import generic, research, stanford
 from .checking import check_scene
 from .files import AXES, DIRECTIONS

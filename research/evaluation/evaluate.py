@@ -34,8 +34,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan, settings_json
 from piccolo.result import UNREADABLE, check_scan, describe_failure, read_results
 from piccolo.scan_map.open_map import scan_sha256_of
-from piccolo.scene import Query, Scene, find_scenes, input_files
 
+from ..scene import Query, Scene, find_scenes, input_files
 from . import query_result, tables
 from .plots import errors_figure, figure_png, risk_figure
 from .query_result import QueryResult, Thresholds

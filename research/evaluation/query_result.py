@@ -19,7 +19,8 @@ from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.opened_scan import OpenedScan
 from piccolo.result import Result
-from piccolo.scene import Query, Scene, document_of_pose, pose_of
+
+from ..scene import Query, Scene, document_of_pose, pose_of
 
 FORMAT = "piccolo-evaluation/2"
 WANTED = "wanted a run of tools/evaluate.py"

@@ -33,10 +33,10 @@ from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels
 from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
-from piccolo.scene import read_scene
 from piccolo.views.zbuffer import is_free_space, visible_points
 
 from ..evaluation.plots import figure_png
+from ..scene import read_scene
 
 POOL_PER_POINT = 8  # points of which visible ones are taken, for one that is used
 FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space

@@ -33,11 +33,11 @@ from piccolo.geometry.pose import Pose, move, rotation_from_quaternion_wxyz, tra
 from piccolo.jobs.memory import limit_memory
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.open_map import CachePolicy
-from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import statistics, table_of
+from ..scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 from ..synthetic.photos import UPSIDE_DOWN
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.

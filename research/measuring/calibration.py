@@ -18,9 +18,9 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose_gaussian import subtract
-from piccolo.scene import pose_of
 
 from ..evaluation.tables import Table, reliability_table
+from ..scene import pose_of
 
 EPILOG = """\
 example:

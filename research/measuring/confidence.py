@@ -18,8 +18,8 @@ from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
-from piccolo.scene import Scene, document_of_pose, read_scene
 
+from ..scene import Scene, document_of_pose, read_scene
 from ..synthetic.layout import PLAIN
 from ..synthetic.photos import change_sensor, cut_photo, occlude
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike

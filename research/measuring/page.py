@@ -25,10 +25,10 @@ from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose_gaussian import subtract
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.panorama import read_panorama
-from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
+from ..scene import Query, Scene, read_scene
 from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
 from .speed import clean_queries, kernel_table, size_table

@@ -20,9 +20,9 @@ from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
-from piccolo.scene import read_scene
 
 from ..evaluation.tables import table_of
+from ..scene import read_scene
 from .confidence import localize_trial, photo_trials, room_trials, scene_trials
 from .trials import Trial
 

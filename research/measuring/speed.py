@@ -23,9 +23,9 @@ from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.scene import Query, Scene
 
 from ..evaluation.tables import Table
+from ..scene import Query, Scene
 from ..synthetic.world import make_query, make_world, scan_world
 
 NUM_ROUNDS = 15

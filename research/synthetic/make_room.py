@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from piccolo import scene as scenes
 from piccolo.camera import Calibration
 from piccolo.camera.calibration import read_cameras
 from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
@@ -22,6 +21,7 @@ from piccolo.optional import import_optional
 from piccolo.panorama.video import writing_video
 from piccolo.views.pictures import encode_image
 
+from .. import scene as scenes
 from . import world as worlds
 from .office import Office, make_office
 from .walk_frames import BAD_KINDS, WalkOptions, frames_of

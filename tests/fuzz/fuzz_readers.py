@@ -22,7 +22,7 @@ from piccolo.panorama.photo import read_photo_facts
 from piccolo.prior import Prior
 from piccolo.result import Result
 from piccolo.scan_map.map_file import load_map
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 READERS = {suffix[1:]: form.open_source for form in FORMATS for suffix in form.suffixes}
 OTHERS = {
