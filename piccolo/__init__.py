@@ -28,40 +28,33 @@ if TYPE_CHECKING:
     from .opening import Cloud as Cloud, open_scan as open_scan
     from .paper.localize import PaperSettings as PaperSettings
     from .photo import Photo as Photo
-    from .prior import Prior as Prior
+    from .prior import GpsPrior as GpsPrior, Prior as Prior
     from .report.build import ReportSettings as ReportSettings, write_report as write_report
     from .result import Result as Result, Source as Source
     from .scan import Scan as Scan
-    from .scan_map.gps import GpsPrior as GpsPrior
     from .scan_walk import Walk as Walk
     from .walk.motion import Motion as Motion
     from .walk.path import Gap as Gap
     from .walk.results import Alone as Alone, WalkFrame as WalkFrame
 
-MODULES = {
-    "Alone": ".walk.results",
-    "Alternative": ".confidence.localization",
-    "Cloud": ".opening",
-    "CoarseToFineSettings": ".localization.settings",
-    "Evidence": ".confidence.localization",
-    "FocalLength": ".confidence.localization",
-    "Gap": ".walk.path",
-    "GpsPrior": ".scan_map.gps",
-    "Motion": ".walk.motion",
-    "PaperSettings": ".paper.settings",
-    "Photo": ".photo",
-    "Pose": ".geometry.pose",
-    "PoseCovariance": ".confidence.covariance",
-    "Prior": ".prior",
-    "ReportSettings": ".report.build",
-    "Result": ".result",
-    "Scan": ".scan",
-    "Source": ".result",
-    "Walk": ".scan_walk",
-    "WalkFrame": ".walk.results",
-    "open_scan": ".opening",
-    "write_report": ".report.build",
+NAMES = {  # by module
+    ".confidence.covariance": ("PoseCovariance",),
+    ".confidence.localization": ("Alternative", "Evidence", "FocalLength"),
+    ".geometry.pose": ("Pose",),
+    ".localization.settings": ("CoarseToFineSettings",),
+    ".opening": ("Cloud", "open_scan"),
+    ".paper.localize": ("PaperSettings",),
+    ".photo": ("Photo",),
+    ".prior": ("GpsPrior", "Prior"),
+    ".report.build": ("ReportSettings", "write_report"),
+    ".result": ("Result", "Source"),
+    ".scan": ("Scan",),
+    ".scan_walk": ("Walk",),
+    ".walk.motion": ("Motion",),
+    ".walk.path": ("Gap",),
+    ".walk.results": ("Alone", "WalkFrame"),
 }
+MODULES = {name: module for module, names in NAMES.items() for name in names}
 __all__ = ["InputError", "__version__", *MODULES]  # noqa: PLE0604  names all
 
 

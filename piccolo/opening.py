@@ -11,9 +11,8 @@ from numpy.typing import NDArray
 
 from .arguments import check_fields, check_kind
 from .arrays import Floats
-from .cloud import open_cloud
 from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
-from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
+from .cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
 from .geometry.colors import Labels

@@ -77,3 +77,16 @@ class Prior:
 
 
 NOTHING_KNOWN = Prior()
+
+
+@dataclass(frozen=True)
+class GpsPrior:
+    """A photo's GPS position in the scan, which may be wrong indoors."""
+
+    center_world: tuple[float, float]  # [m] in the scan's coordinates, of any height
+    radius: float  # [m] within which the camera is searched first
+    is_used: bool = True  # the result lies there; else it was found, or not found, without it
+
+    def apply_to(self, prior: Prior) -> Prior:
+        """Return the prior with this position in place of its own."""
+        return replace(prior, near=(*self.center_world, None), radius=self.radius)

@@ -23,7 +23,7 @@ from .geometry.pose import Pose, check_pose
 from .geometry.rotations import heading_pitch_roll_deg
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .scan_map.gps import GpsPrior
+from .prior import GpsPrior
 from .walk.results import WalkFrame
 
 FORMAT = "piccolo-pose/10"

@@ -55,7 +55,7 @@ class Scan:
     @property
     def points(self) -> PackedPoints:
         """Coloured points, to draw the scan: `x`, `y`, `z` (N,) [m] in the frame of `from_world`."""
-        return self._opened.points
+        return self._opened.prepared.points
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -64,7 +64,7 @@ class Scan:
 
     def from_world(self, pose: Pose) -> Pose:
         """Transform a pose from the scan's own coordinates to the frame of `points`."""
-        return self._opened.from_world(check_pose(pose, "`pose`"))
+        return self._opened.prepared.from_world(check_pose(pose, "`pose`"))
 
     def save(self, path: File) -> None:
         """Write the prepared map to the file `path`, which `open_scan` opens in place of the scan's files.

@@ -11,7 +11,8 @@ from rooms import scan as scan_of_room
 
 import piccolo
 from piccolo.cli.localize import main
-from piccolo.export import Options, export
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.photo import Photo
 from piccolo.result import read_results

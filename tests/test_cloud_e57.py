@@ -6,13 +6,14 @@ import pytest
 from e57_files import ImageToWrite, ScanToWrite, sealed, with_xml, write
 from hypothesis import given, settings, strategies as st
 from refusals import assert_refused, mutated, read_or_refused
+from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cli import e57_images
-from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import e57, e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
 from piccolo.cloud.settings import IN_COLORS
+from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
 from piccolo.geometry.pose import exp_so3, quaternion_wxyz
 

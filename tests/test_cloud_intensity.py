@@ -11,7 +11,6 @@ from scans import write_scalars
 from test_cloud_morton import seeded_cloud, whole
 from test_cloud_pcd import content_of
 
-from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
@@ -19,6 +18,7 @@ from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, make_source
 from piccolo.cloud.readers.text import open_ptx, open_text
 from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.geometry.pose import exp_so3
 
 POINTS = seeded_cloud(1, num_points=3000).points_world

@@ -5,9 +5,9 @@ import naive
 import numpy as np
 from hypothesis import given, settings, strategies as st
 
-from piccolo.cloud import Cloud, CloudStream, open_source
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import IN_COLORS
+from piccolo.cloud.stream import Cloud, CloudStream, open_source
 from piccolo.cloud.voxels import morton_codes, morton_order
 
 A = Path("a")

@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from refusals import assert_refused
+from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import reader as raw, text
 from piccolo.cloud.readers.pcd import MAX_RATIO, decompress_lzf
 from piccolo.cloud.settings import IN_COLORS
+from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

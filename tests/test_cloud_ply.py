@@ -7,11 +7,12 @@ import pytest
 import rooms
 from plyfile import PlyData, PlyElement
 from refusals import assert_input_error, assert_refused
+from scans import read_cloud
 from test_cloud_morton import seeded_cloud, whole
 
-from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import coordinate_type, vertex_rows, writing_ply
 from piccolo.errors import InputError
 

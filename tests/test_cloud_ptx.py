@@ -3,12 +3,13 @@ import math
 import numpy as np
 import pytest
 from refusals import assert_input_error, assert_refused
+from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 from test_cloud_text import write
 
-from piccolo.cloud import open_source, read_cloud
 from piccolo.cloud.readers import reader as raw, text
 from piccolo.cloud.readers.text import line_blocks, open_pts, open_ptx
+from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)

@@ -3,10 +3,10 @@ import pytest
 from hypothesis import given, strategies as st
 from plyfile import PlyElement
 from refusals import assert_refused
+from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud, whole
 from test_cloud_ply import vertices, write as write_ply
 
-from piccolo.cloud import read_cloud
 from piccolo.cloud.readers import reader, text
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.text import is_number, open_text

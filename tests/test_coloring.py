@@ -9,12 +9,13 @@ import laspy
 import numpy as np
 import pytest
 import rooms
+from scans import read_cloud
 from scipy.spatial import cKDTree
 
 from piccolo.cli import color_scan as tool, localize as command_line
 from piccolo.cli.together import steps_file
-from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree, recolor
+from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57
 from piccolo.coloring import alignment, color_scan
 from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points

@@ -11,7 +11,8 @@ from poses import json_of, lines_of, result, tilted_poses
 from refusals import assert_input_error
 
 from piccolo.errors import InputError
-from piccolo.export import Options, export
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
 from piccolo.geometry.rotations import heading_pitch_roll_deg
 from piccolo.result import Source

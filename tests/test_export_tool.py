@@ -15,7 +15,8 @@ from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
-from piccolo.export import FORMATS, select
+from piccolo.export.formats import FORMATS
+from piccolo.export.posed_images import select
 from piccolo.result import Source, read_results
 from research.datasets.generic import _table
 

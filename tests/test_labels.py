@@ -17,9 +17,9 @@ from test_cloud_morton import seeded_cloud, whole
 from test_cloud_pcd import content_of
 
 from piccolo.cli import localize, prepare_map
-from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.errors import InputError
 from piccolo.geometry.colors import NUM_COLORS, Labels, label_colors, palette
 from piccolo.panorama import read_panorama

@@ -7,8 +7,8 @@ import numpy as np
 import poses
 import pytest
 import rooms
+from scans import read_cloud
 
-from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.rotations import uniform_yaws

@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 import pytest
 from rooms import write_room
+from scans import read_cloud
 
-from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.localization.settings import CoarseToFineSettings

@@ -14,13 +14,14 @@ from las_files import OFFSETS, las_bytes
 from made_up import at
 from meshes import SQUARE, write_obj
 from refusals import assert_input_error
+from scans import read_cloud
 
 import piccolo
 from piccolo.cli import localize as command_line
-from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError

@@ -245,7 +245,7 @@ def test_a_pose_file_is_read_or_refused(tmp_path_factory, data):
 
 
 def test_a_camera_too_far_for_the_kernels_is_refused(points):
-    placed = LocalCloud(points, np.eye(3), np.array([5e5, 5e6, 0.0]), ())
+    placed = LocalCloud(np.eye(3), np.array([5e5, 5e6, 0.0]), points, ())
     for far in (1e9, 1e300, np.nan):
         with pytest.raises(InputError, match="wanted one within 1e"):
             placed.from_world(Pose(np.eye(3), np.array([0.0, far, 0.0])))

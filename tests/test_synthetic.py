@@ -11,8 +11,8 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from scans import read_cloud
 
-from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, angle_between, rotation_from_quaternion_wxyz, yaw_rotation
 from piccolo.geometry.rotations import OPTICAL_FROM_CAM

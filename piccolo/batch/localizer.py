@@ -193,7 +193,9 @@ class Localizer:
             return overlay, mask
         photo = photo.with_refined_camera(result.cameras)
         if self.makes_overlays:
-            overlay = overlay_png(scan.points, scan.read(photo), scan.from_world(pose), scan.workers)
+            overlay = overlay_png(
+                scan.prepared.points, scan.read(photo), scan.prepared.from_world(pose), scan.workers
+            )
         if self.makes_occlusion_masks:
             mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask

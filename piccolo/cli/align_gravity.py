@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from ..arrays import Array
-from ..cloud import CloudStream, open_cloud
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
+from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import write_transformed
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError

@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..export import FORMATS, Options, Selection, export, select
-from ..export.formats import offset_file
+from ..export.formats import FORMATS, export, offset_file
+from ..export.posed_images import Options, Selection, select
 from ..geometry.rotations import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of

@@ -185,7 +185,12 @@ class CloudStream:
         return voxels._replace(warnings=(*self._warnings(validators), *of_all))
 
     def read(self) -> Cloud:
-        """Return all points, in Morton order."""
+        """Return all points, in Morton order.
+
+        The middle of their bounding box, rounded to whole metres, becomes `origin_world` and is subtracted in
+        float64. This is done for every cloud, so that UTM coordinates and a room at the origin take the same
+        path.
+        """
         validators: list[PointValidator] = []
         chunks = list(self.chunks(validators))
         points_world = np.concatenate([points_world for points_world, _ in chunks])
@@ -269,16 +274,6 @@ def open_cloud(
         only_shape = replace(settings, channels=("shape",))
         sources = [open_source(path, only_shape) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
-
-
-def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
-    """Return the cloud in a file, checked, in metres, in Morton order.
-
-    The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
-    metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
-    coordinates and a room at the origin take the same path. Raises InputError like `open_cloud`.
-    """
-    return open_cloud([path], settings).read()
 
 
 def open_source(path: Path, settings: CloudSettings = IN_METRES) -> reader.PointSource:

@@ -263,7 +263,7 @@ def prepare(cloud: Cloud, settings: PaperSettings) -> PaperMap:
     """Prepare everything that does not depend on the panorama."""
     points = pack_points(cloud.points, cloud.colors).subsample(settings.max_points)
     positions = free_grid(points, settings.num_translations, settings.grid_margin)
-    return PaperMap(points, np.eye(3), cloud.origin_world, cloud.warnings, positions)
+    return PaperMap(np.eye(3), cloud.origin_world, points, cloud.warnings, positions)
 
 
 def search(

@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
-from ..cloud import CloudStream
 from ..cloud.octree import Octree, build_octree
+from ..cloud.stream import CloudStream
 from ..cloud.surfaces import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Bytes, Int8s, Int64s, Mask
-from ..cloud import CloudStream
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
-from ..cloud.soa import PackedPoints, pack_points
+from ..cloud.soa import MapFrame, PackedPoints, pack_points
+from ..cloud.stream import CloudStream
 from ..cloud.surfaces import paint_shape, surface_variance
 from ..confidence.localization import Localization
 from ..errors import InputError
@@ -33,12 +33,10 @@ MAX_SCANS = 1000  # of a map
 
 
 @dataclass(frozen=True)
-class ScanMap:
-    """A prepared cloud, in a frame of its own: x_map = R_map_from_world @ (x_world - origin_world), z up."""
+class ScanMap(MapFrame):
+    """A prepared cloud, in a frame of its own."""
 
     octree: Octree
-    R_map_from_world: Array  # (3, 3), identity where the cloud's z is up
-    origin_world: Array  # (3,) [m] middle of the leaves' box, in whole metres along the map's axes
     surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
     centers: Array  # (candidates, 3) [m]
     scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
@@ -101,17 +99,6 @@ class ScanMap:
     def features_now(self, workers: Workers) -> FeatureMap:
         """Return the local features, made now if they were deferred."""
         return self.late(workers) if self.late else self.local_features
-
-    def to_world(self, pose: Pose) -> Pose:
-        """Transform a pose of the map's frame to the world."""
-        R_map_from_world = self.R_map_from_world
-        center_world = R_map_from_world.T @ pose.center_world + self.origin_world
-        return Pose(pose.R_cam_from_world @ R_map_from_world, center_world)
-
-    def from_world(self, pose: Pose) -> Pose:
-        """Transform a pose of the world to the map's frame."""
-        center = self.R_map_from_world @ (pose.center_world - self.origin_world)
-        return Pose(pose.R_cam_from_world @ self.R_map_from_world.T, center)
 
 
 def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:

@@ -7,10 +7,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piccolo.arrays import Array
-from piccolo.cloud import open_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.soa import pack_points
+from piccolo.cloud.stream import open_cloud
 from piccolo.confidence.occlusion import VIEW_WIDTH, measure_agreement
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers

@@ -16,10 +16,9 @@ import numpy as np
 from piccolo.cli.checks import check_folder_name, check_least
 from piccolo.cli.command import HelpFormatter, add_run_options, command, option
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, workers_from
-from piccolo.cloud import open_source
 from piccolo.cloud.readers.reader import CHUNK
 from piccolo.cloud.settings import IN_COLORS
-from piccolo.cloud.stream import PointValidator
+from piccolo.cloud.stream import PointValidator, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.errors import InputError, unreadable
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically

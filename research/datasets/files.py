@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from piccolo.arrays import Array
-from piccolo.cloud import FORMATS
+from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import Pose, check_transform

@@ -115,7 +115,7 @@ def surface_png(
     surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
 ) -> bytes:
     """Draw the surface over the plan, with the known poses marked, and return the PNG."""
-    shift = cloud.R_local_from_world @ cloud.origin_world  # (3,) [m] to the plan, with the world's origin
+    shift = cloud.R_map_from_world @ cloud.origin_world  # (3,) [m] to the plan, with the world's origin
     x = grid.x + shift[0]
     y = grid.y + shift[1]
     aspect = (y[-1] - y[0] + 1.0) / (x[-1] - x[0] + 1.0)

@@ -24,8 +24,8 @@ from piccolo.cli.command import command, option
 from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
-from piccolo.cloud import read_cloud
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
+from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
@@ -51,7 +51,7 @@ def identity(scene: Scene, folder: Path) -> Scene:
 
 def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | None = None) -> Scene:
     """Return a number or a fraction of the points, drawn at random; InputError where there are fewer."""
-    cloud = read_cloud(scene.cloud, IN_COLORS)
+    cloud = open_cloud([scene.cloud], IN_COLORS).read()
     count = num_points or max(1, round(fraction * len(cloud.points)))
     if count > len(cloud.points):
         raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
@@ -62,7 +62,7 @@ def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | No
 
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """Return the cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
-    cloud = read_cloud(scene.cloud, IN_COLORS)
+    cloud = open_cloud([scene.cloud], IN_COLORS).read()
     T = np.eye(4)
     T[:3, :3] = rotation_from_quaternion_wxyz(_rng(scene).normal(size=4))
     points = transform_points(cloud.points.astype(np.float64) + cloud.origin_world, T)

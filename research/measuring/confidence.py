@@ -10,8 +10,7 @@ import numpy as np
 from piccolo import CoarseToFineSettings, Photo
 from piccolo.cli.command import option
 from piccolo.cli.terminal import print_note
-from piccolo.cloud import read_cloud
-from piccolo.cloud.stream import stream_of_arrays
+from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
@@ -100,7 +99,7 @@ def _make_trial(world: World, case: str, variant: str, workers: Workers, index: 
 
 def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points, list[Trial]]]:
     """Try every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
-    cloud = read_cloud(scene.cloud)
+    cloud = open_cloud([scene.cloud]).read()
     rng = np.random.default_rng([len(scene.queries), 52])
     own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
     upright = [trial for trial in own if trial.case == "clean"]
@@ -114,7 +113,7 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points
 
 def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator[tuple[Points, list[Trial]]]:
     """Cut `number` photos out of each panorama of every scene, and try them in one scene's cloud."""
-    cloud = read_cloud(scene.cloud)
+    cloud = open_cloud([scene.cloud]).read()
     rng = np.random.default_rng([len(scene.queries), 54])
     trials = []
     for one in (scene, *others):

@@ -14,8 +14,8 @@ import numpy as np
 
 import piccolo
 from piccolo.arrays import Array32, Bytes, Floats
-from piccolo.cloud import Cloud, read_cloud
 from piccolo.cloud.soa import pack_points
+from piccolo.cloud.stream import Cloud, open_cloud
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.rotations import Gravity
@@ -58,7 +58,7 @@ def clean_queries(scene: Scene, count: int) -> list[Query]:
 
 def scene_case(scene: Scene, num_points: int) -> Case:
     """Resample a scene to `num_points` points: leave some out, or repeat them with 5 mm noise."""
-    cloud = read_cloud(scene.cloud)
+    cloud = open_cloud([scene.cloud]).read()
     rng = np.random.default_rng(0)
     index = rng.permutation(len(cloud.points))[:num_points]
     if num_points > len(index):

@@ -14,8 +14,8 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from piccolo.batch.priors import read_priors
 from piccolo.camera.calibration import read_cameras, read_rig
-from piccolo.cloud import FORMATS
 from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
