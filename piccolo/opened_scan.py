@@ -225,7 +225,7 @@ class OpenedScan:
             raise InputError(f"`{given[0]}`: not an option of the preset paper")
 
     def make_gps_prior(self, photo: PhotoFacts, prior: Prior) -> GpsPrior | None:
-        """Return the photo's GPS position in the scan; None if it is unknown, outside of it, or not wanted."""
+        """Return the photo's GPS position in the scan; None if it is not known, or not wanted."""
         gps = photo.gps
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
         if gps is None or not crs or not prior.use_gps or prior.near is not None:
