@@ -27,13 +27,12 @@ if TYPE_CHECKING:
     from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
     from .opening import Cloud as Cloud, open_scan as open_scan
     from .paper.localize import PaperSettings as PaperSettings
-    from .photo import Photo as Photo
-    from .prior import GpsPrior as GpsPrior, Prior as Prior
+    from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
     from .report.build import ReportSettings as ReportSettings, write_report as write_report
     from .result import Result as Result, Source as Source
     from .scan import Scan as Scan
     from .scan_walk import Walk as Walk
-    from .walk.motion import Motion as Motion
+    from .walk.frames import Motion as Motion
     from .walk.path import Gap as Gap
     from .walk.results import Alone as Alone, WalkFrame as WalkFrame
 
@@ -44,13 +43,12 @@ NAMES = {  # by module
     ".localization.settings": ("CoarseToFineSettings",),
     ".opening": ("Cloud", "open_scan"),
     ".paper.localize": ("PaperSettings",),
-    ".photo": ("Photo",),
-    ".prior": ("GpsPrior", "Prior"),
+    ".photo": ("GpsPrior", "Photo", "Prior"),
     ".report.build": ("ReportSettings", "write_report"),
     ".result": ("Result", "Source"),
     ".scan": ("Scan",),
     ".scan_walk": ("Walk",),
-    ".walk.motion": ("Motion",),
+    ".walk.frames": ("Motion",),
     ".walk.path": ("Gap",),
     ".walk.results": ("Alone", "WalkFrame"),
 }

@@ -29,8 +29,7 @@ from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
-from .photo import Photo
-from .prior import GpsPrior, Prior
+from .photo import GpsPrior, Photo, Prior
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
 from .scan_map.scan_map import ScanMap, add_places, check_within
 

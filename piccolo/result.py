@@ -19,11 +19,10 @@ from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
 from .errors import UNPRINTABLE, InputError, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, check_pose
-from .geometry.rotations import heading_pitch_roll_deg
+from .geometry.pose import Pose, check_pose, heading_pitch_roll_deg
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .prior import GpsPrior
+from .photo import GpsPrior
 from .walk.results import WalkFrame
 
 FORMAT = "piccolo-pose/10"

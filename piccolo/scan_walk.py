@@ -21,8 +21,7 @@ from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
 from .result import Result, with_localization
 from .scan_map.scan_map import add_places, check_within
-from .walk.frames import Frame
-from .walk.motion import Motion, check_times
+from .walk.frames import Frame, Motion, check_times
 from .walk.path import believe
 from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
 from .walk.second_look import finish

@@ -19,7 +19,7 @@ from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.localization.verification import Verified
 from piccolo.panorama import GPano
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 
 
 def _localized(panorama, settings=rooms.KNOWN):

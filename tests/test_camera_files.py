@@ -10,8 +10,7 @@ from piccolo.camera.calibration import Mount, document_of, read_calibration, rea
 from piccolo.camera.model import MODELS, Camera
 from piccolo.camera.resampling import View, make_sphere, sphere_width
 from piccolo.errors import InputError
-from piccolo.geometry.pose import exp_so3, quaternion_wxyz
-from piccolo.geometry.rotations import OPTICAL_FROM_CAM
+from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3, quaternion_wxyz
 
 TURN = exp_so3(np.array([0.2, -0.4, 1.1]))
 BACK = ((-1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, 1.0))

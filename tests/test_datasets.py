@@ -14,8 +14,7 @@ from scipy.spatial.transform import Rotation
 from piccolo.cli import export_poses
 from research.datasets import checking, true_poses
 from research.datasets.convert_dataset import list_scenes
-from research.datasets.files import AXES, DIRECTIONS, pose_of_transform
-from research.datasets.model import ConvertOptions
+from research.datasets.model import AXES, DIRECTIONS, ConvertOptions, pose_of_transform
 from research.scene import read_scene
 
 ORIGIN = np.array([10.0, -4.0, 2.0])

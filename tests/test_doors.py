@@ -20,7 +20,7 @@ from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
-from piccolo.prior import GpsPrior
+from piccolo.photo import GpsPrior
 from piccolo.result import read_results
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 from piccolo.walk.path import Gap

@@ -45,7 +45,6 @@ LAYERS = [
     "files",
     "jobs",
     "optional",
-    "prior",
     "arguments",
     "errors",
     "arrays",

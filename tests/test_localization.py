@@ -11,11 +11,10 @@ from rooms import as_panorama, errors, query, room, scan_map
 
 from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.geometry.rotations import uniform_yaws
+from piccolo.geometry.pose import Pose, exp_so3, log_so3, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.localization.prior import allow_rotations, apply_prior
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.scan_map import prepare_map

@@ -10,8 +10,7 @@ import rooms
 from scans import read_cloud
 
 from piccolo.cloud.soa import pack_points
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.rotations import uniform_yaws
+from piccolo.geometry.pose import Pose, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels

@@ -11,8 +11,7 @@ from rooms import as_panorama, errors, query, room
 
 from piccolo.cloud.soa import pack_points
 from piccolo.confidence.localization import Evidence
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.rotations import uniform_rotations
+from piccolo.geometry.pose import Pose, uniform_rotations
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import (

@@ -20,8 +20,7 @@ from piccolo.batch.priors import read_priors
 from piccolo.cloud.settings import CloudSettings, from_wgs84
 from piccolo.cloud.stream import read_crs
 from piccolo.panorama.photo import GpsPosition, PhotoFacts, read_photo_facts
-from piccolo.photo import Photo
-from piccolo.prior import Prior
+from piccolo.photo import Photo, Prior
 
 
 @pytest.mark.parametrize(

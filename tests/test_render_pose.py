@@ -10,7 +10,7 @@ import pytest
 import rooms
 
 from piccolo.cli import prepare_map, render_pose
-from piccolo.geometry.rotations import heading_pitch_roll_deg
+from piccolo.geometry.pose import heading_pitch_roll_deg
 from research.datasets import true_poses
 from research.scene import read_scene
 

@@ -19,7 +19,7 @@ from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_addition import add_scan

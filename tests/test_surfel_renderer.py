@@ -12,8 +12,14 @@ from refusals import mutated, read_or_refused
 from piccolo.cli.render_pose import read_pose_matrix
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, angle_between, exp_so3, step
-from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
+from piccolo.geometry.pose import (
+    Pose,
+    R_cam_from_angles,
+    angle_between,
+    exp_so3,
+    heading_pitch_roll_deg,
+    step,
+)
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.views.pictures import encode_image, fill_holes

@@ -14,8 +14,13 @@ import rooms
 from scans import read_cloud
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, angle_between, rotation_from_quaternion_wxyz, yaw_rotation
-from piccolo.geometry.rotations import OPTICAL_FROM_CAM
+from piccolo.geometry.pose import (
+    OPTICAL_FROM_CAM,
+    Pose,
+    angle_between,
+    rotation_from_quaternion_wxyz,
+    yaw_rotation,
+)
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from research.scene import read_scene

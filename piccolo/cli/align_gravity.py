@@ -21,8 +21,7 @@ from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
-from .checks import check_outputs, check_suffix, checking_options
-from .command import command, option
+from .command import check_outputs, check_suffix, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
 from .terminal import print_error, print_report, print_warnings, progress_bar
 

@@ -27,7 +27,7 @@ from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .checks import UsageError
+from .command import UsageError
 from .options import PHOTOS_OF_A_JOB
 from .start import for_terminal
 from .terminal import EXIT_BAD_INPUT, print_error

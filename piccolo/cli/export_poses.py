@@ -8,11 +8,10 @@ from typing import Any
 from ..errors import InputError
 from ..export.formats import FORMATS, export, offset_file
 from ..export.posed_images import Options, Selection, select
-from ..geometry.rotations import CAMERA_AXES
+from ..geometry.pose import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
-from .checks import check_distinct, checking_options
-from .command import command, option
+from .command import check_distinct, checking_options, command, option
 from .terminal import print_note, print_report
 
 _FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())

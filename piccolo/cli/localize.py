@@ -36,8 +36,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..views.pictures import encode_image
 from . import execution, terminal, together
-from .checks import UsageError, check_distinct, check_suffix, checking_options
-from .command import command
+from .command import UsageError, check_distinct, check_suffix, checking_options, command
 from .execution import Executor, Interruption
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 

@@ -16,12 +16,10 @@ from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import Settings
 from ..panorama import check_labels
 from ..paper.localize import PaperSettings
-from ..photo import Photo, Projection
-from ..prior import Prior
+from ..photo import Photo, Prior, Projection
 from ..scan_map.open_map import CachePolicy
-from ..walk.motion import MAX_SPEED, MAX_STEP
-from .checks import check_least
-from .command import option
+from ..walk.frames import MAX_SPEED, MAX_STEP
+from .command import check_least, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
 EPILOG = """\

@@ -15,15 +15,13 @@ from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
-from ..geometry.pose import Pose, check_pose, check_transform
-from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
+from ..geometry.pose import CAMERA_AXES, Pose, R_cam_from_angles, check_pose, check_transform
 from ..jobs.threads import Workers
 from ..result import read_results
 from ..scan_map.open_map import open_points
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
-from .checks import check_distinct, check_suffix, checking_options
-from .command import command, option
+from .command import check_distinct, check_suffix, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
 from .terminal import print_report, print_warnings, workers_from
 

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from ..errors import printable
 from ..files.atomic import is_stdout
 from ..jobs.threads import Progress, Workers, num_cores
-from .checks import Outputs
+from .command import Outputs
 from .start import for_terminal
 
 EXIT_BAD_INPUT = 3

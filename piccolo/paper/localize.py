@@ -33,8 +33,7 @@ from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..errors import InputError
 from ..geometry.nearness import Nearness
-from ..geometry.pose import Pose
-from ..geometry.rotations import Gravity, uniform_rotations, uniform_yaws
+from ..geometry.pose import Gravity, Pose, uniform_rotations, uniform_yaws
 from ..geometry.sphere import pixel_rays, ray_jacobian, solid_angles
 from ..jobs.threads import Stopwatch, Workers
 from ..optimize.refine import DescentSettings, Equations, Loss, Refined, make_sampling_loss, refine

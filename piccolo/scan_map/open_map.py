@@ -16,7 +16,7 @@ from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, ow
 from ..geometry.pose import rotate_points
 from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap
-from ..prior import NOTHING_KNOWN, Prior
+from ..photo import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
 from .scan_addition import add_scan
 from .scan_map import ScanMap, add_features, name_scan, prepare_map

@@ -19,7 +19,7 @@ from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
-from ..prior import NOTHING_KNOWN, Prior
+from ..photo import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from ..views.view import ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers

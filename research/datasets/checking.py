@@ -18,7 +18,7 @@ from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
 
 from ..scene import Query, Scene
-from .files import AXES
+from .model import AXES
 
 MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom more than the right one
 AS_GIVEN = "as given"

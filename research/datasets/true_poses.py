@@ -7,8 +7,7 @@ import numpy as np
 
 from piccolo import InputError, Result
 from piccolo.batch.results_file import write_results
-from piccolo.cli.checks import check_outputs, check_suffix, checking_options
-from piccolo.cli.command import command, option
+from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import move

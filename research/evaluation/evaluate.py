@@ -14,15 +14,17 @@ import numpy as np
 
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, options
-from piccolo.cli.checks import (
+from piccolo.cli.command import (
+    Terminated,
     UsageError,
     check_distinct,
     check_least,
     check_outputs,
     check_suffix,
     checking_options,
+    command,
+    option,
 )
-from piccolo.cli.command import Terminated, command, option
 from piccolo.cli.execution import Interruption
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, print_report, progress_bar
 from piccolo.errors import InputError

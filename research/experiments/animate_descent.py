@@ -12,8 +12,7 @@ import PIL.Image
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
-from piccolo.cli.checks import check_outputs, check_suffix, checking_options
-from piccolo.cli.command import command, option
+from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
 from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import PackedPoints

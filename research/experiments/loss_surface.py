@@ -18,13 +18,12 @@ from scipy.ndimage import minimum_filter
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Array, Int64s, Mask
-from piccolo.cli.checks import check_outputs, check_suffix, checking_options
-from piccolo.cli.command import command, option
+from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
 from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
+from piccolo.geometry.pose import uniform_rotations, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.optional import new_figure

@@ -19,8 +19,14 @@ import numpy as np
 from piccolo import CoarseToFineSettings, InputError, PaperSettings, Photo
 from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
-from piccolo.cli.checks import check_distinct, check_folder_name, check_least, checking_options
-from piccolo.cli.command import command, option
+from piccolo.cli.command import (
+    check_distinct,
+    check_folder_name,
+    check_least,
+    checking_options,
+    command,
+    option,
+)
 from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error

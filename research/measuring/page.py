@@ -17,8 +17,7 @@ from scipy.stats import chi2
 import piccolo
 from piccolo import InputError, PaperSettings, Pose, Result
 from piccolo.arrays import Bytes
-from piccolo.cli.checks import check_least
-from piccolo.cli.command import option
+from piccolo.cli.command import check_least, option
 from piccolo.cli.terminal import print_note
 from piccolo.cloud.stream import open_cloud
 from piccolo.files.atomic import write_atomically

@@ -17,8 +17,7 @@ from piccolo.arrays import Array32, Bytes, Floats
 from piccolo.cloud.soa import pack_points
 from piccolo.cloud.stream import Cloud, open_cloud
 from piccolo.geometry.nearness import RIGHT
-from piccolo.geometry.pose import Pose, yaw_rotation
-from piccolo.geometry.rotations import Gravity
+from piccolo.geometry.pose import Gravity, Pose, yaw_rotation
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.optimize.sampling_loss import sampling_equations, sampling_loss
 from piccolo.panorama import read_panorama

@@ -10,8 +10,15 @@ import numpy as np
 
 from piccolo.camera import Calibration
 from piccolo.camera.calibration import read_cameras
-from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
-from piccolo.cli.command import command, option
+from piccolo.cli.command import (
+    UsageError,
+    check_folder_name,
+    check_least,
+    checking_options,
+    command,
+    option,
+    refuse_given,
+)
 from piccolo.cli.terminal import workers_from
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.export.formats import tum_lines, write_lines

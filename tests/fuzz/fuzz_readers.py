@@ -19,7 +19,7 @@ from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 from piccolo.result import Result
 from piccolo.scan_map.map_file import load_map
 from research.scene import read_scene
