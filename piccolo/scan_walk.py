@@ -1,7 +1,7 @@
 """A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +60,8 @@ class Walk:
     def settings_of(self, photo: Photo) -> dict[str, object]:
         """Return the settings of a frame as its result repeats them."""
         settings = settings_json(self.tracker.settings, self.scan.cloud_settings, photo)
-        return {**settings, "walk": self.tracker.motion.to_settings(), **self.more_settings}
+        motion = self.tracker.motion
+        return {**settings, "walk": {**asdict(motion), "max_speed": motion.speed}, **self.more_settings}
 
     def key_of(self, photo: Photo) -> dict[str, object]:
         """Return settings, scan and version, which must be the same where a walk goes on."""

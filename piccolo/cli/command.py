@@ -8,7 +8,7 @@ import stat
 import sys
 import threading
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
@@ -19,7 +19,7 @@ from ..files.atomic import check_output, is_stdout, is_stream
 from ..jobs.memory import check_address_space, is_shortage
 from ..panorama.cube import SUFFIXES
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started, for_terminal
-from .terminal import EXIT_BAD_INPUT, print_error, showing_log
+from .terminal import EXIT_BAD_INPUT, Outputs, print_error, showing_log
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
@@ -33,7 +33,6 @@ RETRY = 0.1  # [s] after which a signal is sent again
 SHORTAGE = "not enough memory ({}); lower --max-memory or --threads, or thin the scan"
 EXIT_CODES = "2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 terminated."
 Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
-Outputs = Mapping[str, Path | None]  # by option; None where it is not given
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):

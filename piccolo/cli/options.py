@@ -197,12 +197,6 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
     option(group, "--max-memory GB", text)
 
 
-def photo_from(arguments: argparse.Namespace) -> Photo:
-    """Return the options of all photos, with no picture."""
-    names = {f.name for f in fields(Photo)}
-    return Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
-
-
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     """Return the options of add_cloud_reading_options."""
     scale = METRES["m"] if arguments.units is None else arguments.units
@@ -225,7 +219,8 @@ def cache_from(arguments: argparse.Namespace) -> CachePolicy:
 def localizer_from(arguments: argparse.Namespace, paths: tuple[Path, ...] = ()) -> Localizer:
     """Return what localizes photos in the scan of some files as the options ask for."""
     cloud_settings = cloud_settings_from(arguments)
-    photo = photo_from(arguments)
+    names = {f.name for f in fields(Photo)}
+    photo = Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
     check_labels(photo, cloud_settings.labels)
     return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
 

@@ -7,6 +7,7 @@ import traceback
 from argparse import Namespace
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -14,10 +15,10 @@ from tqdm import tqdm
 from ..errors import printable
 from ..files.atomic import is_stdout
 from ..jobs.threads import Progress, Workers, num_cores
-from .command import Outputs
 from .start import for_terminal
 
 EXIT_BAD_INPUT = 3
+Outputs = Mapping[str, Path | None]  # by option; None where it is not given
 DELAY = 0.5  # seconds: what takes less needs no bar
 COUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left"
 UNCOUNTED = "{desc}: {n_fmt} in {elapsed}"

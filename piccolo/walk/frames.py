@@ -1,4 +1,4 @@
-"""The frames of a walk: the poses that each may have, and their odds.
+"""The frames of a walk: the poses that each may have, and their odds; and the motion of the camera.
 
 A key frame was compared with the whole scan: its states are all the places that look like its photo, each
 once, most of them as rough as the grid of candidates. The frames after it are tracked, and have one pose
@@ -7,7 +7,7 @@ each: wherever the key frame is, their motion from it is the same.
 
 import math
 from collections.abc import Sequence
-from dataclasses import KW_ONLY, asdict, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from itertools import pairwise
 from typing import Literal
 
@@ -154,10 +154,6 @@ class Motion:
     def reach(self, seconds: float) -> float:
         """Return how far [m] the camera may be from where it was so long ago, or later."""
         return self.speed * abs(seconds) + REACH_SLACK
-
-    def to_settings(self) -> dict[str, object]:
-        """Return the motion as results repeat it."""
-        return {**asdict(self), "max_speed": self.speed}
 
     @property
     def jump_log(self) -> float:

@@ -26,7 +26,6 @@ from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import uniform_rotations, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.optional import new_figure
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels
@@ -34,7 +33,7 @@ from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
 from piccolo.views.zbuffer import is_free_space, visible_points
 
-from ..evaluation.plots import figure_png
+from ..evaluation.plots import figure_png, new_figure
 from ..scene import read_scene
 
 POOL_PER_POINT = 8  # points of which visible ones are taken, for one that is used
