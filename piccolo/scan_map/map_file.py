@@ -1,7 +1,9 @@
 """A prepared map on disk: a NumPy archive, mapped into memory if no other process can truncate it meanwhile.
 
-A file of another format, or damaged in any byte (each member of an archive has a checksum), is refused;
-`map_validation.py` checks the contents of undamaged files. The identity of a checked file is remembered.
+A file of another format, or damaged in any byte (each member of an archive has a checksum), is refused. A map
+may come from anybody, and checksums are easily recomputed: every index that a kernel takes from it is
+checked, every number bounded, and the octree compared with the grid of its voxels. The identity of a checked
+file is remembered.
 FORMAT changes with the meaning of the arrays, so that a file outlives an update; the cache also knows the
 sources by which a map was made, and makes it again when they have changed.
 """
