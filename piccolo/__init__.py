@@ -18,52 +18,41 @@ from .errors import InputError as InputError
 
 if TYPE_CHECKING:
     from .confidence.covariance import PoseCovariance as PoseCovariance
-    from .confidence.localization import Alternative as Alternative
-    from .confidence.localization import Evidence as Evidence
-    from .confidence.localization import FocalLength as FocalLength
+    from .confidence.localization import (
+        Alternative as Alternative,
+        Evidence as Evidence,
+        FocalLength as FocalLength,
+    )
     from .geometry.pose import Pose as Pose
     from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
-    from .opening import Cloud as Cloud
-    from .opening import open_scan as open_scan
-    from .paper.settings import PaperSettings as PaperSettings
-    from .photo import Photo as Photo
-    from .prior import Prior as Prior
-    from .report.build import ReportSettings as ReportSettings
-    from .report.build import write_report as write_report
-    from .result import Result as Result
-    from .result import Source as Source
+    from .opening import Cloud as Cloud, open_scan as open_scan
+    from .paper.localize import PaperSettings as PaperSettings
+    from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
+    from .report.build import ReportSettings as ReportSettings, write_report as write_report
+    from .result import Result as Result, Source as Source
     from .scan import Scan as Scan
-    from .scan_map.gps import GpsPrior as GpsPrior
     from .scan_walk import Walk as Walk
-    from .walk.motion import Motion as Motion
+    from .walk.frames import Motion as Motion
     from .walk.path import Gap as Gap
-    from .walk.results import Alone as Alone
-    from .walk.results import WalkFrame as WalkFrame
+    from .walk.results import Alone as Alone, WalkFrame as WalkFrame
 
-MODULES = {
-    "Alone": ".walk.results",
-    "Alternative": ".confidence.localization",
-    "Cloud": ".opening",
-    "CoarseToFineSettings": ".localization.settings",
-    "Evidence": ".confidence.localization",
-    "FocalLength": ".confidence.localization",
-    "Gap": ".walk.path",
-    "GpsPrior": ".scan_map.gps",
-    "Motion": ".walk.motion",
-    "PaperSettings": ".paper.settings",
-    "Photo": ".photo",
-    "Pose": ".geometry.pose",
-    "PoseCovariance": ".confidence.covariance",
-    "Prior": ".prior",
-    "ReportSettings": ".report.build",
-    "Result": ".result",
-    "Scan": ".scan",
-    "Source": ".result",
-    "Walk": ".scan_walk",
-    "WalkFrame": ".walk.results",
-    "open_scan": ".opening",
-    "write_report": ".report.build",
+NAMES = {  # by module
+    ".confidence.covariance": ("PoseCovariance",),
+    ".confidence.localization": ("Alternative", "Evidence", "FocalLength"),
+    ".geometry.pose": ("Pose",),
+    ".localization.settings": ("CoarseToFineSettings",),
+    ".opening": ("Cloud", "open_scan"),
+    ".paper.localize": ("PaperSettings",),
+    ".photo": ("GpsPrior", "Photo", "Prior"),
+    ".report.build": ("ReportSettings", "write_report"),
+    ".result": ("Result", "Source"),
+    ".scan": ("Scan",),
+    ".scan_walk": ("Walk",),
+    ".walk.frames": ("Motion",),
+    ".walk.path": ("Gap",),
+    ".walk.results": ("Alone", "WalkFrame"),
 }
+MODULES = {name: module for module, names in NAMES.items() for name in names}
 __all__ = ["InputError", "__version__", *MODULES]  # noqa: PLE0604  names all
 
 

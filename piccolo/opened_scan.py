@@ -9,8 +9,7 @@ import numpy as np
 
 from .arrays import Bytes
 from .camera import Calibration
-from .cloud.settings import CloudSettings
-from .cloud.soa import PackedPoints
+from .cloud.settings import CloudSettings, from_wgs84
 from .confidence.confidence import LOCALIZED, NOT_LOCALIZED
 from .confidence.localization import FocalLength, Localization
 from .confidence.occlusion import occlusion_mask
@@ -29,15 +28,10 @@ from .localization.query import prepare_query
 from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
-from .paper.localize import PaperMap
-from .paper.localize import localize as localize_by_paper
-from .paper.settings import PaperSettings
-from .photo import Photo
-from .prior import Prior
+from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
+from .photo import GpsPrior, Photo, Prior
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
-from .scan_map.gps import GpsPrior, gps_prior
-from .scan_map.named_scans import add_places, check_within
-from .scan_map.scan_map import ScanMap
+from .scan_map.scan_map import ScanMap, add_places, check_within
 
 LABELS_WARNING = "`labels`: the confidence was fitted to colours; with labels it is a rough estimate"
 MEMORY_OF_PHOTO = 8e7  # [byte] that a photo keeps while others of its bundle are localized
@@ -57,23 +51,14 @@ class OpenedScan:
     seconds: dict[str, float]  # [s] spent on reading and preparing the scan, by stage
 
     @property
-    def points(self) -> PackedPoints:
-        """Coloured points, to draw the scan, in the frame of `from_world`."""
-        return self.prepared.points
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """Warnings about the scan, one line each."""
         return self.prepared.warnings
 
-    def from_world(self, pose: Pose) -> Pose:
-        """Transform a pose from the scan's own coordinates to the frame of `points`."""
-        return self.prepared.from_world(pose)
-
     def occlusion_mask(self, photo: Photo, pose: Pose) -> Bytes:
         """Return the pixels (H, W) of a photo that contradict the scan at a pose (`Scan.occlusion_mask`)."""
-        pose = self.from_world(check_pose(pose, "`pose`"))
-        return occlusion_mask(self.points, self.read(photo), pose)
+        pose = self.prepared.from_world(check_pose(pose, "`pose`"))
+        return occlusion_mask(self.prepared.points, self.read(photo), pose)
 
     def read(self, photo: Photo) -> Panorama:
         """Read a photo, of labels if the scan is one of labels."""
@@ -134,7 +119,7 @@ class OpenedScan:
         if has_guessed_focal(picture) or prepared.has_shape or facts.sha256 != first.source.pano_sha256:
             return first, ()
         known = [pose for pose in (first.best_pose, *(a.pose for a in first.alternatives)) if pose]
-        poses = [self.from_world(pose) for pose in known]
+        poses = [self.prepared.from_world(pose) for pose in known]
         with watch.stage("read"):
             pictures = list_pictures()
         found, names = localize_beside(prepared, picture, poses, pictures, settings, self.workers, watch)
@@ -239,11 +224,17 @@ class OpenedScan:
             raise InputError(f"`{given[0]}`: not an option of the preset paper")
 
     def make_gps_prior(self, photo: PhotoFacts, prior: Prior) -> GpsPrior | None:
-        """Return the photo's GPS position in the scan; None if it is unknown or not wanted."""
+        """Return the photo's GPS position in the scan; None if it is not known, or not wanted."""
+        gps = photo.gps
         crs = self.cloud_settings.crs or getattr(self.prepared, "crs", "")
-        if photo.gps is None or not crs or not prior.use_gps or prior.near is not None:
+        if gps is None or not crs or not prior.use_gps or prior.near is not None:
             return None
-        return gps_prior(photo.gps, crs, self.cloud_settings.scale)
+        place = from_wgs84(crs, gps.latitude_deg, gps.longitude_deg)
+        if place is None:
+            return None
+        scale = self.cloud_settings.scale
+        radius = 3.0 * max(gps.accuracy or 10.0, 5.0)  # [m] three sigmas; 10 m where the file does not say
+        return GpsPrior((place[0] * scale, place[1] * scale), radius)
 
 
 def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Photo) -> dict[str, object]:

@@ -11,22 +11,19 @@ from numpy.typing import NDArray
 
 from .arguments import check_fields, check_kind
 from .arrays import Floats
-from .cloud import open_cloud
 from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
-from .cloud.stream import ARRAYS, CloudStream, stream_of_arrays
+from .cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
 from .geometry.colors import Labels
 from .jobs.threads import ProgressCallback, Stopwatch, Workers, no_progress, num_cores, report_progress
 from .localization.settings import CoarseToFineSettings
 from .opened_scan import OpenedScan, Settings
-from .paper.localize import PaperMap
-from .paper.localize import prepare as prepare_by_paper
+from .paper.localize import PaperMap, prepare as prepare_by_paper
 from .photo import File
 from .scan import Scan
-from .scan_map.named_scans import check_within
 from .scan_map.open_map import CachePolicy, find_prepared_map, open_map
-from .scan_map.scan_map import ScanMap, prepare_map
+from .scan_map.scan_map import ScanMap, check_within, prepare_map
 
 Units = Literal["mm", "cm", "m", "ft", "us-ft"]
 DEFAULT = CoarseToFineSettings()

@@ -13,18 +13,16 @@ import numpy as np
 
 from . import __version__
 from .camera import Mount
-from .camera.calibration import document_of as camera_document
-from .camera.calibration import read_mounts
+from .camera.calibration import document_of as camera_document, read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
 from .confidence.localization import Alternative, Evidence, FocalLength, Localization
 from .errors import UNPRINTABLE, InputError, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
-from .geometry.pose import Pose, check_pose
-from .geometry.rotations import heading_pitch_roll_deg
+from .geometry.pose import Pose, check_pose, heading_pitch_roll_deg
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
-from .scan_map.gps import GpsPrior
+from .photo import GpsPrior
 from .walk.results import WalkFrame
 
 FORMAT = "piccolo-pose/10"

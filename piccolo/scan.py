@@ -11,17 +11,15 @@ from .arrays import Bytes, Floats
 from .cloud.soa import PackedPoints
 from .errors import InputError
 from .files.atomic import check_output
-from .geometry.pose import Pose, check_pose
-from .geometry.rotations import Gravity
+from .geometry.pose import Gravity, Pose, check_pose
 from .localization.bundle_adjustment import RelativeScale
 from .opened_scan import OpenedScan, Settings, make_failed_result
-from .photo import File, Photo, as_photo
-from .prior import Prior
+from .photo import File, Photo, Prior, as_photo
 from .result import Result
 from .scan_map.open_map import write_map
 from .scan_map.scan_map import ScanMap
 from .scan_walk import Walk
-from .walk.motion import Motion
+from .walk.frames import Motion
 
 Picture = File | Bytes | Photo  # a path or an array (H, W, 3) is a photo without options
 
@@ -55,7 +53,7 @@ class Scan:
     @property
     def points(self) -> PackedPoints:
         """Coloured points, to draw the scan: `x`, `y`, `z` (N,) [m] in the frame of `from_world`."""
-        return self._opened.points
+        return self._opened.prepared.points
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -64,7 +62,7 @@ class Scan:
 
     def from_world(self, pose: Pose) -> Pose:
         """Transform a pose from the scan's own coordinates to the frame of `points`."""
-        return self._opened.from_world(check_pose(pose, "`pose`"))
+        return self._opened.prepared.from_world(check_pose(pose, "`pose`"))
 
     def save(self, path: File) -> None:
         """Write the prepared map to the file `path`, which `open_scan` opens in place of the scan's files.

@@ -1,7 +1,7 @@
 """A walk through a scan, frame by frame, and its results, as `Scan.track` makes it."""
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +20,8 @@ from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
 from .result import Result, with_localization
-from .scan_map.named_scans import add_places, check_within
-from .walk.frames import Frame
-from .walk.motion import Motion, check_times
+from .scan_map.scan_map import add_places, check_within
+from .walk.frames import Frame, Motion, check_times
 from .walk.path import believe
 from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
 from .walk.second_look import finish
@@ -61,7 +60,8 @@ class Walk:
     def settings_of(self, photo: Photo) -> dict[str, object]:
         """Return the settings of a frame as its result repeats them."""
         settings = settings_json(self.tracker.settings, self.scan.cloud_settings, photo)
-        return {**settings, "walk": self.tracker.motion.to_settings(), **self.more_settings}
+        motion = self.tracker.motion
+        return {**settings, "walk": {**asdict(motion), "max_speed": motion.speed}, **self.more_settings}
 
     def key_of(self, photo: Photo) -> dict[str, object]:
         """Return settings, scan and version, which must be the same where a walk goes on."""

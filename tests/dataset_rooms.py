@@ -17,9 +17,9 @@ from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.scene import read_scene
 from piccolo.views.zbuffer import visible_points
 from research.datasets import convert_dataset
+from research.scene import read_scene
 from research.synthetic.raycast import cast_rays
 
 SEED = 5

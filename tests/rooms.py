@@ -11,9 +11,9 @@ import numpy as np
 
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
-from piccolo.cloud.stream import Cloud
-from piccolo.cloud.voxels import morton_order
-from piccolo.cloud.writers import vertex_rows, write_ply
+from piccolo.cloud.stream import Cloud, stream_of_arrays
+from piccolo.cloud.voxels import VoxelTable, morton_order
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
@@ -46,6 +46,27 @@ def room(seed, num_points=NUM_POINTS):
     return world, Cloud(points[order], colors[order], origin_world)
 
 
+def stream(cloud):
+    """A cloud as if it were read from a file."""
+    found = stream_of_arrays(cloud.points + cloud.origin_world, cloud.colors)
+    channel = "colors" if cloud.has_colors else "intensity"
+    return replace(found, sources=[source._replace(channel=channel) for source in found.sources])
+
+
+def voxels(points, colors=None):
+    """The voxels of points (N, 3) [m] with colours (N, 3), by default grey."""
+    table = VoxelTable("points")
+    grey = np.full(points.shape, 128, np.uint8)
+    table.add(points.astype(np.float32).astype(np.float64), grey if colors is None else colors)
+    return table.finish()
+
+
+def write_ply(path, rows):
+    """Write vertices to a file."""
+    with writing_ply(path) as writer:
+        writer.add(rows)
+
+
 def make_once(name, make):
     """A file or folder in the folder of all workers, made by the first that asks for it; returns its path."""
     path = SHARED[0] / name
@@ -58,7 +79,7 @@ def make_once(name, make):
 
 def make_map(seed, num_points=NUM_POINTS):
     """The map of a room, prepared anew."""
-    return replace(prepare_map(room(seed, num_points)[1], Workers(2)), scan_sha256=64 * "0")
+    return replace(prepare_map(stream(room(seed, num_points)[1]), Workers(2)), scan_sha256=64 * "0")
 
 
 def map_path(seed, num_points=NUM_POINTS):

@@ -6,6 +6,14 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from rooms import room
 
+from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.stream import open_cloud
+
+
+def read_cloud(path, settings=IN_METRES):
+    """The points of one file."""
+    return open_cloud([path], settings).read()
+
 
 @functools.lru_cache
 def scan():

@@ -13,12 +13,12 @@ from plyfile import PlyData, PlyElement
 from poses import tilted_poses
 from rooms import query as read_photo_facts
 from scans import bare_room, points_of, scan, write_scan
-from test_cloud_ptx import scan as ptx_lines
-from test_cloud_ptx import write as write_lines
+from test_cloud_ptx import scan as ptx_lines, write as write_lines
 
 from piccolo.cli import align_gravity
 from piccolo.geometry.pose import exp_so3, transform_points
-from piccolo.scene import Query, read_scene, write_queries
+from research.datasets import true_poses
+from research.scene import Query, read_scene, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 TURN = np.array([1.4, 0.6, -0.3])
@@ -248,9 +248,10 @@ def test_true_poses_go_along(run, tilted, tmp_path):
     queries = [Query(tmp_path / "raw" / f"{k}.jpg", "robot", pose) for k, pose in enumerate(poses)]
     write_queries(tmp_path / "raw", queries)
     out = tmp_path / "aligned.ply"
-    listed = ("--queries", tmp_path / "raw" / "queries.json")
-    code, report, _ = run("--cloud", tilted, *listed, "--out", out, FREE)
+    code, report, _ = run("--cloud", tilted, "--out", out, FREE)
     assert code == 0
+    files = ["--transform", tmp_path / "aligned.txt", "--out", tmp_path / "queries.json"]
+    assert true_poses.main([*map(str, ["--scenes", tmp_path / "raw", *files])]) == 0
     T = np.array(report["T_aligned_from_scan"])
     scene = read_scene(tmp_path)
     assert scene.cloud == out
@@ -266,7 +267,6 @@ def test_true_poses_go_along(run, tilted, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--queries q.json", "--queries needs --out"),
         ("--up y --assume-nothing", "--assume-nothing can't be combined with --up"),
         ("--up y --pano photo.jpg", "--pano can't be combined with --up"),
         ("--units -1", "--units"),
@@ -303,6 +303,4 @@ def test_a_cloud_on_stdout_and_nothing_beside_it(tilted, tmp_path, capfdbinary):
     capfdbinary.readouterr()
     assert align_gravity.main(["--cloud", str(tilted), "--up", "z", "--out", "-", "--quiet"]) == 0
     assert capfdbinary.readouterr() == (out.read_bytes(), b"")
-    assert align_gravity.main(["--cloud", str(tilted), "--out", "-", "--queries", "q.json"]) == 2
-    assert b"--queries: nothing can be written next to --out -" in capfdbinary.readouterr().err
     assert not Path("-.txt").exists()

@@ -12,13 +12,12 @@ import pytest
 from batches import run
 from refusals import assert_input_error
 
-from piccolo.cli.checks import UsageError, check_distinct, check_outputs, check_suffix
-from piccolo.cli.command import command
+from piccolo.cli.command import UsageError, check_distinct, check_outputs, check_suffix, command
 from piccolo.errors import InputError
 from piccolo.files import atomic
 from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.geometry.pose import Pose
-from piccolo.scene import Query, write_queries
+from research.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -8,18 +8,18 @@ import rooms
 from made_up import PARTIAL, QUERY, TILTED_PARTIAL, TILTED_WHOLE, WHOLE, at, compared, place, places
 
 from piccolo.confidence.confidence import LOCALIZED
-from piccolo.geometry.pose import exp_so3, is_correct
+from piccolo.geometry.nearness import RIGHT
+from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import attempts, beam, query
-from piccolo.localization import localize as method
+from piccolo.localization import attempts, beam, localize as method, query
 from piccolo.localization.photo import ACROSS
 from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
 from piccolo.localization.settings import METHOD, CoarseToFineSettings
 from piccolo.localization.verification import Verified
 from piccolo.panorama import GPano
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 
 
 def _localized(panorama, settings=rooms.KNOWN):
@@ -40,7 +40,7 @@ def test_a_clear_photo_needs_no_features_and_the_result_says_so(monkeypatch):
     monkeypatch.setattr(query, "match", lambda *_: pytest.fail("features of a clear photo"))
     found = _localized(rooms.as_panorama(taken.rgb))
     assert found.status == LOCALIZED
-    assert is_correct(found.pose, taken.pose)
+    assert RIGHT.holds(found.pose, taken.pose)
     assert (found.evidence.num_matches, found.evidence.alternative_matches) == (None, None)
     assert {a.num_matches for a in found.alternatives} <= {None}
     assert found.confidence + found.probability_none + sum(a.probability for a in found.alternatives) == (
@@ -144,7 +144,7 @@ def test_a_tilted_sphere_without_features_is_found_by_whole_views(monkeypatch, g
     monkeypatch.setattr(query, "match", lambda *_: NO_MATCHES)
     taken, settings = rooms.query(1, "tilt"), CoarseToFineSettings(gravity=gravity)
     found = _localized(rooms.as_panorama(taken.rgb), settings)
-    assert is_correct(found.pose, taken.pose)
+    assert RIGHT.holds(found.pose, taken.pose)
     how, asked, num_searched = made[-1]
     num_candidates = len(rooms.scan_map(1).sparse)
     assert (how, asked) == ("any", replace(settings, **changes))

@@ -18,7 +18,7 @@ from piccolo.batch.inputs import list_panoramas
 from piccolo.cli import localize, options
 from piccolo.errors import InputError
 from piccolo.result import read_results
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 
 @pytest.fixture

@@ -315,7 +315,7 @@ def test_what_is_looked_at(scene, monkeypatch):
     assert found.source == first.source
     assert look(replace(first, confidence=0.8), {"x": None})[1] == (), "it is no surer"
     del asked[1:]
-    assert asked == [[opened.from_world(first.best_pose).key]]
+    assert asked == [[opened.prepared.from_world(first.best_pose).key]]
     assert look(first, {}) == (first, ())
     assert len(asked) == 2
     assert look(other, {"x": None}) == (other, ())
@@ -336,7 +336,7 @@ def test_pictures_are_read_once_and_only_as_they_were(scene, tmp_path, monkeypat
     assert confidence == json.loads(text)["confidence"]
     in_world = describe_errors(gaussian, scan._opened.prepared.R_map_from_world.T).matrix
     np.testing.assert_allclose(in_world, json.loads(text)["covariance"], atol=1e-9)
-    assert located.pose.key == opened.from_world(Result.from_json(text).best_pose).key
+    assert located.pose.key == opened.prepared.from_world(Result.from_json(text).best_pose).key
     assert len(located.ranges) == len(located.keypoints.rays) > 50
     assert (located.ranges > 0.0).all()
     asked = []

@@ -19,7 +19,7 @@ from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_besi
 from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
 from piccolo.localization.selection import NOTHING
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 
 
 def test_a_photo_is_localized_beside_one_that_shows_the_same():

@@ -11,11 +11,12 @@ from rooms import scan as scan_of_room
 
 import piccolo
 from piccolo.cli.localize import main
-from piccolo.export import Options, export
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.photo import Photo
 from piccolo.result import read_results
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 COMMON_FROM_WORLD = Pose(exp_so3(np.array([0.3, -0.2, 2.0])), np.array([3.0, -1.0, 2.0]))
 NAMES = ("clean_2.jpg", "clean_0.jpg", "clean_1.jpg")  # in another order than in the files

@@ -15,8 +15,7 @@ from piccolo.camera import Camera, Mount
 from piccolo.camera.model import MODELS, camera_of_fov, pinhole
 from piccolo.camera.resampling import View, make_sphere, sphere_width
 from piccolo.errors import InputError
-from piccolo.geometry.pose import exp_so3
-from piccolo.geometry.rotations import OPTICAL_FROM_CAM
+from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama

@@ -16,9 +16,9 @@ from piccolo.cli import export_poses, localize, render_pose
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
-from piccolo.scene import read_scene
 from piccolo.views.pictures import cut, sphere_width_for
 from research.evaluation import evaluate
+from research.scene import read_scene
 from research.synthetic import make_room
 from research.synthetic.world import make_world, photograph, pose_of_query, render_picture
 

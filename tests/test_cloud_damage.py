@@ -9,12 +9,12 @@ import zlib
 import meshes as made
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from las_files import las_bytes, laz_bytes
 from meshes import CORNER_COLORS, SQUARE, Gltf, change, obj_text, textured_gltf, write_obj, write_ply
 from plyfile import PlyData
 from refusals import assert_input_error, assert_refused, mutated, read_or_refused
+from scans import read_cloud
 from test_cloud_las import RAW
 from test_cloud_morton import read
 from test_cloud_npz import PAIR, WHOLE
@@ -23,10 +23,10 @@ from test_cloud_ply import vertices
 from test_cloud_ptx import TWO_SCANS, pts
 from test_cloud_text import lines_of
 
-from piccolo.cloud import open_cloud, open_source, read_cloud
 from piccolo.cloud.readers import mesh_files
 from piccolo.cloud.readers.mesh import open_mesh
 from piccolo.cloud.readers.reader import RawCloud
+from piccolo.cloud.stream import open_cloud, open_source
 
 SMALL = RawCloud(RAW.points_world[:60], RAW.colors[:60])
 

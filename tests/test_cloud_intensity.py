@@ -4,15 +4,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from e57_files import ScanToWrite
-from e57_files import write as write_e57
+from e57_files import ScanToWrite, write as write_e57
 from las_files import OFFSETS, las_bytes, laz_bytes
 from refusals import assert_refused
 from scans import write_scalars
 from test_cloud_morton import seeded_cloud, whole
 from test_cloud_pcd import content_of
 
-from piccolo.cloud import open_cloud, open_source
 from piccolo.cloud.readers.e57 import open_e57
 from piccolo.cloud.readers.las import open_las
 from piccolo.cloud.readers.pcd import open_pcd
@@ -20,6 +18,7 @@ from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, make_source
 from piccolo.cloud.readers.text import open_ptx, open_text
 from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.geometry.pose import exp_so3
 
 POINTS = seeded_cloud(1, num_points=3000).points_world

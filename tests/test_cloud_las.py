@@ -8,10 +8,10 @@ from las_files import OFFSETS, SCALES, las_bytes, laz_bytes
 from refusals import assert_refused
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.cloud import open_source
 from piccolo.cloud.readers import las
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS
+from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(2, num_points=1200)

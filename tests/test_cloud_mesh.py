@@ -4,15 +4,15 @@ import pytest
 import trimesh
 from PIL import Image
 from refusals import assert_refused
+from scans import read_cloud
 from scipy.spatial.transform import Rotation
 from test_cloud_morton import whole
 
-from piccolo.cloud import open_cloud, read_cloud
-from piccolo.cloud.readers import mesh as mesh_module
-from piccolo.cloud.readers import mesh_files
+from piccolo.cloud.readers import mesh as mesh_module, mesh_files
 from piccolo.cloud.readers.mesh import compute_weights, linear_to_srgb, look_up, open_mesh, srgb_to_linear
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
+from piccolo.cloud.stream import open_cloud
 
 
 def test_an_obj_texture_stands_upright_in_any_encoding(tmp_path):

@@ -5,12 +5,12 @@ import zipfile
 import numpy as np
 import pytest
 from refusals import assert_refused
+from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.cloud import open_source, read_cloud
-from piccolo.cloud.readers import npz
-from piccolo.cloud.readers import reader as raw
+from piccolo.cloud.readers import npz, reader as raw
 from piccolo.cloud.settings import IN_COLORS
+from piccolo.cloud.stream import open_source
 from piccolo.scan_map.map_file import FORMAT, is_map_file, load_map
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -79,7 +79,7 @@ def test_an_archive_that_points_before_its_beginning_is_refused(tmp_path):
 def test_nan_points_need_no_color(tmp_path):
     whole = WHOLE.copy()
     whole[:3, [0, 4]] = np.nan
-    assert read_cloud(save(tmp_path / "a.npy", whole)).num_dropped == 3
+    assert "3 points with NaN" in read_cloud(save(tmp_path / "a.npy", whole)).warnings[0]
 
 
 @pytest.mark.parametrize(

@@ -5,20 +5,18 @@ import itertools
 import naive
 import numpy as np
 import pytest
+import rooms
 from scipy.spatial import cKDTree
 from test_cloud_morton import seeded_cloud
 from test_cloud_stream import LEVEL, TURN, stream
 
-from piccolo.cloud import Cloud, voxels
-from piccolo.cloud import octree as octree_module
-from piccolo.cloud import voxels as voxel_table
-from piccolo.cloud import voxels as voxels_module
+from piccolo.cloud import octree as octree_module, voxels as voxel_table
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.errors import InputError
 from piccolo.geometry.pose import rotate_points
 
-CORNER = -voxels.PHASE / voxels.QUANTA_PER_METRE
+CORNER = -voxel_table.PHASE / voxel_table.QUANTA_PER_METRE
 
 
 @pytest.mark.parametrize("turn", [LEVEL, TURN])
@@ -52,7 +50,7 @@ def test_a_floor_at_a_round_height_is_one_layer_at_every_level(z):
     flat = stream(raw).voxels(LEVEL)
     octree = build_octree(flat)
     for k, (begin, end) in enumerate(itertools.pairwise(octree.level_start)):
-        size = voxels.COARSEST * voxel_table.LEAF_SIZE / 2**k
+        size = voxel_table.COARSEST * voxel_table.LEAF_SIZE / 2**k
         columns = np.floor((octree.nodes[begin:end, :2] + flat.origin[:2] - CORNER) / size)
         assert len(np.unique(columns, axis=0)) == end - begin
 
@@ -77,7 +75,7 @@ def test_a_larger_index_names_the_same_rows_and_the_table_may_be_fed_with_nothin
 
 
 def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
-    monkeypatch.setattr(voxels, "MAX_COUNT", 3)
+    monkeypatch.setattr(voxel_table, "MAX_COUNT", 3)
     index, rows = np.zeros(8, np.int32), np.zeros((4, voxel_table.NUM_COLUMNS), np.int32)
     points, colors = np.full((5, 3), 0.01), np.full((5, 3), 200, np.uint8)
     add = getattr(
@@ -87,8 +85,8 @@ def test_a_full_voxel_takes_no_more_and_fits_its_sums(monkeypatch):
     assert done == (5, 1)
     row = rows[0]
     assert row[voxel_table.COUNT] == 3
-    assert row[voxel_table.POSITION] == 3 * ((128 + voxels.PHASE) % 256)
-    assert voxels.MAX_COUNT * max(255, voxels.QUANTUM_MASK) <= np.iinfo(np.int32).max
+    assert row[voxel_table.POSITION] == 3 * ((128 + voxel_table.PHASE) % 256)
+    assert voxel_table.MAX_COUNT * max(255, voxel_table.QUANTUM_MASK) <= np.iinfo(np.int32).max
 
 
 def test_turning_gives_each_point_the_same_bits_alone_as_among_others():
@@ -116,7 +114,7 @@ def test_points_too_far_away_are_left_out_and_two_scenes_are_no_map():
 
 
 def test_too_many_voxels_are_refused(monkeypatch):
-    monkeypatch.setattr(voxels, "MAX_VOXELS", 40_000)
+    monkeypatch.setattr(voxel_table, "MAX_VOXELS", 40_000)
     with pytest.raises(InputError, match=r"more than 40000 voxels of 0\.02 m are filled.*`units`"):
         stream(seeded_cloud(9, 50_000, size=(900.0, 900.0, 900.0))).voxels(LEVEL)
 
@@ -128,11 +126,11 @@ def _cloud(count=5000, seed=0):
 
 
 def _octree(points, colors):
-    return build_octree(Cloud(points, colors, np.zeros(3)).voxels(np.eye(3)))
+    return build_octree(rooms.voxels(points, colors))
 
 
 def test_leaves_are_the_voxels_and_parents_the_means_of_their_children():
-    voxels = Cloud(*_cloud(), np.zeros(3)).voxels(np.eye(3))
+    voxels = rooms.voxels(*_cloud())
     np.testing.assert_array_equal(build_octree(voxels).level(voxel_table.LEAF_SIZE), voxels.nodes)
     octree = _octree(*_cloud())
     for level in range(voxel_table.NUM_LEVELS - 1):
@@ -152,7 +150,7 @@ def test_leaves_are_the_voxels_and_parents_the_means_of_their_children():
 def test_voxels_and_their_means_are_the_same_in_parts(monkeypatch, num):
     points, colors = _cloud(3000)
     whole = _octree(points, colors)
-    for module in (octree_module, voxels_module):
+    for module in (octree_module, voxel_table):
         monkeypatch.setattr(module, "AT_ONCE", num)
     for values, others in zip(_octree(points, colors), whole, strict=True):
         np.testing.assert_array_equal(values, others)

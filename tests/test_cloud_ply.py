@@ -4,14 +4,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rooms
 from plyfile import PlyData, PlyElement
 from refusals import assert_input_error, assert_refused
+from scans import read_cloud
 from test_cloud_morton import seeded_cloud, whole
 
-from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
-from piccolo.cloud.writers import coordinate_type, vertex_rows, write_ply, writing_ply
+from piccolo.cloud.stream import open_cloud
+from piccolo.cloud.writers import coordinate_type, vertex_rows, writing_ply
 from piccolo.errors import InputError
 
 RAW = seeded_cloud(1, num_points=1200)
@@ -164,7 +166,7 @@ def _cloud(num_points, dtype):
 def test_a_cloud_comes_back(tmp_path, dtype):
     points, colors, labels = _cloud(1000, dtype)
     path = tmp_path / "a b.ply"
-    write_ply(path, vertex_rows(points, colors, label=labels.astype(np.int32)))
+    rooms.write_ply(path, vertex_rows(points, colors, label=labels.astype(np.int32)))
     vertex = PlyData.read(path)["vertex"]
     assert [p.name for p in vertex.properties] == ["x", "y", "z", "red", "green", "blue", "label"]
     for k, name in enumerate("xyz"):
@@ -179,7 +181,7 @@ def test_a_cloud_comes_back(tmp_path, dtype):
 def test_chunks_make_the_same_bytes_as_all_at_once(tmp_path):
     points, colors, _ = _cloud(1234, np.float32)
     rows = vertex_rows(points, colors)
-    write_ply(tmp_path / "once.ply", rows)
+    rooms.write_ply(tmp_path / "once.ply", rows)
     with writing_ply(tmp_path / "parts.ply") as writer:
         for begin in range(0, 1234, 100):
             writer.add(rows[begin : begin + 100])

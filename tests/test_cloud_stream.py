@@ -14,16 +14,15 @@ from refusals import assert_input_error
 from rooms import as_panorama, query, room
 from test_cloud_morton import seeded_cloud
 
-from piccolo.cloud import CloudStream, open_cloud
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
-from piccolo.cloud.stream import stream_of_arrays
+from piccolo.cloud.stream import CloudStream, open_cloud, stream_of_arrays
 from piccolo.cloud.voxels import Voxels
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.opening import open_files
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 from piccolo.scan_map.open_map import CachePolicy, content_key, open_map
 from piccolo.scan_map.scan_map import prepare_map
 
@@ -265,7 +264,7 @@ MEASURE = """
 import resource
 from pathlib import Path
 import numpy as np
-from piccolo.cloud import CloudStream
+from piccolo.cloud.stream import CloudStream
 from piccolo.cloud.readers.reader import CHUNK, PointSource, RawCloud
 
 def read_chunks():

@@ -28,8 +28,8 @@ def _dask(log, *words):
 
 
 @pytest.fixture(scope="module")
-def scheduler(tmp_path_factory):
-    """The file of a scheduler with two workers."""
+def machines(tmp_path_factory):
+    """The file of a scheduler, and the process that has begun two workers."""
     folder = tmp_path_factory.mktemp("elsewhere")
     file = folder / "scheduler.json"
     begun = [_dask(folder / "log" / "s", "scheduler", "--port", "0", "--scheduler-file", str(file))]
@@ -38,13 +38,18 @@ def scheduler(tmp_path_factory):
         time.sleep(0.05)
     words = "worker", "--scheduler-file", str(file), "--nworkers", "2", "--nthreads", "1"
     begun.append(_dask(folder / "log" / "w", *words, "--local-directory", str(folder)))
-    yield file
+    yield file, begun[1]
     for process in reversed(begun):
         process.terminate()
         process.wait()
 
 
-def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_path, monkeypatch):
+@pytest.fixture
+def scheduler(machines):
+    return machines[0]
+
+
+def test_a_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, machines, tmp_path, monkeypatch):
     """However fast it is, it can't come to its end: it waits for names on standard input."""
     monkeypatch.chdir(scene)
     names = ["missing.jpg", *PANOS]
@@ -52,11 +57,11 @@ def test_a_local_cluster_loses_a_worker_is_interrupted_and_goes_on(scene, tmp_pa
     words = ["--cloud", "cloud.ply", "--quiet", *PAPER]
     assert localize.main([*words, "--pano", *names, "--out", str(whole), "--jobs", "1"]) == 3
     words += ["--out", str(out)]
-    dask = ["--pano", "-", "--jobs", "2", "--dask", "local"]
+    dask = ["--pano", "-", "--dask", str(machines[0])]
     with start_localize([*words, *dask], stdin=subprocess.PIPE, start_new_session=True) as process:
         process.stdin.writelines(f"{name}\n" for name in names[:4])
         wait_for_lines(process, out, 2)
-        workers = workers_of(process)
+        workers = workers_of(machines[1])
         assert len(workers) == 2
         os.kill(workers[0], signal.SIGKILL)
         process.stdin.writelines(f"{name}\n" for name in names[4:8])
@@ -120,7 +125,7 @@ def test_a_cluster_that_is_none_is_told_in_one_line(scene, tmp_path, monkeypatch
         assert localize.main([*words, "--dask", "x", *more]) == 2
         assert message in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "distributed", None)
-    assert localize.main([*words, "--dask", "local"]) == 3
+    assert localize.main([*words, "--dask", "x"]) == 3
     err = capsys.readouterr().err
     assert "--dask: needs distributed" in err
     assert "pip install 'piccolo-localize[distributed]'" in err

@@ -9,14 +9,14 @@ import laspy
 import numpy as np
 import pytest
 import rooms
+from scans import read_cloud
 from scipy.spatial import cKDTree
 
-from piccolo.cli import color_scan as tool
-from piccolo.cli import localize as command_line
+from piccolo.cli import color_scan as tool, localize as command_line
 from piccolo.cli.together import steps_file
-from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree, recolor
-from piccolo.cloud.writers import vertex_rows, write_colored, write_ply, writing_e57
+from piccolo.cloud.stream import open_cloud
+from piccolo.cloud.writers import vertex_rows, write_colored, writing_e57
 from piccolo.coloring import alignment, color_scan
 from piccolo.coloring.alignment import Anchor, add_pairs, align, balance, look, weigh_points
 from piccolo.coloring.color_scan import (
@@ -43,7 +43,7 @@ WIDTH = 1024
 
 @functools.lru_cache
 def _octree():
-    return build_octree(rooms.room(SEED, NUM_POINTS)[1].voxels(np.eye(3)))
+    return build_octree(rooms.stream(rooms.room(SEED, NUM_POINTS)[1]).voxels(np.eye(3)))
 
 
 @functools.lru_cache
@@ -151,7 +151,7 @@ def test_photos_that_were_moved_are_aligned_and_paint_the_room():
 def _gray_map(cloud):
     """A map of a scan's shape alone."""
     gray = replace(cloud, colors=np.full_like(cloud.colors, 128), has_colors=False)
-    return prepare_map(gray, Workers(2), has_features=False)
+    return prepare_map(rooms.stream(gray), Workers(2), has_features=False)
 
 
 def _result(path, rgb, pose):
@@ -252,7 +252,7 @@ def test_colours_are_written_in_each_format(tmp_path, suffix):
     rng = np.random.default_rng(4)
     points = rng.uniform(0, 9, (3000, 3)) + np.array([500_000.0, 5_800_000.0, 100.0])
     source = tmp_path / "cloud.ply"
-    write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
+    rooms.write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
     wanted = rng.integers(0, 256, (3000, 3)).astype(np.uint8)
     out = tmp_path / f"a b{suffix}"
     box = np.stack([points.min(axis=0), points.max(axis=0)])
@@ -269,7 +269,7 @@ def test_a_file_that_is_not_finished_is_closed(tmp_path, monkeypatch, suffix):
     """The source fails between two chunks: nothing is left, and the library's writer has ended."""
     source = tmp_path / "cloud.ply"
     points = np.random.default_rng(4).uniform(0, 9, (3000, 3))
-    write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
+    rooms.write_ply(source, vertex_rows(points, np.full((3000, 3), 9, np.uint8)))
     closed, close = [], laspy.LasWriter.close
     monkeypatch.setattr(laspy.LasWriter, "close", lambda self: closed.append(close(self)))
 

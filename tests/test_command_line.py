@@ -16,8 +16,7 @@ from batches import ROOT
 from rooms import errors, query, room
 
 from piccolo.cli import localize, prepare_map, terminal
-from piccolo.cli.checks import UsageError, checking_options
-from piccolo.cli.command import command, new_parser, parse
+from piccolo.cli.command import UsageError, checking_options, command, new_parser, parse
 from piccolo.cli.options import add_arguments, cloud_settings_from
 from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import IN_METRES, WITHOUT_COLORS, CloudSettings

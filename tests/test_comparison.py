@@ -10,8 +10,7 @@ import rooms
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
-from piccolo.localization import comparison
-from piccolo.localization import judge as judging
+from piccolo.localization import comparison, judge as judging
 from piccolo.localization.judge import is_mirrored
 from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS

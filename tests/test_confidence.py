@@ -6,8 +6,7 @@ import rooms
 from made_up import at
 from rooms import as_panorama
 
-from piccolo.confidence import alternatives
-from piccolo.confidence import confidence as rule
+from piccolo.confidence import alternatives, confidence as rule
 from piccolo.confidence.confidence import Standing, classify, posterior
 from piccolo.confidence.covariance import PoseCovariance, least_constrained_direction
 from piccolo.confidence.occlusion import Agreement, measure_agreement
@@ -15,7 +14,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
 
 SURE = 0.002  # [m] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.geometry.rotations import uniform_rotations
+from piccolo.geometry.pose import uniform_rotations
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import correlation

@@ -6,18 +6,16 @@ from pathlib import Path
 import dataset_rooms as made
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, given, settings, strategies as st
 from poses import jpeg, tilted_poses
 from refusals import mutated, read_or_refused
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli import export_poses
-from piccolo.scene import read_scene
-from research.datasets import checking
+from research.datasets import checking, true_poses
 from research.datasets.convert_dataset import list_scenes
-from research.datasets.files import AXES, DIRECTIONS, pose_of_transform
-from research.datasets.model import ConvertOptions
+from research.datasets.model import AXES, DIRECTIONS, ConvertOptions, pose_of_transform
+from research.scene import read_scene
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 
@@ -206,8 +204,9 @@ def test_a_table_of_exported_poses_comes_back(folder, tmp_path, capsys):
     first = tmp_path / "first" / "my photos"
     (folder / "poses.csv").unlink()
     table = folder / "exported.csv"
-    words = ["--scenes", str(first), "--format", "csv", "--images", str(first), "--out", str(table)]
-    assert export_poses.main(words) == 0
+    assert true_poses.main(["--scenes", str(first), "--out", str(tmp_path / "true.jsonl")]) == 0
+    words = ["--results", tmp_path / "true.jsonl", "--format", "csv", "--images", first, "--out", table]
+    assert export_poses.main([*map(str, words)]) == 0
     capsys.readouterr()
     code, _, err = made.run(capsys, "generic", folder, tmp_path / "second", "--poses", table)
     assert (code, err) == (0, "")

@@ -10,7 +10,7 @@ import pytest
 from plyfile import PlyData, PlyElement
 
 from piccolo.cloud.writers import vertex_rows
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 # 360loc
 SEQUENCES = ("daytime_360_1", "nighttime_360_2")

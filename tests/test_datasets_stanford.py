@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from piccolo.scene import find_scenes
 from research.datasets import convert_dataset
+from research.scene import find_scenes
 
 LABELS = ["<UNK>_0_<UNK>_0_0", "chair_1_office_1_1", "wall_1_office_1_1", "clutter_7_office_1_1"]
 CHAIR, WALL, CLUTTER = 9, 3, 13

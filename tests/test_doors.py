@@ -8,8 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from refusals import assert_input_error
 from test_result import RESULT
 
@@ -21,8 +20,8 @@ from piccolo.geometry.pose import check_pose, exp_so3
 from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
+from piccolo.photo import GpsPrior
 from piccolo.result import read_results
-from piccolo.scan_map.gps import GpsPrior
 from piccolo.views.zbuffer import nearest_depth, render_view, visible_points
 from piccolo.walk.path import Gap
 from piccolo.walk.results import Alone, WalkFrame

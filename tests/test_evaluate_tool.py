@@ -16,9 +16,9 @@ from piccolo.batch.localizer import Localizer
 from piccolo.jobs import memory
 from piccolo.panorama import picture
 from piccolo.result import Source
-from piccolo.scene import Query, read_scene, write_queries
 from research.evaluation import evaluate
 from research.evaluation.query_result import read_run
+from research.scene import Query, read_scene, write_queries
 
 QUICK = ["--quiet", "--preset", "paper", "max_points=20000", "num_translations=12", "num_iterations=30"]
 

@@ -11,8 +11,8 @@ from poses import result
 from refusals import assert_input_error, assert_refused
 
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3, is_correct
-from piccolo.scene import Query, Scene
+from piccolo.geometry.nearness import RIGHT
+from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.walk.results import Alone, WalkFrame
 from research.evaluation import tables
 from research.evaluation.plots import errors_figure, figure_png, risk_figure
@@ -25,6 +25,7 @@ from research.evaluation.query_result import (
     read_run,
 )
 from research.evaluation.tables import alone_table, group_walks, walk_table
+from research.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))
 
@@ -67,8 +68,8 @@ def test_errors_of_a_query_and_the_thresholds_of_the_paper(tmp_path):
     assert row.is_correct()
     assert not row.is_correct(Thresholds(max_distance=0.04))
     assert not row.is_correct(Thresholds(max_angle=np.radians(2.0)))
-    poses = _pose(0.09, 4.9), _pose(0.11, 0.0), _pose(0.0, 5.1), None
-    assert [is_correct(pose, TRUE_POSE) for pose in poses] == [True, False, False, False]
+    poses = _pose(0.09, 4.9), _pose(0.11, 0.0), _pose(0.0, 5.1)
+    assert [RIGHT.holds(pose, TRUE_POSE) for pose in poses] == [True, False, False]
 
 
 @pytest.mark.parametrize("row", ROWS)

@@ -9,7 +9,8 @@ from refusals import assert_input_error
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.errors import InputError
-from piccolo.export import Options, export
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
 from piccolo.geometry.pose import exp_so3, log_so3
 
 POSES = tilted_poses(4)

@@ -6,15 +6,15 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from pictures import encoded, smooth_rgb, write
 from poses import jpeg, result, tilted_poses
 from refusals import assert_input_error, mutated, read_or_refused
 from test_export_tables import rotation
 
 from piccolo.errors import InputError
-from piccolo.export import Options, export
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
 from piccolo.panorama import panorama_size
 from piccolo.panorama.gpano import EMPTY_PACKET, SCAN, jpeg_segments, with_pose, without_pose
 

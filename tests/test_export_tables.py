@@ -11,9 +11,9 @@ from poses import json_of, lines_of, result, tilted_poses
 from refusals import assert_input_error
 
 from piccolo.errors import InputError
-from piccolo.export import Options, export
-from piccolo.geometry.pose import Pose, exp_so3, rotation_from_quaternion_wxyz
-from piccolo.geometry.rotations import heading_pitch_roll_deg
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
+from piccolo.geometry.pose import Pose, exp_so3, heading_pitch_roll_deg, rotation_from_quaternion_wxyz
 from piccolo.result import Source
 from piccolo.walk.path import Gap
 from piccolo.walk.results import WalkFrame

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from PIL import Image
 from poses import SIZE, jpeg, lines_of, result, tilted_poses, write_results
 from refusals import mutated, read_or_refused
 
 from piccolo.cli import export_poses
 from piccolo.errors import InputError
-from piccolo.export import FORMATS, select
+from piccolo.export.formats import FORMATS
+from piccolo.export.posed_images import select
 from piccolo.result import Source, read_results
 from research.datasets.generic import _table
 

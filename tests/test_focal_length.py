@@ -17,8 +17,7 @@ from piccolo.confidence.localization import Alternative, Evidence, FocalLength, 
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import focal_length as focal
-from piccolo.localization import localize as module
+from piccolo.localization import focal_length as focal, localize as module
 from piccolo.localization.comparison import score_pose
 from piccolo.localization.localize import select_likeliest
 from piccolo.localization.selection import Selection

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+import rooms
 from rooms import room
 from scans import bare_room
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.stream import Cloud
 from piccolo.geometry.pose import exp_so3, rotation_to_z, yaw_rotation
 from piccolo.gravity import alignment
 from piccolo.gravity.alignment import Planes
@@ -18,7 +18,7 @@ TURNS = [np.array(w) for w in ([0.3, -0.2, 0.9], [1.4, 0.6, -0.3], [2.9, -0.5, 0
 def up_of(points, w=(0.0, 0.0, 0.0)):
     """Up (3,) of points (N, 3) turned by a rotation vector, None if it is not known, and why."""
     points = (points @ exp_so3(np.asarray(w)).T).astype(np.float32)
-    octree = build_octree(Cloud(points, np.full(points.shape, 99, np.uint8), np.zeros(3)).voxels(np.eye(3)))
+    octree = build_octree(rooms.voxels(points))
     axis, sense, reason, _ = alignment.find_up(octree)
     assert np.linalg.norm(axis) == pytest.approx(1.0)
     assert "\n" not in reason

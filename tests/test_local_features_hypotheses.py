@@ -16,7 +16,7 @@ from piccolo.local_features.matching import Matches
 from piccolo.localization.attempts import match_poses
 from piccolo.localization.prior import contradictions
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 
 
 @functools.lru_cache

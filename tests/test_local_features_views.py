@@ -7,7 +7,6 @@ import pytest
 import rooms
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.stream import Cloud
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.geometry.sphere import compute_indices, make_grid, pixel_rays
 from piccolo.jobs.threads import Workers
@@ -152,7 +151,7 @@ def _octree(*shells):
     """An octree of points (N, 3) [m] of one grey each."""
     points = np.concatenate([points for points, _ in shells]).astype(np.float32)
     colors = np.concatenate([np.full((len(points), 3), gray, np.uint8) for points, gray in shells])
-    return build_octree(Cloud(points, colors, np.zeros(3)).voxels(np.eye(3)))
+    return build_octree(rooms.voxels(points, colors))
 
 
 def _sphere(radius, width=WIDTH):

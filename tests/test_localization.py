@@ -9,13 +9,12 @@ import rooms
 from golden_poses import check_golden_poses
 from rooms import as_panorama, errors, query, room, scan_map
 
-from piccolo.cloud.stream import Cloud
+from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.geometry.rotations import uniform_yaws
+from piccolo.geometry.pose import Pose, exp_so3, log_so3, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.localization.prior import allow_rotations, apply_prior
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.scan_map import prepare_map
@@ -71,7 +70,7 @@ def test_nothing_that_counts_or_no_place_for_a_camera_is_no_error():
     assert found.pose is None
     rng = np.random.default_rng(0)
     solid = rng.uniform(0.0, 1.0, (20_000, 3)).astype(np.float32)
-    cloud = Cloud(solid, rng.integers(0, 256, (20_000, 3), dtype=np.uint8), np.zeros(3))
+    cloud = stream_of_arrays(solid, rng.integers(0, 256, (20_000, 3), dtype=np.uint8))
     solid_map = prepare_map(cloud, Workers(1))
     found = rooms.locate(as_panorama(query(1).rgb), solid_map)
     assert found.status == "not_localized"
@@ -81,7 +80,7 @@ def test_poses_in_a_cloud_that_a_rotation_turns_upright_are_in_the_files_frame()
     cloud, taken = room(1)[1], query(1)
     turn = exp_so3(np.array([np.pi / 2, 0.0, 0.0])) @ exp_so3(np.array([0.3, 0.3, 0.0]))
     lying = Cloud((cloud.points @ turn.T).astype(np.float32), cloud.colors, cloud.origin_world)
-    lying_map = prepare_map(lying, Workers(2), turn.T)
+    lying_map = prepare_map(rooms.stream(lying), Workers(2), turn.T)
     assert lying_map.warnings == ()
     found = rooms.locate(as_panorama(taken.rgb), lying_map, rooms.KNOWN)
     center = turn @ (taken.pose.center_world - cloud.origin_world) + cloud.origin_world
@@ -139,7 +138,7 @@ def test_a_prior_that_allows_nothing_says_what_was_left_out():
 
 
 def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatch):
-    cloud, whole = room(1)[1], scan_map(1)
+    cloud, whole = rooms.stream(room(1)[1]), scan_map(1)
     center = whole.centers[0]
     is_near = np.linalg.norm(whole.centers - center, axis=1) <= 1.0
     num = len(find_supported_cells(top_surfaces(whole.octree)))
@@ -148,7 +147,7 @@ def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatc
         with pytest.raises(InputError, match=rf"more than {most} camera positions, .*`units`, .*`near`"):
             prepare_map(cloud, Workers(1))
     monkeypatch.setattr(camera_positions, "MAX_POSITIONS", num - 1)
-    prior = Prior(near=tuple(center + cloud.origin_world), radius=1.0)
+    prior = Prior(near=tuple(center + whole.origin_world), radius=1.0)
     said = []
     part = prepare_map(cloud, Workers(1, warn=said.append), prior=prior)
     assert part.is_partial

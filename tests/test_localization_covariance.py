@@ -9,8 +9,8 @@ import pytest
 import rooms
 from rooms import as_panorama, errors, query
 
-from piccolo.cloud import CloudStream
 from piccolo.cloud.readers.reader import PointSource, RawCloud
+from piccolo.cloud.stream import CloudStream
 from piccolo.confidence.covariance import describe_errors
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays

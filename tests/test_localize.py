@@ -23,7 +23,7 @@ from piccolo.camera.model import pinhole
 from piccolo.cli import execution, localize, prepare_map
 from piccolo.confidence.localization import FocalLength
 from piccolo.result import Result
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 PAPER = ["--preset", "paper", "num_translations=30", "num_iterations=60", "max_points=30000"]
 

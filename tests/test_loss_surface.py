@@ -7,18 +7,17 @@ import numpy as np
 import poses
 import pytest
 import rooms
+from scans import read_cloud
 
-from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.rotations import uniform_yaws
+from piccolo.geometry.pose import Pose, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
-from piccolo.scene import read_scene
 from piccolo.views.zbuffer import visible_points
 from research.experiments import loss_surface as tool
 from research.experiments.loss_surface import LossSurface, PoseGrid, loss_surface
+from research.scene import read_scene
 
 STEP = 0.3
 

@@ -18,8 +18,7 @@ from piccolo.files import array_archive
 from piccolo.files.array_archive import ALIGNMENT, ArrayArchive, read_header, write_archive
 from piccolo.geometry.pose import exp_so3
 from piccolo.scan_map import map_file, open_map
-from piccolo.scan_map.map_file import is_map_file, load_map, save_map
-from piccolo.scan_map.map_validation import first_misplaced
+from piccolo.scan_map.map_file import first_misplaced, is_map_file, load_map, save_map
 from piccolo.scan_map.open_map import content_key
 
 

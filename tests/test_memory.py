@@ -11,10 +11,9 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
 from refusals import assert_input_error
-from rooms import as_panorama, query, room, scan_map
+from rooms import as_panorama, query, room, scan_map, stream
 
-from piccolo.cloud import octree
-from piccolo.cloud import voxels as voxels_module
+from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.errors import InputError
 from piccolo.jobs import memory
@@ -153,7 +152,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     for text, ask in (
         ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),
         ("a.ply: a table of more than 32768 voxels", lambda: table.add(spread, colors)),
-        ("voxels of 2 cm needs", lambda: prepare_map(room(1)[1], workers)),
+        ("voxels of 2 cm needs", lambda: prepare_map(stream(room(1)[1]), workers)),
         ("prepared views", lambda: render_wide(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("rotations needs .*num_yaws", lambda: search_poses(asked, "known")),

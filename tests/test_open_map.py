@@ -19,8 +19,7 @@ from piccolo.cloud.settings import IN_METRES
 from piccolo.files import cache
 from piccolo.jobs.threads import Once, Stopwatch, Workers
 from piccolo.opening import Cloud, open_scan
-from piccolo.scan_map import map_file, open_map
-from piccolo.scan_map import scan_map as making
+from piccolo.scan_map import map_file, open_map, scan_map as making
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.open_map import CachePolicy
 

@@ -5,8 +5,7 @@ import poselib
 import pytest
 import rooms
 
-from piccolo.geometry.pose import Pose, exp_so3, pose_errors, step
-from piccolo.geometry.rotations import random_rotation
+from piccolo.geometry.pose import Pose, exp_so3, pose_errors, rotation_from_quaternion_wxyz, step
 from piccolo.local_features.hypotheses import angular_equations, descend_matches
 from piccolo.local_features.p3p import p3p
 from piccolo.optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX, NUM_SUMS
@@ -30,7 +29,7 @@ def _three(bearings, points):
 def _case(rng):
     """Points (3, 3) all around a camera, its rotation and center."""
     center = RESTS + rng.normal(size=3) * 3.0
-    return RESTS + rng.normal(size=(3, 3)) * 4.0, random_rotation(rng), center
+    return RESTS + rng.normal(size=(3, 3)) * 4.0, rotation_from_quaternion_wxyz(rng.normal(size=4)), center
 
 
 def _off(found, R, center):
@@ -60,7 +59,7 @@ def test_truth_is_found_and_every_pose_sees_the_points():
 def test_poses_are_those_of_poselib_where_all_points_are_in_front():
     rng, num_compared = np.random.default_rng(2), 0
     for _ in range(500):
-        R, center = random_rotation(rng), RESTS + rng.normal(size=3)
+        R, center = rotation_from_quaternion_wxyz(rng.normal(size=4)), RESTS + rng.normal(size=3)
         points = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 4.0], size=(3, 3)) @ R + center
         bearings = _rays(points, R, center)
         _, ours = _three(bearings, points)
@@ -144,7 +143,7 @@ def _sums(problem, pose):
 def test_sums_are_those_of_numerical_rows_at_tilted_poses():
     rng, h = np.random.default_rng(0), 1e-5
     for _ in range(5):
-        pose = Pose(random_rotation(rng), rng.normal(size=3))
+        pose = Pose(rotation_from_quaternion_wxyz(rng.normal(size=4)), rng.normal(size=3))
         bearings, points = _matches(rng, pose, 40, noise=0.2)
         scale = 0.3
         sums = _sums((bearings, points, scale), pose)
@@ -181,7 +180,7 @@ def _away(rng, pose):
 def test_pose_is_found_from_afar():
     rng = np.random.default_rng(1)
     for _ in range(100):
-        pose = Pose(random_rotation(rng), rng.normal(size=3) * 5.0)
+        pose = Pose(rotation_from_quaternion_wxyz(rng.normal(size=4)), rng.normal(size=3) * 5.0)
         found, loss = _refined(_matches(rng, pose, 30), _away(rng, pose), 0.3)
         rooms.assert_near(found, pose, 1e-5, 5e-4)
         assert loss < 1e-9

@@ -5,8 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from pictures import PNG_HEADER_SIZE, TURNS, animation, encoded, png_chunk, smooth_rgb, with_metadata, write
 from refusals import assert_refused, mutated, read_or_refused
 

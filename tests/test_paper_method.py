@@ -11,13 +11,13 @@ from rooms import as_panorama, errors, query, room
 
 from piccolo.cloud.soa import pack_points
 from piccolo.confidence.localization import Evidence
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.rotations import uniform_rotations
+from piccolo.geometry.pose import Pose, uniform_rotations
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import (
     MIN_CLEARANCE,
     PROBE_WIDTH,
+    PaperSettings,
     color_histogram,
     free_grid,
     histogram_similarity,
@@ -25,7 +25,6 @@ from piccolo.paper.localize import (
     paper_confidence,
     prepare,
 )
-from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import is_free_space
 
 QUICK = dataclasses.replace(PaperSettings(), num_translations=30, max_points=30_000, num_iterations=60)

@@ -17,6 +17,7 @@ from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
 from piccolo.paper.localize import (
+    PaperSettings,
     localize,
     make_loss,
     photometric_equations,
@@ -25,7 +26,6 @@ from piccolo.paper.localize import (
     prepare,
     view_gradient,
 )
-from piccolo.paper.settings import PaperSettings
 from piccolo.views.zbuffer import View, render_view
 
 HALF_SIZE = np.array([2.5, 2.0, 1.3])

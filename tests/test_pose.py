@@ -4,13 +4,13 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from poses import tilted_poses
 from refusals import assert_input_error
 
 from piccolo.geometry import pose as poses
-from piccolo.geometry.nearness import Nearness
+from piccolo.geometry.nearness import Nearness, non_maximum_suppression
+from piccolo.geometry.pose import uniform_yaws
 from piccolo.geometry.pose_gaussian import (
     LIKELY,
     PoseGaussian,
@@ -21,8 +21,6 @@ from piccolo.geometry.pose_gaussian import (
     probability_within,
     subtract,
 )
-from piccolo.geometry.rotations import uniform_yaws
-from piccolo.geometry.suppression import non_maximum_suppression
 
 VECTORS = [np.zeros(3), np.array([1e-9, 0, 0]), np.array([0.3, -0.2, 0.9]), np.array([0.0, 3.14159, 0.0])]
 

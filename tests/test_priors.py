@@ -3,6 +3,7 @@
 import hashlib
 import os
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,12 +17,10 @@ from test_cloud_las import RAW
 
 import piccolo
 from piccolo.batch.priors import read_priors
-from piccolo.cloud.settings import from_wgs84
+from piccolo.cloud.settings import CloudSettings, from_wgs84
 from piccolo.cloud.stream import read_crs
-from piccolo.panorama.photo import GpsPosition, read_photo_facts
-from piccolo.photo import Photo
-from piccolo.prior import Prior
-from piccolo.scan_map.gps import gps_prior
+from piccolo.panorama.photo import GpsPosition, PhotoFacts, read_photo_facts
+from piccolo.photo import Photo, Prior
 
 
 @pytest.mark.parametrize(
@@ -147,10 +146,14 @@ def test_las_names_its_system(tmp_path):
 def test_a_position_becomes_a_prior_of_any_height():
     x, y = 512_345.0, 5_403_210.0
     longitude, latitude = Transformer.from_crs(UTM, "EPSG:4326", always_xy=True).transform(x, y)
-    prior = gps_prior(GpsPosition(latitude, longitude, 4.0), UTM, 1.0)
+    opened = replace(rooms.scan(1)._opened, cloud_settings=CloudSettings(crs=UTM))
+    prior = opened.make_gps_prior(
+        PhotoFacts("", (1, 1), None, GpsPosition(latitude, longitude, 4.0)), Prior()
+    )
     assert prior.center_world == pytest.approx((x, y), abs=1e-3)
     assert (prior.radius, prior.is_used) == (15.0, True)
-    assert gps_prior(GpsPosition(latitude, longitude, None), UTM, 1.0).radius == 30.0
+    rough = PhotoFacts("", (1, 1), None, GpsPosition(latitude, longitude, None))
+    assert opened.make_gps_prior(rough, Prior()).radius == 30.0
     near = prior.apply_to(Prior(height=(1.0, 2.0)))
     assert near.near == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)

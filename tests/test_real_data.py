@@ -7,7 +7,7 @@ import pytest
 
 import piccolo
 from piccolo.geometry.pose import pose_errors
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 CORRIDOR = read_scene(Path(__file__).parent / "data" / "corridor")
 

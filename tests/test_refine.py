@@ -1,17 +1,20 @@
 """Descents on a loss, with their history and the animations of them."""
 
 import dataclasses
+import json
 
+import av
 import cv2
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.geometry.pose import Pose, pose_errors, step, yaw_rotation
-from piccolo.optimize.descent_animation import encode_gif, perturb_pose, refine_with_history
 from piccolo.optimize.refine import Adam, DescentSettings, descend_lbfgs, make_sampling_loss, refine
 from piccolo.panorama.texels import pack_texels
-from piccolo.paper.settings import PaperSettings
+from piccolo.paper.localize import PaperSettings
+from research.experiments import animate_descent
+from research.experiments.animate_descent import encode_gif, perturb_pose, refine_with_history
 
 PERTURBATION = np.array([0.05, -0.04, 0.12, 0.15, -0.12, 0.08])  # rad, m
 
@@ -97,3 +100,22 @@ def test_a_gif_reads_back(tmp_path):
     assert len(read) >= len(frames)
     assert abs(read[0][13, 15, ::-1].astype(int) - frames[0][13, 15]).max() < 12
     assert abs(read[-1][13, 15, ::-1].astype(int) - frames[-1][13, 15]).max() < 12
+
+
+def test_a_descent_is_shown_with_where_it_ended(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(animate_descent, "MAX_FRAMES", 5)
+    monkeypatch.setattr(animate_descent, "DESCENT", DescentSettings(solver="gauss-newton"))
+    words = "--seed 7 --size 4 3 2.5 --points 30000 --panoramas 1 --width 256 --variants clean"
+    room = rooms.write_room(tmp_path, words)
+    pano = ["--cloud", room / "cloud.ply", "--pano", room / "images" / "clean_0.jpg", "--quiet"]
+    video = [*pano, "--out", tmp_path / "a.mp4"]
+    assert animate_descent.main(list(map(str, video))) == 2
+    assert "--result, --truth: found none of them" in capsys.readouterr().err
+    assert animate_descent.main(list(map(str, [*video, "--truth", room / "queries.json"]))) == 0
+    line = json.loads(capsys.readouterr().out)
+    assert line["start_distance"] == pytest.approx(0.3)
+    assert line["end_distance"] < 0.02
+    assert line["frames"] == 5 + animate_descent.NUM_LAST
+    with av.open(tmp_path / "a.mp4") as shown:
+        frames = [frame.to_ndarray(format="rgb24") for frame in shown.decode(video=0)]
+    assert (len(frames), frames[0].shape[1]) == (line["frames"], animate_descent.FRAME_WIDTH)

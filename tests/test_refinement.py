@@ -15,8 +15,7 @@ from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
-from piccolo.localization import beam, ladder
-from piccolo.localization import query as query_module
+from piccolo.localization import beam, ladder, query as query_module
 from piccolo.localization.beam import Ends, best_and_alternatives, narrow
 from piccolo.localization.comparison import CONTRADICTS, Comparison
 from piccolo.localization.ladder import AROUND_MIDDLE, FINE, SECOND, Limits

@@ -11,7 +11,8 @@ from refusals import assert_refused
 from piccolo.batch.inputs import times_of
 from piccolo.batch.relative_poses import read_odometry, read_relative_poses
 from piccolo.errors import InputError
-from piccolo.export import Options, export
+from piccolo.export.formats import export
+from piccolo.export.posed_images import Options
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
 PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]

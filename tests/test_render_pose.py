@@ -3,7 +3,6 @@
 import json
 from pathlib import Path
 
-import av
 import cv2
 import numpy as np
 import poses
@@ -11,10 +10,9 @@ import pytest
 import rooms
 
 from piccolo.cli import prepare_map, render_pose
-from piccolo.geometry.rotations import heading_pitch_roll_deg
-from piccolo.optimize import descent_animation as animation
-from piccolo.optimize.refine import DescentSettings
-from piccolo.scene import read_scene
+from piccolo.geometry.pose import heading_pitch_roll_deg
+from research.datasets import true_poses
+from research.scene import read_scene
 
 
 @pytest.fixture(scope="module")
@@ -51,11 +49,12 @@ def test_all_results_become_a_folder_of_pictures(run, scene, tmp_path):
 
 def test_the_same_pose_from_each_source_gives_the_same_picture(run, scene, tmp_path):
     pose = read_scene(scene).by_name["tilt_0.jpg"].pose
+    assert true_poses.main(["--scenes", str(scene), "--out", str(tmp_path / "true.jsonl")]) == 0
     np.savetxt(tmp_path / "T.txt", pose.T_world_from_cam, fmt="%.17g")
     heading, pitch, roll = heading_pitch_roll_deg(pose)
     sources = {
         "result": ["--result", scene / "poses.jsonl", "--pano", "tilt_0.jpg"],
-        "queries": ["--queries", scene / "queries.json", "--pano", "images/tilt_0.jpg"],
+        "truth": ["--result", tmp_path / "true.jsonl", "--pano", "images/tilt_0.jpg"],
         "pose": ["--pose", tmp_path / "T.txt"],
         "at": ["--at", *pose.center_world, "--heading", heading, "--pitch", pitch, "--roll", roll],
     }
@@ -81,38 +80,22 @@ def test_depth_in_millimetres_and_a_prepared_map_in_place_of_the_cloud(run, scen
     assert read.tolist() == [[1234, 0], [65535, 65535]]
     arguments = ["--cloud", str(scene / "cloud.ply"), "--out", str(scene / "cloud.map"), "--quiet"]
     assert prepare_map.main(arguments) == 0
-    pano = ["--queries", scene / "queries.json", "--pano", "tilt_0.jpg", "--width", 128]
+    pano = ["--result", scene / "poses.jsonl", "--pano", "tilt_0.jpg", "--width", 128]
     for cloud in ("cloud.ply", "cloud.map"):
         assert run(*pano, "--out", tmp_path / f"{cloud}.png", cloud=cloud)[0] == 0
     both = [cv2.imread(str(tmp_path / f"cloud.{kind}.png")).ravel() for kind in ("ply", "map")]
     assert np.corrcoef(*both)[0, 1] > 0.98
 
 
-def test_a_descent_is_shown_with_where_it_ended(run, scene, tmp_path, monkeypatch):
-    monkeypatch.setattr(animation, "MAX_FRAMES", 5)
-    monkeypatch.setattr(render_pose, "DESCENT", DescentSettings(solver="gauss-newton"))
-    pano = ["--queries", scene / "queries.json", "--pano", "clean_0.jpg"]
-    code, (line,), err = run(*pano, "--animate", tmp_path / "a.mp4")
-    assert (code, err) == (0, "")
-    assert line["start_distance"] == pytest.approx(0.3)
-    assert line["end_distance"] < 0.02
-    assert line["frames"] == 5 + animation.NUM_LAST
-    with av.open(tmp_path / "a.mp4") as video:
-        shown = [frame.to_ndarray(format="rgb24") for frame in video.decode(video=0)]
-    assert (len(shown), shown[0].shape[1]) == (line["frames"], animation.FRAME_WIDTH)
-
-
 def test_refusals_leave_nothing(run, scene, tmp_path):
     (tmp_path / "T.txt").write_text("1 2 3\n")
     result, out, at = ["--result", scene / "poses.jsonl"], ["--out", tmp_path / "a.png"], ["--at", 0, 0, 1]
     for code, arguments, message in (
-        (2, at, "give --out, --animate or both"),
         (2, [*at, *out, "--width", 101], "--width 101: wanted an even number"),
         (2, [*at, "--out", "a.bmp"], "--out a.bmp: wanted a name that ends with .png, .jpg"),
         (2, [*at, *out, "--depth", "a.exr"], "--depth a.exr: wanted"),
         (2, [*at, "--out", "a", "--depth", "a.png"], "only with a single picture"),
         (2, [*at, *out, "--heading", "nan"], "must be finite"),
-        (2, [*at, "--animate", "a.gif"], "--animate: only with --result or --queries"),
         (2, ["--pose", "T.txt", *out, "--heading", 3], "only with --at"),
         (2, [*at, *out, "--units", 0], "--units: found 0"),
         (3, [*result, *out], "2 poses; choose one"),
@@ -142,7 +125,7 @@ def test_pictures_on_stdout_are_those_of_files(scene, tmp_path, capfdbinary):
     assert render_pose.main([*arguments, str(tmp_path / "b.png"), "--depth", "-", "--quiet"]) == 0
     assert capfdbinary.readouterr() == (before, b"")
     assert render_pose.main([*arguments, "-", "--depth", "/dev/stdout", "--quiet"]) == 2
-    pano = ["--cloud", str(scene / "cloud.ply"), "--queries", str(scene / "queries.json")]
+    pano = ["--cloud", str(scene / "cloud.ply"), "--result", str(scene / "poses.jsonl")]
     pano += ["--pano", "clean_0.jpg", "--out", str(scene / "images" / "clean_0.jpg")]
     assert render_pose.main(pano) == 2
     assert b"found an input as the output" in capfdbinary.readouterr().err

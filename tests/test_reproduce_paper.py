@@ -8,16 +8,15 @@ import cv2
 import numpy as np
 import pytest
 from rooms import write_room
+from scans import read_cloud
 
-from piccolo.cloud import read_cloud
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import read_panorama
 from piccolo.panorama.texels import pack_texels
-from piccolo.paper.settings import PaperSettings
-from piccolo.scene import Query, read_scene, write_queries
+from piccolo.paper.localize import PaperSettings
 from piccolo.views.zbuffer import visible_points
 from research.evaluation.query_result import read_run
 from research.experiments import reproduce_paper
@@ -29,6 +28,7 @@ from research.experiments.reproduce_paper import (
     thin,
     with_random_rotation,
 )
+from research.scene import Query, read_scene, write_queries
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
 QUICK = PaperSettings(num_translations=8, num_iterations=20)

@@ -118,16 +118,6 @@ def test_normal_matrix_equals_jacobians_stacked():
     np.testing.assert_allclose(matrix, expected, rtol=2e-3, atol=2e-3 * np.abs(expected).max())
 
 
-def test_same_bits_for_any_number_of_threads():
-    points, colors = _points("anywhere", 5 * BLOCK + 3)
-    packed, texels, pose = pack_points(points, colors), pack_texels(_smooth_image()), POSES["tilted"]
-    assert len({sampling_loss(packed, texels, pose, n) for n in (1, 2, 3, 7)}) == 1
-    one, two = (sampling_equations(packed, texels, pose, n) for n in (1, 2))
-    assert one[0] == two[0]
-    np.testing.assert_array_equal(one[1], two[1])
-    np.testing.assert_array_equal(one[2], two[2])
-
-
 def test_turning_rolls_the_image_and_moving_world_and_camera_together_changes_nothing():
     points, colors = _points("anywhere")
     packed, image = pack_points(points, colors), _smooth_image()

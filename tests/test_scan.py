@@ -13,10 +13,10 @@ from refusals import assert_input_error
 import piccolo
 from piccolo.errors import InputError
 from piccolo.files.cache import sha256_of_arrays
-from piccolo.geometry.rotations import heading_pitch_roll_deg
+from piccolo.geometry.pose import heading_pitch_roll_deg
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.paper.settings import PaperSettings
-from piccolo.prior import Prior
+from piccolo.paper.localize import PaperSettings
+from piccolo.photo import Prior
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,7 @@ import rooms
 from refusals import assert_input_error
 from scipy.spatial import cKDTree
 
-from piccolo.cli import localize as localize_command
-from piccolo.cli import prepare_map as prepare_command
+from piccolo.cli import localize as localize_command, prepare_map as prepare_command
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import LEAF_SIZE, VoxelTable, join_voxels
 from piccolo.errors import InputError
@@ -20,12 +19,11 @@ from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
 from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
-from piccolo.scan_map.named_scans import add_places, find_scan_at, name_scan
 from piccolo.scan_map.scan_addition import add_scan
-from piccolo.scan_map.scan_map import prepare_map
+from piccolo.scan_map.scan_map import add_places, find_scan_at, name_scan, prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, WideViews, render_wide
 
 BESIDE = np.array([5.3, 0.4, 0.2])  # of a second room, from where it was made [m]
@@ -38,7 +36,7 @@ def _shifted(cloud, shift):
 
 
 def _added(old, cloud, name):
-    return add_scan(old, cloud, name, WORKERS, Stopwatch())
+    return add_scan(old, rooms.stream(cloud), name, WORKERS, Stopwatch())
 
 
 @functools.lru_cache
@@ -82,7 +80,7 @@ def test_poses_are_those_of_a_map_of_both():
     a, b = rooms.room(1)[1], _shifted(rooms.room(2)[1], BESIDE)
     points = np.concatenate([a.points + a.origin_world, b.points + b.origin_world])
     both = Cloud(points, np.concatenate([a.colors, b.colors]), np.zeros(3))
-    whole, scan_map = prepare_map(both, WORKERS), of_two_rooms()
+    whole, scan_map = prepare_map(rooms.stream(both), WORKERS), of_two_rooms()
     assert abs(len(scan_map.centers) / len(whole.centers) - 1.0) < 0.05
     for seed, name, shift in ((1, "A", np.zeros(3)), (2, "B", BESIDE)):
         found, expected = _localized(scan_map, seed), _localized(whole, seed)

@@ -10,7 +10,7 @@ from refusals import assert_input_error, assert_refused
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3
-from piccolo.scene import Query, find_scenes, read_scene, write_queries
+from research.scene import Query, find_scenes, read_scene, write_queries
 
 POSE = Pose(exp_so3(np.array([0.3, -1.2, 2.0])), np.array([500_123.25, -3.5, 1.125]))
 

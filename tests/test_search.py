@@ -8,8 +8,7 @@ import pytest
 import rooms
 from pictures import encoded, with_metadata, xmp_packet
 
-from piccolo.geometry.pose import angle_between, exp_so3
-from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
+from piccolo.geometry.pose import angle_between, exp_so3, uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
@@ -19,8 +18,7 @@ from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
-from piccolo.photo import Photo
-from piccolo.prior import Prior
+from piccolo.photo import Photo, Prior
 from research.synthetic.photos import mask_outside_field
 
 AREA = make_grid(24).solid_angle

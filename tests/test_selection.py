@@ -12,8 +12,7 @@ from made_up import QUERY, at, compared, place, places
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.pose import step
-from piccolo.localization import beam, last_descent, selection
-from piccolo.localization import judge as judging
+from piccolo.localization import beam, judge as judging, last_descent, selection
 from piccolo.localization.comparison import score_pose
 from piccolo.localization.covariance import UNKNOWN_ERRORS
 from piccolo.localization.last_descent import refine_best

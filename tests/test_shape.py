@@ -14,14 +14,14 @@ from las_files import OFFSETS, las_bytes
 from made_up import at
 from meshes import SQUARE, write_obj
 from refusals import assert_input_error
+from scans import read_cloud
 
 import piccolo
 from piccolo.cli import localize as command_line
-from piccolo.cloud import open_cloud, read_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
-from piccolo.cloud.stream import Cloud
+from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.errors import InputError
@@ -57,7 +57,9 @@ def _in_gray(cloud):
 
 @functools.lru_cache
 def _shape_map():
-    made = prepare_map(_in_gray(rooms.room(SEED, NUM_POINTS)[1]), Workers(2), has_features=False)
+    made = prepare_map(
+        rooms.stream(_in_gray(rooms.room(SEED, NUM_POINTS)[1])), Workers(2), has_features=False
+    )
     return replace(made, scan_sha256=64 * "0")
 
 
@@ -80,7 +82,7 @@ def _painted():
     plate = _plane(1, 4.0, 1.4, 2.2)
     corner = [_plane(0, 0.0, 0.0, 3.0), _plane(1, 0.0, 0.0, 3.0), _plane(2, 0.0, 0.0, 3.0)]
     points = np.concatenate([*corner, plate]).astype(np.float32)
-    voxels = Cloud(points, np.full(points.shape, 128, np.uint8), np.zeros(3)).voxels(np.eye(3))
+    voxels = rooms.voxels(points)
     leaves = paint_shape(build_octree(voxels), Workers(2)).level(0.04)
     return leaves[:, :3] + voxels.origin, *_opponent(leaves[:, 3:] * 255.0)
 
@@ -180,7 +182,7 @@ def test_intensity_is_a_channel_of_its_own():
     gray = np.repeat(cloud.colors.mean(axis=1).astype(np.uint8)[:, None], 3, axis=1)
     found = {}
     for name, made in (("shape", _in_gray(cloud)), ("intensity", replace(_in_gray(cloud), colors=gray))):
-        scan_map = prepare_map(made, Workers(2), has_features=False)
+        scan_map = prepare_map(rooms.stream(made), Workers(2), has_features=False)
         assert scan_map.has_shape
         assert scan_map.has_intensity == (name == "intensity")
         settings = rooms.KNOWN

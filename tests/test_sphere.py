@@ -3,8 +3,7 @@ import math
 import naive
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from piccolo.geometry import sphere
 from piccolo.geometry.pose import exp_so3

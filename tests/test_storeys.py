@@ -6,7 +6,7 @@ import rooms
 from rooms import scan_map
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.stream import Cloud, stream_of_arrays
+from piccolo.cloud.stream import stream_of_arrays
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map.free_space import FreeSpace
 from piccolo.scan_map.scan_map import prepare_map
@@ -15,9 +15,7 @@ from research.synthetic.world import make_world, scan_world
 
 
 def _octree(*parts):
-    points = np.concatenate(parts).astype(np.float32)
-    cloud = Cloud(points, np.full((len(points), 3), 128, np.uint8), np.zeros(3))
-    voxels = cloud.voxels(np.eye(3))
+    voxels = rooms.voxels(np.concatenate(parts))
     return build_octree(voxels), voxels.origin
 
 

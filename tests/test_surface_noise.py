@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
+import rooms
 
-from piccolo.cloud import Cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.surfaces import NOISE_SHARE, surface_variance
 
@@ -19,9 +19,7 @@ def _room(count, seed=0):
 
 def _deviations(points):
     """Square roots of the variance's eigenvalues (3,) [m], and axes (3, 3), greatest last."""
-    grey = np.full((len(points), 3), 128, np.uint8)
-    voxels = Cloud(points.astype(np.float32), grey, np.zeros(3)).voxels(np.eye(3))
-    values, axes = np.linalg.eigh(surface_variance(build_octree(voxels)))
+    values, axes = np.linalg.eigh(surface_variance(build_octree(rooms.voxels(points))))
     return np.sqrt(np.maximum(values, 0.0)), axes
 
 

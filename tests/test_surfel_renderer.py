@@ -6,15 +6,20 @@ import numpy as np
 import poses
 import pytest
 import rooms
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from refusals import mutated, read_or_refused
 
 from piccolo.cli.render_pose import read_pose_matrix
 from piccolo.cloud.soa import LocalCloud, pack_points
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, angle_between, exp_so3, step
-from piccolo.geometry.rotations import R_cam_from_angles, heading_pitch_roll_deg
+from piccolo.geometry.pose import (
+    Pose,
+    R_cam_from_angles,
+    angle_between,
+    exp_so3,
+    heading_pitch_roll_deg,
+    step,
+)
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.views.pictures import encode_image, fill_holes
@@ -246,7 +251,7 @@ def test_a_pose_file_is_read_or_refused(tmp_path_factory, data):
 
 
 def test_a_camera_too_far_for_the_kernels_is_refused(points):
-    placed = LocalCloud(points, np.eye(3), np.array([5e5, 5e6, 0.0]), ())
+    placed = LocalCloud(np.eye(3), np.array([5e5, 5e6, 0.0]), points, ())
     for far in (1e9, 1e300, np.nan):
         with pytest.raises(InputError, match="wanted one within 1e"):
             placed.from_world(Pose(np.eye(3), np.array([0.0, far, 0.0])))

@@ -11,14 +11,19 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from scans import read_cloud
 
-from piccolo.cloud import read_cloud
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, angle_between, rotation_from_quaternion_wxyz, yaw_rotation
-from piccolo.geometry.rotations import OPTICAL_FROM_CAM
+from piccolo.geometry.pose import (
+    OPTICAL_FROM_CAM,
+    Pose,
+    angle_between,
+    rotation_from_quaternion_wxyz,
+    yaw_rotation,
+)
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.scene import read_scene
+from research.scene import read_scene
 from research.synthetic import make_room as tool
 from research.synthetic.layout import make_room
 from research.synthetic.office import make_office

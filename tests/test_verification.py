@@ -115,7 +115,7 @@ def test_copies_of_a_place_are_where_the_drawn_scan_looks_the_same():
     both = Cloud(np.vstack([cloud.points, twin]), np.vstack([cloud.colors, colors]), cloud.origin_world)
     order = morton_order(both.points, both.colors)
     both = Cloud(both.points[order], both.colors[order], both.origin_world)
-    query = rooms.ask(_narrow()[0], prepare_map(both, Workers(2)), rooms.UNKNOWN)
+    query = rooms.ask(_narrow()[0], prepare_map(rooms.stream(both), Workers(2)), rooms.UNKNOWN)
     here = query.scan_map.from_world(_narrow()[1])
     moves = [(6.05, 0.0, 0.02), (6.9, -0.8, 0.0), (0.9, -0.8, 0.0)]
     others = [Pose(here.R_cam_from_world, here.center_world + move) for move in moves]

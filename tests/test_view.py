@@ -5,7 +5,6 @@ import rooms
 from scipy.spatial import cKDTree
 
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.stream import Cloud
 from piccolo.geometry.colors import unpack_rgb
 from piccolo.geometry.sphere import find_cell, make_grid
 from piccolo.jobs.threads import Workers
@@ -25,8 +24,7 @@ ALL = np.ones(len(make_grid(24)), bool)
 
 @pytest.fixture(scope="module")
 def octree():
-    cloud = rooms.room(1)[1]
-    return build_octree(cloud.voxels(np.eye(3)))
+    return build_octree(rooms.stream(rooms.room(1)[1]).voxels(np.eye(3)))
 
 
 def _cells(positions):
@@ -101,8 +99,7 @@ def test_more_must_be_seen_around_a_candidate_than_on_open_land():
     ]
     hall = np.concatenate([ground, ground + np.array([0, 0, 3]), *walls, *(w[:, [1, 0, 2]] for w in walls)])
     for points, least, most in ((ground, 0.3, 0.55), (hall, 0.55, 1.01)):
-        cloud = Cloud(points.astype(np.float32), np.full(points.shape, 99, np.uint8), np.zeros(3))
-        octree = build_octree(cloud.voxels(np.eye(3)))
+        octree = build_octree(rooms.voxels(points))
         centers = camera_positions.candidate_centers(octree, Workers(2))
         fractions = camera_positions.coverage(octree, centers, Workers(2))
         assert len(fractions) > 50

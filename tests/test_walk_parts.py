@@ -15,10 +15,9 @@ from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import PoseGaussian
-from piccolo.optimize.smoothing import smooth_positions
 from piccolo.photo import Photo
 from piccolo.walk.frames import Frame
-from piccolo.walk.results import check_odometry
+from piccolo.walk.results import check_odometry, smooth_positions
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
 MAX_SPEED = 2.0  # [m/s]

@@ -10,10 +10,8 @@ from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.walk import path as walk_path
-from piccolo.walk import second_look
-from piccolo.walk.frames import MOST_EXPECTED, Frame, State
-from piccolo.walk.motion import JUMP_LOG, Motion, check_times
+from piccolo.walk import path as walk_path, second_look
+from piccolo.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
 from piccolo.walk.path import NOTHING, Belief, believe
 from piccolo.walk.tracker import Followed, expect
 

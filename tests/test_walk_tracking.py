@@ -17,8 +17,7 @@ from piccolo.localization.comparison import Comparison, score_pose
 from piccolo.localization.near import Near
 from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
-from piccolo.walk.frames import Frame, State
-from piccolo.walk.motion import Motion
+from piccolo.walk.frames import Frame, Motion, State
 from piccolo.walk.tracker import (
     Expected,
     expect,

@@ -15,7 +15,7 @@ from ..errors import InputError, printable
 from ..files.json_file import read_bytes, read_text
 from ..panorama.cube import SUFFIXES, is_cube
 from ..panorama.photo import read_photo_facts
-from ..walk.motion import check_times
+from ..walk.frames import check_times
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a photo's path on each line"

@@ -186,14 +186,14 @@ class Localizer:
 
     def _pictures(self, scan: OpenedScan, photo: Photo, result: Result) -> tuple[bytes | None, bytes | None]:
         """Overlay and occlusion mask as PNG, where they are asked for and there is a pose."""
-        overlay = None
-        mask = None
+        overlay = mask = None
         pose = result.best_pose
         if pose is None:
             return overlay, mask
         photo = photo.with_refined_camera(result.cameras)
         if self.makes_overlays:
-            overlay = overlay_png(scan.points, scan.read(photo), scan.from_world(pose), scan.workers)
+            local = scan.prepared.from_world(pose)
+            overlay = overlay_png(scan.prepared.points, scan.read(photo), local, scan.workers)
         if self.makes_occlusion_masks:
             mask = encode_image(scan.occlusion_mask(photo, pose), ".png")
         return overlay, mask

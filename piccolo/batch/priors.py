@@ -9,10 +9,8 @@ from typing import Any
 
 from ..errors import InputError
 from ..files.json_file import read_text
-from ..photo import Photo, Vector
-from ..prior import Prior
-from ..scan_map.named_scans import check_within
-from ..scan_map.scan_map import ScanMap
+from ..photo import Photo, Prior, Vector
+from ..scan_map.scan_map import ScanMap, check_within
 
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
 COLUMNS = ("x", "y", "z", "radius", "heading", "tolerance", "height", *GRAVITY, "within")

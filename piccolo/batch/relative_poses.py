@@ -10,8 +10,13 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..files.json_file import DAMAGE, describe, read_json, read_text
-from ..geometry.pose import Pose, check_transform, rotation_from_quaternion_wxyz
-from ..geometry.rotations import OPENGL_FROM_CAM, OPTICAL_FROM_CAM
+from ..geometry.pose import (
+    OPENGL_FROM_CAM,
+    OPTICAL_FROM_CAM,
+    Pose,
+    check_transform,
+    rotation_from_quaternion_wxyz,
+)
 from ..localization.bundle_adjustment import RelativeScale
 
 WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio [m], or a TUM trajectory [m]"

@@ -9,7 +9,7 @@ from hashlib import sha256
 from typing import Any, NamedTuple
 
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
-from ..confidence.focal_length import Consensus, Opinion
+from ..confidence.focal_length import Consensus
 from ..confidence.localization import FocalLength
 from ..localization.focal_length import WIDE
 from ..localization.judge import follow_consensus
@@ -104,17 +104,14 @@ def list_changed_by_consensus(texts: Sequence[str], min_confidence: float) -> li
             continue
         for k, _ in camera:
             before = Result.from_json(texts[k])
-            after = take_consensus(before, consensus, min_confidence)
+            after = with_localization(
+                before, follow_consensus(localization_of(before), consensus, min_confidence)
+            )
+            after = replace(after, warnings=tuple(dict.fromkeys(after.warnings)))
             is_other = after.status != before.status or after.warnings != before.warnings
             if is_other or abs(after.confidence - before.confidence) > TOLD_CHANGE:
                 changed.append((k, before.status, after))
     return changed
-
-
-def take_consensus(result: Result, consensus: Opinion, min_confidence: float) -> Result:
-    """Return a result as all photos of its camera together leave it."""
-    told = with_localization(result, follow_consensus(localization_of(result), consensus, min_confidence))
-    return replace(told, warnings=tuple(dict.fromkeys(told.warnings)))
 
 
 def group_by_camera(lines: Sequence[Line]) -> list[list[tuple[int, FocalLength]]]:

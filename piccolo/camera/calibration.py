@@ -16,8 +16,7 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError, unreadable
 from ..files.json_file import DAMAGE, describe, read_text
-from ..geometry.pose import Pose, check_pose, rotation_from_quaternion_wxyz
-from ..geometry.rotations import OPTICAL_FROM_CAM
+from ..geometry.pose import OPTICAL_FROM_CAM, Pose, check_pose, rotation_from_quaternion_wxyz
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))

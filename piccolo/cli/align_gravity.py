@@ -1,20 +1,19 @@
 """Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
 from argparse import ArgumentParser, Namespace
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from ..arrays import Array
-from ..cloud import CloudStream, open_cloud
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
+from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import write_transformed
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
-from ..geometry.pose import move, orthonormal, rotation_to_z, yaw_rotation
+from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
 from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
 from ..localization.settings import CoarseToFineSettings
@@ -22,9 +21,7 @@ from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
-from ..scene import QUERIES_NAME, read_scene, write_queries
-from .checks import check_outputs, check_suffix, checking_options
-from .command import command, option
+from .command import check_outputs, check_suffix, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
 from .terminal import print_error, print_report, print_warnings, progress_bar
 
@@ -32,7 +29,7 @@ EXIT_UNKNOWN = 1
 EPILOG = """\
 examples:
   python tools/align_gravity.py --cloud scan.ply --out aligned.ply --assume-nothing --pano photo.jpg
-  python tools/align_gravity.py --cloud room/cloud.ply --queries room/queries.json --out aligned/cloud.ply
+  python tools/align_gravity.py --cloud room/cloud.ply --yaw-walls --out aligned/cloud.ply
 
 The dominant planes give the vertical; of its two directions, the one closer to the file's up axis (z, in glTF
 y) or to --up is up. The axis may be up to 15 degrees off. If the scan may have any orientation,
@@ -47,7 +44,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py")
     option(parser, "--out FILE", "write the rotated cloud to this PLY file; - is stdout")
-    option(parser, "--queries FILE", "true poses in the scan: rotate them too and write them next to --out")
     text = "also rotate about z, as little as possible, to align the dominant walls with x and y"
     option(parser, "--yaw-walls", text)
     option(parser, "--assume-nothing", "the scan may have any orientation: find up from its contents")
@@ -57,10 +53,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 def check_arguments(a: Namespace) -> None:
     """Refuse options that do not go together."""
     refusals = {
-        "--queries needs --out": a.queries and not a.out,
         "--assume-nothing can't be combined with --up": a.up != "auto" and a.assume_nothing,
         "--pano can't be combined with --up": a.up != "auto" and a.pano,
-        f"--queries: nothing can be written next to --out {a.out}": a.queries and a.out and is_stream(a.out),
     }
     for text, is_wrong in refusals.items():
         if is_wrong:
@@ -136,27 +130,21 @@ def main(arguments: Namespace) -> int:
         check_arguments(arguments)
         settings = cloud_settings_from(arguments)
     out = arguments.out
-    queries = read_scene(arguments.queries).queries if arguments.queries else ()
     transform = out.with_suffix(".txt") if out and not is_stream(out) else None
-    poses = out.with_name(QUERIES_NAME) if queries else None
-    outputs = {"--out": out, "its .txt": transform, "the poses": poses}
-    inputs = [path for path in (arguments.pano, arguments.queries) if path]
-    check_outputs(outputs, [*arguments.cloud, *inputs, *(path / QUERIES_NAME for path in inputs)])
+    outputs = {"--out": out, "its .txt": transform}
+    check_outputs(outputs, [*arguments.cloud, *filter(None, [arguments.pano])])
     if arguments.pano:
         read_panorama(arguments.pano)  # refused before the cloud is read
     cloud = open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet))
     T, report, doubt = find(arguments, cloud)
 
-    def write_others() -> None:
+    def write_transform() -> None:
         if transform:
             lines = (" ".join(map(repr, row)) + "\n" for row in T.tolist())
             write_atomically(transform, "".join(lines).encode())
-        if queries:
-            moved = [replace(query, pose=move(query.pose, T, cloud.scale)) for query in queries]
-            write_queries(out.parent, moved, cloud=out.name)
 
     if out and not doubt:
-        print_warnings(arguments, write_transformed(cloud, T, out, write_others))
+        print_warnings(arguments, write_transformed(cloud, T, out, write_transform))
     report |= {"cloud": list(map(str, arguments.cloud)), "out": str(out) if out and not doubt else None}
     report |= {"T_aligned_from_scan": T.tolist(), "metres_per_unit": cloud.scale}
     print_report(arguments, outputs, report)

@@ -6,8 +6,7 @@ from ..coloring.color_scan import check_suffix, write_colored_scan
 from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..result import read_results
-from .checks import check_outputs, checking_options
-from .command import command, option
+from .command import check_outputs, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
 from .terminal import print_report, print_warnings, workers_from
 

@@ -9,8 +9,7 @@ from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
-from .checks import check_distinct, check_folder_name
-from .command import command, option
+from .command import check_distinct, check_folder_name, command, option
 from .terminal import EXIT_BAD_INPUT, print_error
 
 EPILOG = """\

@@ -17,7 +17,7 @@ from tqdm import tqdm
 from ..batch.localizer import Answer, Localizer, Task
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED
 from ..errors import InputError, printable
-from ..jobs.cluster import LOCAL, Cluster, connect
+from ..jobs.cluster import Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
@@ -27,7 +27,7 @@ from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .checks import UsageError
+from .command import UsageError
 from .options import PHOTOS_OF_A_JOB
 from .start import for_terminal
 from .terminal import EXIT_BAD_INPUT, print_error
@@ -78,15 +78,10 @@ def print_result(arguments: Namespace, result: Result, warnings: Sequence[str]) 
 
 def check_execution(arguments: Namespace) -> None:
     """Refuse options that do not go together."""
-    if is_remote(arguments) and arguments.jobs not in (None, 1):
+    if arguments.dask and arguments.jobs not in (None, 1):
         raise UsageError(f"--jobs: not with --dask {arguments.dask}, whose scheduler starts the workers")
-    if is_remote(arguments) and arguments.mask and not arguments.mask.is_absolute():
+    if arguments.dask and arguments.mask and not arguments.mask.is_absolute():
         raise UsageError(f"--mask {arguments.mask}: wanted an absolute path with --dask {arguments.dask}")
-
-
-def is_remote(arguments: Namespace) -> bool:
-    """Return True if a cluster that others have begun does the work."""
-    return arguments.dask not in (None, LOCAL)
 
 
 def count_jobs(arguments: Namespace, num_left: int | None) -> int:
@@ -108,7 +103,7 @@ def count_fitting(arguments: Namespace, num_jobs: int) -> int:
 
 def share_of_a_job(arguments: Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
     """Return the localizer of one of some processes, which divide cores and --max-memory."""
-    if is_remote(arguments):
+    if arguments.dask:
         return replace(localizer, num_threads=arguments.threads or 1, max_memory=arguments.max_memory)
     num_threads = arguments.threads or max(1, num_cores() // num_jobs)
     memory = arguments.max_memory
@@ -117,12 +112,9 @@ def share_of_a_job(arguments: Namespace, localizer: Localizer, num_jobs: int) ->
     return replace(localizer, num_threads=num_threads, max_memory=memory)
 
 
-def connecting(arguments: Namespace, num_jobs: int) -> AbstractContextManager[Cluster | None]:
+def connecting(arguments: Namespace) -> AbstractContextManager[Cluster | None]:
     """Return the cluster of --dask; None without."""
-    if not arguments.dask:
-        return nullcontext()
-    num_threads = arguments.threads or (1 if is_remote(arguments) else max(1, num_cores() // num_jobs))
-    return connect(arguments.dask, num_jobs, num_threads)
+    return connect(arguments.dask) if arguments.dask else nullcontext()
 
 
 @contextmanager
@@ -143,7 +135,7 @@ def executing(
         if cluster is None and (num_jobs := count_fitting(arguments, num_jobs)) == 1:
             yield Here(localizer.answer_in(scan)), localizer
             return
-        if cluster and is_remote(arguments):
+        if cluster:
             localizer = at_the_workers(arguments, cluster, localizer, scan, is_kept)
         del scan
         localizer = share_of_a_job(arguments, localizer, num_jobs)

@@ -6,14 +6,12 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..export import FORMATS, Options, Selection, export, select, true_results
-from ..export.formats import offset_file
-from ..geometry.rotations import CAMERA_AXES
+from ..export.formats import FORMATS, export, offset_file
+from ..export.posed_images import Options, Selection, select
+from ..geometry.pose import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
-from ..scene import find_scenes, input_files
-from .checks import check_distinct, checking_options
-from .command import command, option
+from .command import check_distinct, checking_options, command, option
 from .terminal import print_note, print_report
 
 _FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
@@ -37,9 +35,7 @@ OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only som
 
 def add_arguments(parser: ArgumentParser) -> None:
     """All options. One that is not given stays None, and keeps its default."""
-    source = parser.add_mutually_exclusive_group(required=True)
-    option(source, "--results FILE ...", "results of localize.py, JSON lines", default=[])
-    option(source, "--scenes FOLDER ...", "write the true poses of these scenes, as a reference", default=[])
+    option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     option(parser, "--format", "format of the poses, see below", choices=FORMATS, required=True)
     option(parser, "--out FILE", "file of the poses; for colmap and gpano a new folder", required=True)
     option(parser, "--images FOLDER", "write picture names relative to this folder (default: as in results)")
@@ -101,12 +97,10 @@ def main(arguments: Namespace) -> int:
     with checking_options():
         options = options_from(arguments)
     results = read_results(arguments.results)
-    scenes = find_scenes(arguments.scenes) if arguments.scenes else []
-    results += [result for scene in scenes for result in true_results(scene)]
     beside = offset_file(arguments.out) if options.offset else None
     outputs = {"--out": arguments.out, "the offset": beside}
     files = {Path(name) for result in results for name in (result.pano, result.cloud_name)}
-    check_distinct(outputs, [*arguments.results, *input_files(scenes), *files])
+    check_distinct(outputs, [*arguments.results, *files])
     selection = select(results, arguments.cloud, arguments.all)
     for note in (*notes_on(selection), *check_content(arguments, selection.results)):
         print_note(arguments, note)

@@ -36,8 +36,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..views.pictures import encode_image
 from . import execution, terminal, together
-from .checks import UsageError, check_distinct, check_suffix, checking_options
-from .command import command
+from .command import UsageError, check_distinct, check_suffix, checking_options, command
 from .execution import Executor, Interruption
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 
@@ -340,7 +339,7 @@ def main(arguments: Namespace) -> int:
         num_jobs = execution.count_jobs(arguments, num_left or len(looks) or None)
         opening = partial(open_scan, run)
         with (
-            execution.connecting(arguments, num_jobs) as cluster,
+            execution.connecting(arguments) as cluster,
             execution.executing(arguments, run.localizer, num_jobs, cluster, opening) as place,
             watch.stage("all"),
         ):

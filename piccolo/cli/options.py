@@ -15,13 +15,11 @@ from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import Settings
 from ..panorama import check_labels
-from ..paper.settings import PaperSettings
-from ..photo import Photo, Projection
-from ..prior import Prior
+from ..paper.localize import PaperSettings
+from ..photo import Photo, Prior, Projection
 from ..scan_map.open_map import CachePolicy
-from ..walk.motion import MAX_SPEED, MAX_STEP
-from .checks import check_least
-from .command import option
+from ..walk.frames import MAX_SPEED, MAX_STEP
+from .command import check_least, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
 EPILOG = """\
@@ -192,17 +190,11 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
         text = f" (default one per core, if memory suffices and each gets {PHOTOS_OF_A_JOB} photos or more; "
         text += "1 with paths on stdin or --threads)"
     option(group, "--jobs N", f"processes that use one prepared map{text}", default=default_jobs)
-    text = "run on a Dask cluster: address or file of its scheduler; or local: --jobs workers on this machine"
+    text = "run on a Dask cluster: address or file of its scheduler"
     option(group, "--dask ADDRESS", text)
     option(group, "--threads N", "threads of each process (default: the cores divided by --jobs)")
     text = "memory limit of all processes, or of each --dask worker (default 80 %% of the free memory)"
     option(group, "--max-memory GB", text)
-
-
-def photo_from(arguments: argparse.Namespace) -> Photo:
-    """Return the options of all photos, with no picture."""
-    names = {f.name for f in fields(Photo)}
-    return Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
 
 
 def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
@@ -227,7 +219,8 @@ def cache_from(arguments: argparse.Namespace) -> CachePolicy:
 def localizer_from(arguments: argparse.Namespace, paths: tuple[Path, ...] = ()) -> Localizer:
     """Return what localizes photos in the scan of some files as the options ask for."""
     cloud_settings = cloud_settings_from(arguments)
-    photo = photo_from(arguments)
+    names = {f.name for f in fields(Photo)}
+    photo = Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
     check_labels(photo, cloud_settings.labels)
     return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
 

@@ -3,10 +3,9 @@
 from argparse import ArgumentParser, Namespace
 
 from ..jobs.threads import Stopwatch
-from ..scan_map.named_scans import check_name, name_scan
 from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
-from .checks import check_outputs, checking_options
-from .command import command, option
+from ..scan_map.scan_map import check_name, name_scan
+from .command import check_outputs, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
 from .terminal import print_report, workers_from
 

@@ -1,4 +1,4 @@
-"""Render the cloud as a camera at a pose would see it: colours, depth, or a descent towards the pose."""
+"""Render the cloud as a camera at a pose would see it: colours or depth."""
 
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
@@ -15,23 +15,13 @@ from ..cloud.soa import LocalCloud
 from ..errors import InputError
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_text
-from ..geometry.pose import Pose, check_pose, check_transform, pose_errors
-from ..geometry.rotations import CAMERA_AXES, R_cam_from_angles
+from ..geometry.pose import CAMERA_AXES, Pose, R_cam_from_angles, check_pose, check_transform
 from ..jobs.threads import Workers
-from ..optimize import descent_animation
-from ..optimize.refine import DescentSettings
-from ..optional import import_optional
-from ..panorama import read_panorama
-from ..panorama.model import shrink
-from ..panorama.texels import pack_texels
-from ..panorama.video import writing_video
 from ..result import read_results
 from ..scan_map.open_map import open_points
-from ..scene import read_scene
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
-from .checks import check_distinct, check_suffix, checking_options
-from .command import command, option
+from .command import check_distinct, check_suffix, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
 from .terminal import print_report, print_warnings, workers_from
 
@@ -39,27 +29,21 @@ EPILOG = """\
 examples:
   python tools/render_pose.py --cloud scan.ply --result pose.json --out seen.png --depth depth.png
   python tools/render_pose.py --cloud scan.ply --at 3 2 1.5 --heading 90 --out east.png
-  python tools/render_pose.py --cloud scan.ply --result pose.json --animate descent.gif
 
 Angles: docs/CONVENTIONS.md, Exports; heading is clockwise from the world's +y. Each point is drawn as a disc
 that reaches its nearest neighbours; pixels without a disc are interpolated. --depth is the range along the
 ray. PNG: 16 bit, millimetres, 0 without scan, 65535 for 65.535 m and farther. NPY: float32, metres,
 inf without scan. --mask-out: white without scan, a mask for --mask of localize.py.
-An output - is stdout (PNG; GIF of --animate). Prints one JSON object per picture to stdout, or to stderr if
+An output - is stdout (PNG). Prints one JSON object per picture to stdout, or to stderr if
 stdout is an output.
 """
 MAX_WIDTH = 32_768
 MIN_WIDTH = 16
 MAX_POSE_FILE = 65_536  # [byte] sixteen numbers and some comments
-DESCENT_WIDTH = 1024  # of the panorama
-DESCENT = DescentSettings(solver="adam")
-START_DISTANCE = 0.3  # of a descent from the pose [m]
-START_ANGLE_DEG = 8.0
 SUFFIXES = {  # of outputs, those of stdout and devices first; "" is a folder
     "--out": (".png", ".jpg", ".jpeg", ""),
     "--depth": (".png", ".npy"),
     "--mask-out": (".png",),
-    "--animate": (".gif", ".mp4"),
 }
 
 
@@ -77,29 +61,25 @@ def add_arguments(parser: ArgumentParser) -> None:
     group = parser.add_argument_group("pose, one of")
     one = group.add_mutually_exclusive_group(required=True)
     option(one, "--result FILE", "results of localize.py, JSON lines")
-    option(one, "--queries FILE", "queries.json with true poses")
     option(one, "--pose FILE", "text file with the 4 x 4 numbers of T_world_from_cam")
     option(one, "--at X Y Z", "position in world coordinates [m]")
-    option(group, "--pano NAME", "choose the pose of this panorama (file name), if --queries has several")
+    option(group, "--pano NAME", "choose the pose of this panorama (file name), if --result has several")
     for angle in ("heading", "pitch", "roll"):
         option(group, f"--{angle} DEG", f"{angle} with --at (default 0)")
     group = parser.add_argument_group("picture")
-    option(group, "--out FILE", ".png or .jpg; for several poses a new folder of .png, named like the photos")
+    text = ".png or .jpg; for several poses a new folder of .png, named like the photos"
+    option(group, "--out FILE", text, required=True)
     option(group, "--width PX", "width of a spherical picture, twice its height", default=2048)
     text = "render the view of this camera (docs/CAMERAS.md; default: that of --result, else a sphere)"
     option(group, "--camera FILE", text)
     option(group, "--depth FILE", "range of each pixel, .png or .npy, see below")
     option(group, "--mask-out PNG", "mask of the pixels without scan, see below")
-    text = "animate a descent on a panorama's sampling loss towards its pose: .gif or .mp4 (extra video)"
-    option(group, "--animate FILE", text)
 
 
 def check_usage(arguments: Namespace) -> None:
     """Refuse options that make no sense, whatever the files hold."""
     cloud_settings_from(arguments)
-    if not (arguments.out or arguments.animate):
-        raise InputError("give --out, --animate or both")
-    if (arguments.depth or arguments.mask_out) and (not arguments.out or is_folder(arguments.out)):
+    if (arguments.depth or arguments.mask_out) and is_folder(arguments.out):
         raise InputError("--depth, --mask-out: only with a single picture, --out FILE")
     if not MIN_WIDTH <= arguments.width <= MAX_WIDTH or arguments.width % 2:
         raise InputError(f"--width {arguments.width}: wanted an even number, {MIN_WIDTH} to {MAX_WIDTH}")
@@ -113,8 +93,6 @@ def check_pose_options(arguments: Namespace) -> None:
     angles = [arguments.heading, arguments.pitch, arguments.roll]
     if not arguments.at and any(angle is not None for angle in angles):
         raise InputError("--heading, --pitch, --roll: only with --at")
-    if arguments.animate and not (arguments.result or arguments.queries):
-        raise InputError("--animate: only with --result or --queries, which name a panorama")
     if not np.isfinite([*(arguments.at or ()), *(angle or 0.0 for angle in angles)]).all():
         raise InputError("--at and angles must be finite numbers")
 
@@ -136,16 +114,11 @@ def suffix_of(option: str, path: Path) -> str:
 
 def check_files(arguments: Namespace, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
-    given = (arguments.result, arguments.queries, arguments.pose, arguments.camera)
-    photos = [find_photo(arguments, shot.pano) for shot in poses]
+    given = (arguments.result, arguments.pose, arguments.camera)
+    photos = [Path(shot.pano) for shot in poses]
     check_distinct(outputs_of(arguments), [*arguments.cloud, *filter(None, given), *photos])
     for path in filter(None, outputs_of(arguments).values()):
         (check_output_folder if is_folder(path) else check_output)(path)
-
-
-def find_photo(arguments: Namespace, name: str) -> Path:
-    """Return the panorama that a pose's file names."""
-    return arguments.queries.parent / "images" / name if arguments.queries else Path(name)
 
 
 def poses_from(arguments: Namespace) -> list[Shot]:
@@ -159,19 +132,16 @@ def poses_from(arguments: Namespace) -> list[Shot]:
         return [shot_of("at", pose, given)]
     if arguments.pose:
         return [shot_of(str(arguments.pose), read_pose_matrix(arguments.pose), given)]
-    file = arguments.queries or arguments.result
-    if arguments.queries:
-        queries = read_scene(file).by_name.items()
-        found = [shot_of(name, query.pose, given or query.cameras) for name, query in queries]
-    else:
-        results = [r for r in read_results([file]) if r.best_pose is not None]
-        found = [shot_of(r.pano, r.best_pose, given or r.cameras) for r in results if r.best_pose]
+    results = read_results([arguments.result])
+    found = [shot_of(r.pano, r.best_pose, given or r.cameras) for r in results if r.best_pose]
     if arguments.pano:
         found = [shot for shot in found if Path(shot.pano).name == Path(arguments.pano).name]
     if not found:
-        raise InputError(f"{file}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
-    if len(found) > 1 and (arguments.animate or not is_folder(arguments.out)):
-        raise InputError(f"{file}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER")
+        raise InputError(f"{arguments.result}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
+    if len(found) > 1 and not is_folder(arguments.out):
+        raise InputError(
+            f"{arguments.result}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER"
+        )
     return found
 
 
@@ -236,48 +206,16 @@ def draw_pictures(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], wo
         print_report(arguments, outputs_of(arguments), line)
 
 
-def animate(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
-    """Write the descent towards the pose; one JSON line."""
-    ((name, pose, camera),) = poses
-    if camera is not None:
-        raise InputError(f"{name}: found the camera model {camera.model}, wanted a sphere for --animate")
-    panorama = shrink(read_panorama(find_photo(arguments, name)), DESCENT_WIDTH)
-    goal = cloud.from_world(pose)
-    start = descent_animation.perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
-    texels = pack_texels(panorama.rgb, panorama.is_valid)
-    refined, history = descent_animation.refine_with_history(cloud.points, texels, start, DESCENT)
-    frame_width = descent_animation.FRAME_WIDTH
-    frames = descent_animation.frames_of(cloud.points, panorama, history, frame_width, workers)
-    if suffix_of("--animate", arguments.animate) == ".gif":
-        write_atomically(arguments.animate, descent_animation.encode_gif(frames))
-    else:
-        height, width = frames[0].shape[:2]
-        with writing_video(arguments.animate, descent_animation.FRAMES_PER_S, (width, height)) as add:
-            for frame in frames:
-                add(frame)
-    line: dict[str, object] = {"out": str(arguments.animate), "pano": name, "frames": len(frames)}
-    for label, at in (("start", start), ("end", refined.pose)):
-        distance, angle = pose_errors(at, goal)
-        line |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
-    line["loss"] = refined.loss if np.isfinite(refined.loss) else None
-    print_report(arguments, outputs_of(arguments), line)
-
-
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: Namespace) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
-    if arguments.animate and suffix_of("--animate", arguments.animate) == ".mp4":
-        import_optional("--animate", "av", "video")
     poses = poses_from(arguments)
     check_files(arguments, poses)
 
     workers = workers_from(arguments)
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
     print_warnings(arguments, cloud.warnings)
-    if arguments.out:
-        draw_pictures(arguments, cloud, poses, workers)
-    if arguments.animate:
-        animate(arguments, cloud, poses, workers)
+    draw_pictures(arguments, cloud, poses, workers)
     return 0

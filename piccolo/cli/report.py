@@ -14,8 +14,7 @@ from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
-from .checks import UsageError, check_distinct, check_least, check_suffix, checking_options
-from .command import command, option
+from .command import UsageError, check_distinct, check_least, check_suffix, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
 from .terminal import print_report, print_warnings, workers_from
 

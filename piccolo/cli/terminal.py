@@ -5,8 +5,9 @@ import logging
 import sys
 import traceback
 from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from tqdm import tqdm
@@ -14,15 +15,16 @@ from tqdm import tqdm
 from ..errors import printable
 from ..files.atomic import is_stdout
 from ..jobs.threads import Progress, Workers, num_cores
-from .checks import Outputs
 from .start import for_terminal
 
 EXIT_BAD_INPUT = 3
+Outputs = Mapping[str, Path | None]  # by option; None where it is not given
 DELAY = 0.5  # seconds: what takes less needs no bar
 COUNTED = "{desc}: {percentage:3.0f} % |{bar:20}| {remaining} left"
 UNCOUNTED = "{desc}: {n_fmt} in {elapsed}"
 # of a map, when its scan has been read
 STEPS = {"find free space": 1, "render views": 2, "find features": 3, "sort features": 4}
+LOG = logging.getLogger("piccolo")
 tqdm.monitor_interval = 0  # no thread of tqdm's own, which might not start, for bars that stand still
 
 
@@ -56,9 +58,8 @@ def print_report(arguments: Namespace, outputs: Outputs, report: Mapping[str, ob
 
 
 def workers_from(arguments: Namespace, num_threads: int | None = None) -> Workers:
-    """Return workers, by default one a core, whose progress and warnings are shown, or not with --quiet."""
-    show = progress_bar(arguments.quiet)
-    return Workers(num_threads or num_cores(), show, warn_once(arguments.quiet))
+    """Return workers, by default one a core, that show progress, but not with --quiet, and log warnings."""
+    return Workers(num_threads or num_cores(), progress_bar(arguments.quiet), LOG.warning)
 
 
 def show_progress(values: Iterable[Any], is_quiet: bool, **form: Any) -> Iterator[Any]:
@@ -77,44 +78,32 @@ def progress_bar(is_quiet: bool) -> Progress:
     return show
 
 
-def warn_once(is_quiet: bool) -> Callable[[str], None]:
-    """Return a function that prints a warning, once however often it comes, or nothing."""
-    printed: set[str] = set()
-
-    def warn(warning: str) -> None:
-        if not is_quiet and warning not in printed:
-            printed.add(warning)
-            tqdm.write(f"warning: {for_terminal(printable(warning))}", file=sys.stderr)
-
-    return warn
-
-
 class LogHandler(logging.Handler):
-    """Prints what is logged: news, and warnings once."""
+    """Prints what is logged: news and warnings, each once however often it comes."""
 
-    def __init__(self, is_quiet: bool) -> None:
+    def __init__(self) -> None:
         super().__init__(logging.INFO)
-        self.is_quiet = is_quiet
-        self.warn = warn_once(is_quiet)
+        self.printed: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a record."""
+        text = record.getMessage()
         if record.levelno >= logging.WARNING:
-            self.warn(record.getMessage())
-        elif not self.is_quiet:
-            tqdm.write(record.getMessage(), file=sys.stderr)
+            text = f"warning: {for_terminal(printable(text))}"
+        if text not in self.printed:
+            self.printed.add(text)
+            tqdm.write(text, file=sys.stderr)
 
 
 @contextmanager
 def showing_log(is_quiet: bool) -> Iterator[None]:
-    """Within this, what the package logs is printed, warnings once, or nothing at all."""
-    log = logging.getLogger("piccolo")
-    handler = LogHandler(is_quiet)
-    level = log.level
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
+    """Within this, what the package logs is printed, or nothing at all."""
+    handler = logging.NullHandler() if is_quiet else LogHandler()
+    level = LOG.level
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
     try:
         yield
     finally:
-        log.removeHandler(handler)
-        log.setLevel(level)
+        LOG.removeHandler(handler)
+        LOG.setLevel(level)

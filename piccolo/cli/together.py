@@ -33,9 +33,9 @@ from ..photo import Photo
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
-from ..walk.motion import Motion
+from ..walk.frames import Motion
 from . import terminal
-from .checks import UsageError, refuse_given
+from .command import UsageError, refuse_given
 from .execution import EXIT_SOME_NOT, Interruption, choose_exit_code, interruptible, print_result
 from .options import DEFAULT_EVERY
 

@@ -37,27 +37,33 @@ class PackedPoints:
 
 
 @dataclass(frozen=True)
-class LocalCloud:
-    """A cloud's points near a local origin: x_local = R_local_from_world (x_world - origin_world)."""
+class MapFrame:
+    """A frame near the points, z up: x_map = R_map_from_world (x_world - origin_world)."""
 
-    points: PackedPoints
-    R_local_from_world: Array  # (3, 3) turns the axis that points up, or the map's up, to z
-    origin_world: Array  # (3,) [m]
-    warnings: tuple[str, ...]
+    R_map_from_world: Array  # (3, 3) turns the axis that points up to z; identity where z is up
+    origin_world: Array  # (3,) [m] in whole metres along the map's axes
 
     def from_world(self, pose: Pose) -> Pose:
-        """Return a world pose in the frame of `points`; InputError if it is too far away for float32."""
+        """Transform a pose of the world to this frame; InputError if it is too far away for float32."""
         center_world = pose.center_world
         if not np.abs(center_world - self.origin_world).max() < FARTHEST:
             found = f"found a camera at {center_world.tolist()}"
             raise InputError(f"{found}, wanted one within {FARTHEST:.0e} m of the cloud")
-        R = self.R_local_from_world
+        R = self.R_map_from_world
         return Pose(pose.R_cam_from_world @ R.T, R @ (center_world - self.origin_world))
 
     def to_world(self, pose: Pose) -> Pose:
-        """Return a pose in the frame of `points` as one in the world."""
-        R = self.R_local_from_world
+        """Transform a pose of this frame to the world."""
+        R = self.R_map_from_world
         return Pose(pose.R_cam_from_world @ R, R.T @ pose.center_world + self.origin_world)
+
+
+@dataclass(frozen=True)
+class LocalCloud(MapFrame):
+    """The points of a cloud."""
+
+    points: PackedPoints  # in this frame
+    warnings: tuple[str, ...]
 
 
 def pack_points(points: Array32, colors: Bytes) -> PackedPoints:

@@ -112,17 +112,9 @@ class Cloud:
     points: Array32  # (N, 3) world minus origin_world [m], all finite, Morton order
     colors: Bytes  # (N, 3) RGB
     origin_world: Array  # (3,) what was subtracted from the file's coordinates [m]
-    num_dropped: int = 0  # points with NaN or infinite coordinates, left out
     warnings: tuple[str, ...] = ()  # one line each, for the user
     up: UpAxis = "z"  # the axis that points up according to the files
     has_colors: bool = True  # else greys, by the intensity or all alike
-
-    def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
-        table = VoxelTable("cloud")
-        table.add(rotate_points(self.points + self.origin_world, R_map_from_world), self.colors)
-        voxels = table.finish()
-        return Voxels(voxels.codes, voxels.nodes, voxels.origin, self.warnings + voxels.warnings)
 
 
 @dataclass(frozen=True)
@@ -193,7 +185,12 @@ class CloudStream:
         return voxels._replace(warnings=(*self._warnings(validators), *of_all))
 
     def read(self) -> Cloud:
-        """Return all points, in Morton order."""
+        """Return all points, in Morton order.
+
+        The middle of their bounding box, rounded to whole metres, becomes `origin_world` and is subtracted in
+        float64. This is done for every cloud, so that UTM coordinates and a room at the origin take the same
+        path.
+        """
         validators: list[PointValidator] = []
         chunks = list(self.chunks(validators))
         points_world = np.concatenate([points_world for points_world, _ in chunks])
@@ -207,8 +204,7 @@ class CloudStream:
         points = points[order]
         colors = colors[order]
         warnings = (*self._warnings(validators), *unit_warnings(self.label, points))
-        num_dropped = sum(validator.num_dropped for validator in validators)
-        return Cloud(points, colors, origin_world, num_dropped, warnings, self.up, self.has_colors)
+        return Cloud(points, colors, origin_world, warnings, self.up, self.has_colors)
 
 
 def stream_of_arrays(points: Floats, colors: NDArray[Any] | None) -> CloudStream:
@@ -278,16 +274,6 @@ def open_cloud(
         only_shape = replace(settings, channels=("shape",))
         sources = [open_source(path, only_shape) for path in sorted(paths)]
     return CloudStream(sources, settings.scale, show)
-
-
-def read_cloud(path: Path, settings: CloudSettings = IN_METRES) -> Cloud:
-    """Return the cloud in a file, checked, in metres, in Morton order.
-
-    The file's coordinates are multiplied by the scale; the middle of their bounding box, rounded to whole
-    metres, becomes `origin_world` and is subtracted in float64. This is done for every cloud, so that UTM
-    coordinates and a room at the origin take the same path. Raises InputError like `open_cloud`.
-    """
-    return open_cloud([path], settings).read()
 
 
 def open_source(path: Path, settings: CloudSettings = IN_METRES) -> reader.PointSource:

@@ -54,16 +54,6 @@ def _rows(columns: dict[str, NDArray[Any]], dtype: np.dtype[Any]) -> Rows:
     return rows
 
 
-def header(dtype: np.dtype[Any], num_vertices: int, comments: Sequence[str], more: Sequence[str]) -> bytes:
-    """Return the header, of a fixed size, of binary vertices, with lines of the elements that follow them."""
-    # The room that the number doesn't need stands in a comment: a padded number is not read everywhere.
-    room = "comment " + "." * (MAX_DIGITS - len(str(num_vertices)))
-    properties = [f"property {TYPE_NAMES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
-    lines = ["ply", "format binary_little_endian 1.0", room, *(f"comment {text}" for text in comments)]
-    lines += [f"element vertex {num_vertices}", *properties, *more, "end_header", ""]
-    return "\n".join(lines).encode("ascii", "replace")
-
-
 @dataclass
 class PlyWriter:
     """A writer of vertices, chunk by chunk; all have the fields of the first."""
@@ -83,8 +73,15 @@ class PlyWriter:
         self.num_vertices += len(rows)
 
     def write_header(self) -> None:
-        """Write the header for the vertices so far."""
-        self.file.write(header(self.dtype or np.dtype([]), self.num_vertices, self.comments, self.more))
+        """Write the header, of a fixed size, for the vertices so far."""
+        # The room that the number doesn't need stands in a comment: a padded number is not read everywhere.
+        lines = ["ply", "format binary_little_endian 1.0"]
+        lines.append("comment " + "." * (MAX_DIGITS - len(str(self.num_vertices))))
+        lines += [f"comment {text}" for text in self.comments]
+        lines.append(f"element vertex {self.num_vertices}")
+        dtype = self.dtype or np.dtype([])
+        lines += [f"property {TYPE_NAMES[dtype[name].str[1:]]} {name}" for name in dtype.names or ()]
+        self.file.write("\n".join([*lines, *self.more, "end_header", ""]).encode("ascii", "replace"))
 
 
 @contextmanager
@@ -95,12 +92,6 @@ def writing_ply(path: Path, comments: Sequence[str] = (), more: Sequence[str] = 
         yield writer
         file.seek(0)
         writer.write_header()
-
-
-def write_ply(path: Path, rows: Rows) -> None:
-    """Write vertices to a file, whole or not at all."""
-    with writing_ply(path) as writer:
-        writer.add(rows)
 
 
 def coordinate_type(box: Array, T_target_from_source: Array, scale: float) -> type[np.floating[Any]]:

@@ -11,8 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array, Array32, Bytes, Int32s
-from ..cloud import open_cloud
 from ..cloud.octree import Octree, recolor
+from ..cloud.stream import open_cloud
 from ..cloud.writers import SUFFIXES, write_colored
 from ..errors import InputError
 from ..files.line_file import Journal

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..geometry.nearness import ONE_ANSWER, Nearness
+from ..geometry.nearness import ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
-from ..geometry.suppression import non_maximum_suppression
 
 MAX_ALTERNATIVES = 5  # reported
 

@@ -18,9 +18,17 @@ import numpy as np
 from ..errors import InputError, printable
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_bytes
-from ..geometry import rotations
-from ..geometry.pose import Pose, log_so3, quaternion_wxyz
-from ..geometry.rotations import CAMERA_AXES, OPENGL_FROM_CAM, OPTICAL_FROM_CAM, turn_axes
+from ..geometry.pose import (
+    CAMERA_AXES,
+    OPENGL_FROM_CAM,
+    OPTICAL_FROM_CAM,
+    Pose,
+    heading_pitch_roll_deg,
+    log_so3,
+    quaternion_wxyz,
+    translation,
+    turn_axes,
+)
 from ..optional import import_optional
 from ..panorama.gpano import with_pose
 from ..panorama.picture import WANTED
@@ -85,7 +93,7 @@ def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None
         score = result.evidence.score if result.evidence else None
         words = (cell(image.name), cell(result.cloud_name), result.status, result.confidence, score)
         wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
-        table.writerow([*words, *pose.center_world.tolist(), *wxyz, *rotations.heading_pitch_roll_deg(pose)])
+        table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
     write_offset_beside(out, options)
     write_atomically(out, text.getvalue().encode())
 
@@ -124,7 +132,7 @@ def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> N
     """
     lines = [""]
     for image in images:
-        values = [*image.pose.center_world, *rotations.heading_pitch_roll_deg(image.pose)]
+        values = [*image.pose.center_world, *heading_pitch_roll_deg(image.pose)]
         lines.append("\t".join([image.name, image.time, numbers(values, "\t")]))
     write_offset_beside(out, options)
     write_lines(out, lines)
@@ -143,7 +151,7 @@ def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> N
     lines = []
     for i, (image, text) in enumerate(zip(images, texts, strict=True), 1):
         pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
-        values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *rotations.translation(pose)])
+        values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
         lines += [f"{i} {values} {camera_ids[text]} {image.name}", ""]  # a line of points follows
     offset = offset_comment(options)
     with replacing_folder(out) as folder:
@@ -204,7 +212,7 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
         cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
         pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
         rotation = log_so3(pose.R_cam_from_world).tolist()
-        shot = {"rotation": rotation, "translation": rotations.translation(pose).tolist(), "camera": camera}
+        shot = {"rotation": rotation, "translation": translation(pose).tolist(), "camera": camera}
         shots[image.name] = shot
     write_offset_beside(out, options)
     write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
@@ -289,7 +297,7 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
     """Return the point without a height, which would have to be above WGS84's ellipsoid: z is a property."""
     result = image.result
     x, y, z = image.pose.center_world.tolist()
-    heading, pitch, roll = rotations.heading_pitch_roll_deg(image.pose)
+    heading, pitch, roll = heading_pitch_roll_deg(image.pose)
     ahead = np.radians(heading)
     eastings = [x, x + STEP * np.sin(ahead)]
     northings = [y, y + STEP * np.cos(ahead)]
@@ -323,7 +331,7 @@ def write_gpano(images: Sequence[PosedImage], out: Path, options: Options) -> No
 
 def _copy(image: PosedImage) -> bytes:
     """Return the picture's file with its pose."""
-    return with_pose(image.path, read_bytes(image.path, WANTED), rotations.heading_pitch_roll_deg(image.pose))
+    return with_pose(image.path, read_bytes(image.path, WANTED), heading_pitch_roll_deg(image.pose))
 
 
 OFFSET = frozenset({"offset"})

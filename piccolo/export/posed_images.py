@@ -18,7 +18,6 @@ from ..geometry.pose import Pose
 from ..panorama import panorama_size
 from ..panorama.gpano import check_size
 from ..result import Result
-from ..scene import Scene
 
 NO_UTF8 = "[\ud800-\udfff]"  # in a name
 LeftOut = dict[str, list[str]]  # names of pictures that a format can't hold, by why
@@ -78,12 +77,6 @@ class Selection(NamedTuple):
     def clouds(self) -> Mapping[str, str]:
         """Paths of the results' clouds, in order; clouds are one if their content is."""
         return {result.source.cloud_sha256 or result.cloud_name: result.cloud_name for result in self.results}
-
-
-def true_results(scene: Scene) -> list[Result]:
-    """Return true poses of a scene, as if they had been found beyond doubt: a reference for other tools."""
-    cloud = str(scene.cloud)
-    return [Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose) for query in scene.queries]
 
 
 def select(results: Sequence[Result], clouds: Sequence[str] = (), use_all: bool = False) -> Selection:

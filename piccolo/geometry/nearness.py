@@ -1,9 +1,14 @@
-"""Poses that count as one: how near they must be, for each purpose."""
+"""Poses that count as one: how near they must be, for each purpose, and non-maximum suppression."""
 
 import math
 from typing import NamedTuple
 
+import numpy as np
+
+from ..arrays import Array, Int64s
+from ..kernels.jit import copy_to, kernel
 from .pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
+from .vectors import dot, minus, row
 
 
 class Nearness(NamedTuple):
@@ -31,3 +36,35 @@ CONFIRMED = Nearness(0.3, math.radians(5.0))  # a pose that matches or another r
 ONE_ANSWER = Nearness(0.5, math.radians(15.0))  # of a photo: others are alternatives
 ONE_IN_BUNDLE = Nearness(0.5, math.radians(6.0))  # of a photo, with the errors of relative poses
 ONE_PLACE = Nearness(2.0, math.radians(45.0))  # of a walk: square rooms look alike turned by twice that
+
+
+@kernel
+def suppress(rotations: Array, centers: Array, min_distance: float, min_trace: float, kept: Int64s) -> int:
+    """Write the indices of the poses, best first, that are near none kept before; return their number."""
+    places = np.empty((len(kept), 3))
+    count = 0
+    for k in range(len(centers)):
+        is_new = True
+        for m in range(count):
+            gap = minus(row(places, m), row(centers, k))
+            if dot(gap, gap) < min_distance * min_distance:
+                trace = 0.0
+                for i in range(9):
+                    trace += rotations[k, i // 3, i % 3] * rotations[kept[m], i // 3, i % 3]
+                if trace > min_trace:
+                    is_new = False
+                    break
+        if is_new:
+            kept[count] = k
+            copy_to(places[count], centers[k])
+            count += 1
+            if count == len(kept):
+                break
+    return count
+
+
+def non_maximum_suppression(rotations: Array, centers: Array, count: int, near: Nearness) -> Int64s:
+    """Return the indices of at most `count` poses (n, 3, 3), (n, 3), best first, near no better one."""
+    kept = np.empty(count, np.int64)
+    min_trace = 1.0 + 2.0 * math.cos(near.angle)
+    return kept[: suppress(rotations, centers, near.distance, min_trace, kept)]

@@ -82,19 +82,19 @@ def std_of(found: PoseGaussian | None) -> float | None:
     return None if found is None else found.largest_std
 
 
-def probability_within(std: float | None, distance: float = MAX_DISTANCE) -> float:
-    """Return the probability that an error is within a distance [m], by its deviation [m]; 1 for None."""
-    return 1.0 if std is None else math.erf(distance / (max(std, 1e-9) * math.sqrt(2.0)))
+def probability_within(std: float | None) -> float:
+    """Return the probability that an error is within MAX_DISTANCE, by its deviation [m]; 1 for None."""
+    return 1.0 if std is None else math.erf(MAX_DISTANCE / (max(std, 1e-9) * math.sqrt(2.0)))
 
 
-def probability_near(offset: Array, covariance: Array, distance: float = MAX_DISTANCE) -> float:
-    """Return the probability that a position is within a distance [m] of a place at an offset (3,) from it.
+def probability_near(offset: Array, covariance: Array) -> float:
+    """Return the probability that a position is within MAX_DISTANCE of a place at an offset (3,) from it.
 
     Along the offset and across it the covariance (3, 3) counts by its largest deviation.
     """
     std = math.sqrt(max(float(np.linalg.eigvalsh(covariance)[-1]), 1e-18)) * math.sqrt(2.0)
     gap = float(np.linalg.norm(offset))
-    return 0.5 * (math.erf((distance - gap) / std) + math.erf((distance + gap) / std))
+    return 0.5 * (math.erf((MAX_DISTANCE - gap) / std) + math.erf((MAX_DISTANCE + gap) / std))
 
 
 def square_root(covariance: Array) -> Array:

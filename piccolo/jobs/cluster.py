@@ -1,16 +1,13 @@
 """Items worked on by a Dask cluster, whose scheduler gives what a lost worker had to others."""
 
 import json
-import logging
 import pickle
-import signal
 import socket
 import threading
 from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from functools import lru_cache, partial
-from multiprocessing import resource_tracker
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -19,49 +16,37 @@ from urllib.parse import urlsplit
 from .. import __version__
 from ..errors import InputError
 from ..optional import import_optional
-from .processes import IN_FLIGHT, LIBRARIES, Function, InFlight, Opening, WorkerLostError
+from .processes import IN_FLIGHT, Function, InFlight, Opening, WorkerLostError
 
-LOCAL = "local"
-HOST = "127.0.0.1"  # of the scheduler and workers of "local"
 TIMEOUT = 10.0  # [s] for a scheduler to answer, and for a first worker to be there
 LEAST_IN_FLIGHT = 64  # as workers may come later
 KEPT_OPEN = 2  # functions of a worker, when several commands use it
-ENVIRONMENT = "distributed.nanny.pre-spawn-environ"
 LOGGING = dict.fromkeys(("distributed", "distributed.client", "distributed.gc"), "critical")
-SETTINGS = {
-    "logging": LOGGING,
-    "distributed.worker.profile.enabled": False,  # samples of all stacks, a hundred a second
-    "distributed.scheduler.worker-saturation": 1.0,  # none waits behind another whose worker may be lost
-}
 NO_SCHEDULER = f"`dask` {{}}: no scheduler answers there within {TIMEOUT:.0f} s ({{}}); wanted "
-NO_SCHEDULER += f"its address, such as tcp://host:8786, the file that it has written, or {LOCAL}"
+NO_SCHEDULER += "its address, such as tcp://host:8786, or the file that it has written"
 _opening = threading.Lock()
 
 
 @contextmanager
-def connect(address: str, num_processes: int, num_threads: int) -> Iterator["Cluster"]:
-    """Yield the cluster of a scheduler's address or file; or of so many processes here, if it is "local".
+def connect(address: str) -> Iterator["Cluster"]:
+    """Yield the cluster of a scheduler's address or file.
 
     Raises InputError if dask.distributed is missing, or no scheduler or worker of this version answers.
     """
-    import_optional("`dask`", "dask", "distributed").config.set(SETTINGS)
+    import_optional("`dask`", "dask", "distributed").config.set({"logging": LOGGING})
     distributed = import_optional("`dask`", "distributed", "distributed")
-    with ExitStack() as stack:
-        if address == LOCAL:
-            scheduler = stack.enter_context(_local_cluster(distributed, num_processes, num_threads))
-        else:
-            scheduler = _scheduler_at(address)
-        try:
-            client = stack.enter_context(distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False))
-        except OSError as error:
-            raise InputError(NO_SCHEDULER.format(address, error)) from error
+    scheduler = _scheduler_at(address)
+    try:
+        client = distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False)
+    except OSError as error:
+        raise InputError(NO_SCHEDULER.format(address, error)) from error
+    with client:
         cluster = Cluster(address, client, distributed)
         cluster.check_workers()
         try:
             yield cluster
         finally:
-            if address != LOCAL:
-                cluster.forget()
+            cluster.forget()
 
 
 def _scheduler_at(address: str) -> str:
@@ -76,31 +61,6 @@ def _scheduler_at(address: str) -> str:
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise InputError(NO_SCHEDULER.format(address, error)) from error
     return url.geturl()
-
-
-@contextmanager
-def _local_cluster(distributed: Any, num_processes: int, num_threads: int) -> Iterator[str]:
-    """Yield the address of a scheduler in this process, with workers in others that end with it."""
-    # In place of Dask's own, of which MALLOC_TRIM_THRESHOLD_ makes large arrays slow.
-    environment = dict.fromkeys(LIBRARIES, str(num_threads))
-    import_optional("`dask`", "dask", "distributed").config.set({ENVIRONMENT: environment})
-    resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
-    # What this thread blocks, its children do: Ctrl-C is for this process, and not for the others.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        cluster = distributed.LocalCluster(
-            n_workers=num_processes,
-            threads_per_worker=1,
-            processes=True,
-            host=HOST,
-            dashboard_address=f"{HOST}:0",  # a port that is free: its pages are of no use here
-            memory_limit=0,  # piccolo itself refuses what is too much
-            silence_logs=logging.CRITICAL,
-        )
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    with cluster:
-        yield cluster.scheduler_address
 
 
 class Cluster:

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Int64s, Mask
-from ..geometry.nearness import MATCHED, VOTED
+from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
 from ..geometry.pose import Pose
-from ..geometry.suppression import non_maximum_suppression
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, copy_to, inline_kernel, kernel

@@ -14,7 +14,7 @@ from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
 from ..jobs.threads import Once, Stopwatch
 from ..local_features.hypotheses import count_matches, propose_poses
-from ..prior import NOTHING_KNOWN
+from ..photo import NOTHING_KNOWN
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from .beam import brief_query, refine_matches, refine_starts, score_mirror, score_starts

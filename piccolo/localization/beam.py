@@ -10,9 +10,8 @@ import numpy as np
 
 from ..arrays import Array, Int64s
 from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
-from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness
+from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
-from ..geometry.suppression import non_maximum_suppression
 from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL

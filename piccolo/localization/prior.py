@@ -6,10 +6,9 @@ import numpy as np
 
 from ..arrays import Array, Mask
 from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
-from ..prior import Prior
+from ..photo import Prior
 from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
-from ..scan_map.named_scans import candidates_within, find_scan_at
-from ..scan_map.scan_map import ScanMap
+from ..scan_map.scan_map import ScanMap, candidates_within, find_scan_at
 
 STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
 

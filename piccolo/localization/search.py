@@ -6,11 +6,9 @@ from typing import Literal
 import numpy as np
 
 from ..arrays import Array, Int32s, Int64s
-from ..geometry.nearness import STARTING, STARTING_NARROW
-from ..geometry.pose import Pose
-from ..geometry.rotations import R_cam_from_angles, uniform_rotations, uniform_yaws
+from ..geometry.nearness import STARTING, STARTING_NARROW, non_maximum_suppression
+from ..geometry.pose import Pose, R_cam_from_angles, uniform_rotations, uniform_yaws
 from ..geometry.sphere import SEARCH_RINGS, make_grid, whole_areas, wider_cells
-from ..geometry.suppression import non_maximum_suppression
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel

@@ -6,9 +6,9 @@ from typing import Literal, NamedTuple
 from ..arguments import check_fields
 from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
 from ..errors import InputError
-from ..geometry.rotations import Gravity
+from ..geometry.pose import Gravity
 from ..optimize.refine import Solver
-from ..prior import NOTHING_KNOWN, Prior
+from ..photo import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW
 from ..views.view import ViewConfig
 

@@ -20,8 +20,6 @@ LEAST_STEP = 1e-7  # [rad + m] of Gauss-Newton: a shorter one ends the descent
 
 Equations = tuple[float, Array, Array]  # loss, its gradient (6,) by a step, normal matrix (6, 6)
 Objective = Callable[[Pose], Equations]
-# called with the part of the descent, a pose tried, and the loss there
-Watch = Callable[[int, Pose, float], None]
 Solver = Literal["gauss-newton", "lbfgs", "adam"]
 
 
@@ -146,9 +144,7 @@ def descend_gauss_newton(objective: Objective, start: Pose, num_iterations: int)
     return best
 
 
-def refine(
-    points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings, watch: Watch = lambda *_: None
-) -> Refined:
+def refine(points: PackedPoints, loss: Loss, start: Pose, settings: DescentSettings) -> Refined:
     """Descend from `start`, leaving out the points hidden from the camera; these are found `num_culls` times.
 
     That changes the function, so losses before and after it are not comparable: the result is the best pose
@@ -161,17 +157,12 @@ def refine(
     def find_seen(at: Pose) -> PackedPoints:
         return visible_points(points, at.center_world) if settings.use_visibility else points
 
-    def objective(part: int, seen: PackedPoints, at: Pose) -> Equations:
-        found = loss.equations(seen, at)
-        watch(part, at, found[0])
-        return found
-
-    for part, num_iterations in enumerate(np.diff(bounds).tolist()):
-        of_part = partial(objective, part, find_seen(pose))
+    for num_iterations in np.diff(bounds).tolist():
+        objective = partial(loss.equations, find_seen(pose))
         if settings.solver == "adam":
             adam.best_loss = np.inf
-            pose = descend_adam(of_part, pose, adam, num_iterations).pose
+            pose = descend_adam(objective, pose, adam, num_iterations).pose
         else:
             descend = descend_lbfgs if settings.solver == "lbfgs" else descend_gauss_newton
-            pose = descend(of_part, pose, num_iterations).pose
+            pose = descend(objective, pose, num_iterations).pose
     return Refined(pose, loss.value(find_seen(pose), pose))

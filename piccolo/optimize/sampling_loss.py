@@ -6,7 +6,7 @@ over the N' points that do not fall on masked pixels; colours in [0, 1], a mean 
 those of normal_equations.
 
 Kernels sum float32 within chunks of 512 points, and these in float64, in order, within blocks of 4,096 and
-over them. The result has the same bits for any number of threads.
+over them.
 """
 
 import math
@@ -17,7 +17,6 @@ import numpy as np
 from ..arrays import Array, Array32, Int32s
 from ..cloud.soa import FARTHEST, PackedPoints
 from ..geometry.pose import Pose
-from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import CHUNK, Texels, bilinear_weights, blend, channel, is_valid, make_chunk, project
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
@@ -33,13 +32,13 @@ Points = tuple[Array32, Array32, Array32, Int32s]  # x, y, z [m] and packed colo
 
 @kernel
 def loss_blocks(
-    points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, first_block: int, sums: Array
+    points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, sums: Array
 ) -> None:
     """Write for each block (blocks, 2): the sum of the residual norms [8-bit levels], the count of points."""
     x, y, z, rgbx = points
     p = make_chunk()
     for block in range(len(sums)):
-        begin = (first_block + block) * BLOCK
+        begin = block * BLOCK
         end = min(len(x), begin + BLOCK)
         sums[block] = 0.0
         for lo in range(begin, end, CHUNK):
@@ -84,35 +83,26 @@ add_packed = block_adder(read_packed, norm)
 
 @kernel
 def normal_blocks(
-    points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, first_block: int, sums: Array
+    points: Points, image: Texels, R_cam_from_world: Array, center_world: Array, sums: Array
 ) -> None:
     """Write for each block (blocks, 29): loss, count, gradient, upper triangle of sum J^T J / norm."""
     x, y, z, rgbx = points
     R, t = R_cam_from_world, center_world
     for block in range(len(sums)):
-        lo = (first_block + block) * BLOCK
+        lo = block * BLOCK
         part = slice(lo, min(len(x), lo + BLOCK))
         sums[block] = 0.0
         xyz = (x[part], y[part], z[part])
         add_packed(xyz, rgbx[part], image.rgbx, image.width, R, t, HALF_LEVEL, sums[block])
 
 
-def _sum_blocks(
-    blocks: Callable[..., None], points: PackedPoints, texels: Texels, pose: Pose, num_threads: int
-) -> Array:
+def _sum_blocks(blocks: Callable[..., None], points: PackedPoints, texels: Texels, pose: Pose) -> Array:
     """Sum over all points, in float64, the rows that a kernel writes, one a block."""
     if not np.abs(pose.center_world).max() < FARTHEST:  # NaN included: a kernel must not gather there
         return np.zeros(NUM_SUMS)
-    num_blocks = -(-len(points) // BLOCK)
-    sums = np.empty((num_blocks, NUM_SUMS if blocks is normal_blocks else 2))
-    bounds = np.linspace(0, num_blocks, num_threads + 1).astype(np.int64)
-
-    def run(part: int) -> None:
-        lo, hi = bounds[part : part + 2]
-        arrays = points.x, points.y, points.z, points.rgbx
-        blocks(arrays, texels, pose.R_cam_from_world, pose.center_world, lo, sums[lo:hi])
-
-    list(Workers(num_threads).map(run, range(num_threads), "blocks"))
+    sums = np.empty((-(-len(points) // BLOCK), NUM_SUMS if blocks is normal_blocks else 2))
+    arrays = points.x, points.y, points.z, points.rgbx
+    blocks(arrays, texels, pose.R_cam_from_world, pose.center_world, sums)
     return np.asarray(sums.sum(axis=0))
 
 
@@ -121,22 +111,20 @@ def _is_hidden(count: float, points: PackedPoints, texels: Texels) -> bool:
     return bool(count <= MIN_SHOWN_SHARE * texels.valid_share**2 * len(points))
 
 
-def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1) -> float:
+def sampling_loss(points: PackedPoints, texels: Texels, pose: Pose) -> float:
     """Compute the paper's Eq. 2 at `pose`, in [0, sqrt(3)]; inf if masked pixels hide too many points."""
-    total, count = _sum_blocks(loss_blocks, points, texels, pose, num_threads)[:2]
+    total, count = _sum_blocks(loss_blocks, points, texels, pose)[:2]
     if _is_hidden(count, points, texels):
         return math.inf
     return float(total / count * TO_UNIT)
 
 
-def sampling_equations(
-    points: PackedPoints, texels: Texels, pose: Pose, num_threads: int = 1
-) -> tuple[float, Array, Array]:
+def sampling_equations(points: PackedPoints, texels: Texels, pose: Pose) -> tuple[float, Array, Array]:
     """Compute loss, gradient (6,) and matrix (6, 6) of iteratively reweighted least squares at `pose`.
 
     The matrix is (1 / N') sum_i J_i^T J_i / ||e_i||; -inverse(matrix) @ gradient is the Gauss-Newton step.
     """
-    sums = _sum_blocks(normal_blocks, points, texels, pose, num_threads)
+    sums = _sum_blocks(normal_blocks, points, texels, pose)
     total, count = sums[:2]
     if _is_hidden(count, points, texels):
         return math.inf, np.zeros(6), np.eye(6)

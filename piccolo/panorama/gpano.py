@@ -20,7 +20,7 @@ import numpy as np
 
 from ..arrays import Array, Bytes, Mask
 from ..errors import InputError
-from ..geometry.rotations import DECIMALS
+from ..geometry.pose import DECIMALS
 from .model import GPano
 from .picture import MAX_WIDTH, open_picture
 

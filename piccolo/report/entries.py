@@ -13,8 +13,7 @@ from ..arrays import Array
 from ..confidence.confidence import NOT_LOCALIZED
 from ..confidence.covariance import PoseCovariance
 from ..errors import printable
-from ..geometry.pose import Pose
-from ..geometry.rotations import heading_pitch_roll_deg
+from ..geometry.pose import Pose, heading_pitch_roll_deg
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
 

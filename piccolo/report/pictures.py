@@ -298,8 +298,8 @@ def read_control_points(path: Path) -> Array:
     return points
 
 
-def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]:
-    """Return a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f, and the rms error [m] at the points.
+def plan_matrix(pixels: Array, places: Array) -> tuple[float, ...]:
+    """Return a, b, c, d, e, f of x = a u + c v + e, y = b u + d v + f.
 
     Of pixels (N, 2), v downwards, and places (N, 2) [m]: two points give a turn and a scale, more any affine
     map by least squares. InputError if they lie in one point or, more than two, on one line.
@@ -318,8 +318,7 @@ def plan_matrix(pixels: Array, places: Array) -> tuple[tuple[float, ...], float]
     else:
         linear = np.linalg.lstsq(centred, places - places.mean(axis=0), rcond=None)[0].T
     shift = places.mean(axis=0) - linear @ pixels.mean(axis=0)
-    error = float(np.sqrt(((pixels @ linear.T + shift - places) ** 2).sum(axis=1).mean()))
-    return (*linear.T.ravel().tolist(), *shift.tolist()), error
+    return (*linear.T.ravel().tolist(), *shift.tolist())
 
 
 def own_plan(image: Path, control_points: Path, scan_map: ScanMap) -> PlanImage:
@@ -333,7 +332,6 @@ def own_plan(image: Path, control_points: Path, scan_map: ScanMap) -> PlanImage:
     if scale < 1.0:
         rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
     try:
-        matrix, _ = plan_matrix(points[:, :2] * scale, places)
+        return PlanImage(rgb, plan_matrix(points[:, :2] * scale, places))
     except InputError as error:
         raise InputError(f"{control_points}: {error}") from error
-    return PlanImage(rgb, matrix)

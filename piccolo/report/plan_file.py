@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import Array
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..files.atomic import temporary_folder, write_atomically
-from ..optional import import_optional, new_figure
+from ..optional import import_optional
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of
@@ -113,7 +113,8 @@ def draw_figure(document: dict[str, Any], folder: Path, form: str) -> bytes:
     plans = [(k, storey) for k, storey in enumerate(document["storeys"]) if storey["plan"]]
     sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + MARGIN for _, s in plans]
     heights = [float(side[1]) for side in sides] or [1.0]
-    figure = new_figure(figsize=(max([float(side[0]) for side in sides] or [1.0]), sum(heights)), dpi=DPI)
+    size = max([float(side[0]) for side in sides] or [1.0]), sum(heights)
+    figure = import_optional("`plan`", "matplotlib.figure", "tools").Figure(figsize=size, dpi=DPI)
     top = sum(heights)
     for (k, storey), (width, height) in zip(plans, sides, strict=True):
         top -= height
@@ -134,7 +135,7 @@ def draw_figure(document: dict[str, Any], folder: Path, form: str) -> bytes:
 
 def _draw_plan(axes: Any, storey: dict[str, Any], folder: Path) -> None:
     """Draw the plan of a storey with its name and scale, in metres of the map's frame."""
-    from matplotlib.transforms import Affine2D  # noqa: PLC0415  # as of new_figure
+    from matplotlib.transforms import Affine2D  # noqa: PLC0415  # half a second
 
     plan = storey["plan"]
     picture = read_picture(folder / plan["file"], (1, 1))

@@ -1,12 +1,16 @@
 """A prepared map on disk: a NumPy archive, mapped into memory if no other process can truncate it meanwhile.
 
-A file of another format, or damaged in any byte (each member of an archive has a checksum), is refused;
-`map_validation.py` checks the contents of undamaged files. The identity of a checked file is remembered.
+A file of another format, or damaged in any byte (each member of an archive has a checksum), is refused. A map
+may come from anybody, and checksums are easily recomputed: every index that a kernel takes from it is
+checked, every number bounded, and the octree compared with the grid of its voxels. The identity of a checked
+file is remembered.
 FORMAT changes with the meaning of the arrays, so that a file outlives an update; the cache also knows the
 sources by which a map was made, and makes it again when they have changed.
 """
 
+import math
 import os
+import re
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -18,23 +22,225 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import __version__
+from ..arrays import Array, Array32, Int32s
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import naming_damage
+from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
 from ..files.array_archive import ArrayArchive, write_archive
 from ..files.atomic import replacing
 from ..files.cache import WRITABLE, is_own, make_key, mark_used, own_names, private_folder, recall, remember
-from ..local_features.feature_map import FeatureMap
-from ..views.candidate_views import CandidateViews
-from .map_validation import LAYOUT, check_arrays, clean_warnings
-from .scan_map import ScanMap, defer_features
+from ..geometry.pose import check_rotation
+from ..geometry.sphere import make_grid
+from ..kernels.jit import F0, F1, inline_kernel, kernel
+from ..local_features.feature_map import MAX_LISTS, MAX_RANGE, MOST_VIEWS, NUM_COMPONENTS, FeatureMap
+from ..local_features.keypoints import DESCRIPTOR_SIZE
+from ..views.candidate_views import WIDE_RINGS, CandidateViews
+from .scan_map import MAX_SCANS, ScanMap, defer_features, is_name, sparse_candidates
 
+Arrays = dict[str, NDArray[Any]]
+WIDE_CELLS = len(make_grid(WIDE_RINGS))
+# Type and shape; an axis that has a name is as long as the others of that name.
+LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
+    "octree_nodes": ("<f4", ("nodes", 6)),
+    "octree_first_child": ("<i4", ("links",)),
+    "octree_level_start": ("<i4", (NUM_LEVELS + 1,)),
+    "octree_leaf_size": ("<f8", ()),
+    "R_map_from_world": ("<f8", (3, 3)),
+    "origin_world": ("<f8", (3,)),
+    "surface_variance": ("<f8", (3, 3)),
+    "centers": ("<f8", ("candidates", 3)),
+    "scan_of_candidate": ("<u2", ("candidates",)),
+    "sparse": ("<i8", ("sparse",)),
+    "wide_features": ("|i1", ("sparse", 3 * WIDE_CELLS)),
+    "wide_seen": ("|u1", ("sparse", WIDE_CELLS)),
+    "local_points": ("<f4", ("local", 3)),
+    "local_directions": ("|i1", ("local", 3)),
+    "local_tangents": ("|i1", ("local", 3)),
+    "local_sizes": ("<f4", ("local",)),
+    "local_descriptors": ("|i1", ("local", NUM_COMPONENTS)),
+    "local_views": ("<u2", ("local",)),
+    "local_view_centers": ("<f8", ("views", 3)),
+    "local_mean": ("<i2", (DESCRIPTOR_SIZE,)),
+    "local_components": ("|i1", (DESCRIPTOR_SIZE, NUM_COMPONENTS)),
+    "local_middles": ("|i1", ("lists", NUM_COMPONENTS)),
+    "local_list_start": ("<i4", ("list_starts",)),
+    "has_labels": ("|b1", ()),
+    "has_shape": ("|b1", ()),
+    "scan_sha256": ("<U64", ()),
+    "crs": ("|u1", ("characters",)),  # UTF-8
+}
+SHA256 = re.compile("[0-9a-f]{64}")
+ROUNDING = 1e-9  # of a rotation
+LEAF_SIZES = 1e-3, 0.1  # [m] least and most
+FARTHEST_ORIGIN = 1e12  # [m] of the world
+MARGIN = 10.0  # [m] around the voxels that are kept
+BRIGHTEST = np.float32(1.0 + 1e-6)
+LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
+MAX_CRS = 4 * 20_000  # [byte]
+MAX_WARNINGS = 1000  # lines
+MAX_WARNING = 5000  # characters of a line
 FORMAT = "piccolo-map/8"
 NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
 MEMBERS = {*LAYOUT, "format", "scan_names", "warnings"}
 WANTED = "wanted a whole map of tools/prepare_map.py"
+
+
+@inline_kernel
+def is_in_range(node: Array32, reach: float) -> bool:
+    """Return True if a node (6,) is within `reach` of zero along each axis and has a valid colour."""
+    is_one = True
+    for k in range(3):
+        is_one = is_one and abs(node[k]) <= reach and F0 <= node[3 + k] <= BRIGHTEST
+    return is_one
+
+
+@kernel
+def first_misplaced(
+    nodes: Array32, first_child: Int32s, level_start: Int32s, origin: Array, leaf_size: float, reach: float
+) -> int:
+    """Return the first node outside its parent's voxel, beyond `reach` [m] or without valid colour, or -1.
+
+    The links must be valid. `origin` (3,) is the vector from a corner of all levels' grids to zero [m].
+    """
+    num_levels = len(level_start) - 1
+    for node in range(len(nodes)):
+        if not is_in_range(nodes[node], reach):
+            return node
+    for level in range(num_levels - 1):
+        size = leaf_size * 2.0 ** (num_levels - 1 - level)
+        for parent in range(level_start[level], level_start[level + 1]):
+            for k in range(3):
+                x = np.float64(nodes[parent, k])
+                low = math.floor((x + origin[k]) / size) * size - origin[k]
+                rounding = 1e-5 + 4e-7 * abs(x)  # float32
+                for child in range(first_child[parent], first_child[parent + 1]):
+                    if not (low - rounding <= nodes[child, k] <= low + size + rounding):
+                        return child
+    return -1
+
+
+def check_arrays(path: Path, arrays: Arrays) -> None:
+    """Refuse arrays of a map file that `save_map` can't have written; the warnings are not checked."""
+    sizes: dict[str, int] = {}
+    for name, (dtype, shape) in LAYOUT.items():
+        found = arrays[name]
+        wanted = len(shape) == found.ndim and tuple(
+            sizes.setdefault(axis, length) if isinstance(axis, str) else axis
+            for axis, length in zip(shape, found.shape, strict=True)
+        )
+        if found.dtype.str != dtype or found.shape != wanted:
+            _refuse(path, f"{name} of type {found.dtype} and shape {found.shape}")
+    _check_frame(path, arrays)
+    _check_octree(path, arrays)
+    _check_views(path, arrays)
+    _check_features(path, arrays)
+    _check_scans(path, arrays)
+    if not SHA256.fullmatch(str(arrays["scan_sha256"])):
+        _refuse(path, "a scan_sha256 that is no digest")
+    text = arrays["crs"].tobytes()
+    if len(text) > MAX_CRS or not text.decode().isprintable():
+        _refuse(path, "a crs that is no text")
+
+
+def _refuse(path: Path, found: str) -> None:
+    raise InputError(f"{path}: found {found}, wanted a map of tools/prepare_map.py; prepare it again")
+
+
+def _reach(arrays: Arrays) -> float:
+    """Return the largest distance [m] of points in a map from the origin along an axis."""
+    return WINDOW * float(arrays["octree_leaf_size"]) + MARGIN
+
+
+def _check_frame(path: Path, arrays: Arrays) -> None:
+    """Check the rotation and the variance, and that the origin is at whole metres of the map's axes."""
+    R = check_rotation(arrays["R_map_from_world"], ROUNDING, f"{path}: R_map_from_world of the map")
+    origin: Array = arrays["origin_world"]
+    if not (np.abs(origin).max() < FARTHEST_ORIGIN and np.abs(R @ origin - np.rint(R @ origin)).max() < 1e-3):
+        _refuse(path, f"an origin_world of {origin.tolist()}")
+    T: Array = arrays["surface_variance"]
+    is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROUNDING)
+    if not (is_one and -ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
+        _refuse(path, f"a surface_variance of {T.tolist()}")
+
+
+def _check_octree(path: Path, arrays: Arrays) -> None:
+    """Check that the children of each level are the next level, one to eight a node, within its voxel."""
+    nodes = arrays["octree_nodes"]
+    first_child = arrays["octree_first_child"]
+    start = arrays["octree_level_start"]
+    leaf_size = float(arrays["octree_leaf_size"])
+    if not LEAF_SIZES[0] <= leaf_size <= LEAF_SIZES[1]:
+        _refuse(path, f"leaves of {leaf_size} m")
+    if start[0] != 0 or start[-1] != len(nodes) or not (start[:-1] < start[1:]).all():
+        _refuse(path, f"levels that begin at {start.tolist()} of {len(nodes)} nodes")
+    num_children = np.diff(first_child)
+    is_tree = len(first_child) == len(nodes) + 1 and (first_child[start[:-1]] == start[1:]).all()
+    inner, leaves = np.split(num_children, [start[-2]])
+    if not (is_tree and inner.min() >= 1 and inner.max() <= 8 and not leaves.any()):
+        _refuse(path, "invalid child links of the octree")
+    origin_map = np.rint(arrays["R_map_from_world"] @ arrays["origin_world"])
+    origin = origin_map + PHASE / (1 << QUANTUM_BITS) * leaf_size
+    misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, _reach(arrays))
+    if misplaced >= 0:
+        _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
+
+
+def _check_views(path: Path, arrays: Arrays) -> None:
+    """Check that candidates and views are within the scan, with values in range, and features have a view.
+
+    The sparse candidates must be those of the coarse grid.
+    """
+    for what, centers in (("view", arrays["local_view_centers"]), ("candidate", arrays["centers"])):
+        if not np.abs(centers).max(initial=0.0) <= _reach(arrays):
+            _refuse(path, f"a {what} at no finite place or too far away")
+    num_views = len(arrays["local_view_centers"])
+    last_view = arrays["local_views"].max(initial=0)
+    if num_views > MOST_VIEWS or last_view >= max(num_views, 1):
+        _refuse(path, f"a feature of view {last_view} of {num_views}")
+    for name, (dtype, _) in LAYOUT.items():
+        if dtype == "|i1" and arrays[name].min(initial=0) < -127:
+            _refuse(path, f"{name} below -127")
+    if not np.array_equal(arrays["sparse"], sparse_candidates(arrays["centers"])[0]):
+        _refuse(path, "sparse candidates that are not those of the coarse grid")
+
+
+def _check_features(path: Path, arrays: Arrays) -> None:
+    """Check that features are within the scan, and that the lists hold each of them once."""
+    points = arrays["local_points"]
+    sizes = arrays["local_sizes"]
+    start = arrays["local_list_start"]
+    if not np.abs(points).max(initial=F0) <= _reach(arrays) + MARGIN + MAX_RANGE:
+        _refuse(path, "a feature at no finite place or too far away")
+    if not (sizes.min(initial=F1) > F0 and sizes.max(initial=F0) <= MAX_RANGE):
+        _refuse(path, f"features of {sizes.min()} to {sizes.max()} m")
+    if not 1 <= len(arrays["local_middles"]) == len(start) - 1 <= MAX_LISTS:
+        _refuse(path, f"{len(arrays['local_middles'])} lists of features with {len(start)} beginnings")
+    if start[0] != 0 or start[-1] != len(points) or (np.diff(start) < 0).any():
+        _refuse(path, "lists of features that do not follow each other")
+
+
+def _check_scans(path: Path, arrays: Arrays) -> None:
+    """Check that names are text and distinct, and that each candidate lies in a named scan."""
+    found = arrays["scan_names"]
+    index = arrays["scan_of_candidate"]
+    if found.dtype.kind != "U" or found.ndim != 1 or len(found) > MAX_SCANS:
+        _refuse(path, f"scan_names of type {found.dtype} and shape {found.shape}")
+    names = list(map(str, found))
+    if len(set(names)) < len(names) or not all(map(is_name, names)):
+        _refuse(path, "invalid or duplicate names of scans")
+    if index.max(initial=0) >= max(len(names), 1):
+        _refuse(path, f"a candidate in scan {index.max()} of {len(names)}")
+
+
+def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:
+    """Return printable warnings: without control characters, limited in number and length."""
+    if warnings.dtype.kind != "U" or warnings.ndim != 1:
+        _refuse(path, f"warnings of type {warnings.dtype} and shape {warnings.shape}")
+    lines = (str(line)[:MAX_WARNING] for line in warnings[:MAX_WARNINGS])
+    return tuple("".join(c if c.isprintable() else "?" for c in line) for line in lines)
 
 
 def save_map(scan_map: ScanMap, path: Path) -> None:

@@ -8,20 +8,18 @@ from pathlib import Path
 
 import numpy as np
 
-from ..cloud import open_cloud
 from ..cloud.settings import IN_COLORS, IN_METRES, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
-from ..cloud.stream import read_crs
+from ..cloud.stream import open_cloud, read_crs
 from ..errors import InputError
 from ..files.cache import cache_root, digest_of_sources, in_words, mark_used, own_folder, sha256_of_files
 from ..geometry.pose import rotate_points
 from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap
-from ..prior import NOTHING_KNOWN, Prior
+from ..photo import NOTHING_KNOWN, Prior
 from .map_file import FORMAT, NAME, is_map_file, load_map, save_map
-from .named_scans import name_scan
 from .scan_addition import add_scan
-from .scan_map import ScanMap, add_features, prepare_map
+from .scan_map import ScanMap, add_features, name_scan, prepare_map
 
 FOLDER = "piccolo-maps"  # within the folder that the user names
 # What makes a map: folders of the package. The cache makes maps anew when one of their files has changed.
@@ -206,9 +204,9 @@ def open_points(paths: Sequence[Path], settings: CloudSettings, workers: Workers
     """Return all points of a cloud's files, or the voxels of a prepared map."""
     if find_prepared_map(paths):
         m = open_map(paths, settings, CachePolicy(is_used=False), workers, Stopwatch())
-        return LocalCloud(m.points, m.R_map_from_world, m.origin_world, m.warnings)
+        return LocalCloud(m.R_map_from_world, m.origin_world, m.points, m.warnings)
     cloud = open_cloud(paths, settings, workers.show).read()
-    R_local_from_world = R_z_from_axis(settings.up, cloud.up)
-    points = rotate_points(cloud.points.astype(np.float64), R_local_from_world).astype(np.float32)
+    R_map_from_world = R_z_from_axis(settings.up, cloud.up)
+    points = rotate_points(cloud.points.astype(np.float64), R_map_from_world).astype(np.float32)
     packed = pack_points(points, cloud.colors)
-    return LocalCloud(packed, R_local_from_world, cloud.origin_world, cloud.warnings)
+    return LocalCloud(R_map_from_world, cloud.origin_world, packed, cloud.warnings)

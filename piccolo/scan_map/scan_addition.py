@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
 from ..cloud.octree import Octree, build_octree
+from ..cloud.stream import CloudStream
 from ..cloud.surfaces import surface_variance
 from ..cloud.voxels import LEAF_SIZE, WINDOW, Voxels, join_voxels
 from ..errors import InputError
@@ -21,8 +22,7 @@ from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import BLOCK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
-from .named_scans import check_name
-from .scan_map import ScanMap, Voxelized, make_range_lookup, sparse_candidates
+from .scan_map import ScanMap, check_name, make_range_lookup, sparse_candidates
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -48,7 +48,7 @@ class Candidates(NamedTuple):
         return np.flatnonzero(self.fraction > LEAST_CHANGED)
 
 
-def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch: Stopwatch) -> ScanMap:
+def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watch: Stopwatch) -> ScanMap:
     """Add another scan in the same coordinates to a map, under a name of its own."""
     check_name(name, old.scan_names)
     with watch.stage("read"):
@@ -77,7 +77,7 @@ def add_scan(old: ScanMap, cloud: Voxelized, name: str, workers: Workers, watch:
         )
 
 
-def read_added_scan(old: ScanMap, cloud: Voxelized) -> tuple[Octree, tuple[str, ...]]:
+def read_added_scan(old: ScanMap, cloud: CloudStream) -> tuple[Octree, tuple[str, ...]]:
     """Read a scan into an octree of its own, in the map's frame; with warnings."""
     if old.octree.leaf_size != LEAF_SIZE:
         found = f"found a map of voxels of {old.octree.leaf_size} m"

@@ -1,8 +1,8 @@
-"""The map prepared once per cloud: octree, candidate camera positions, and their coarse views."""
+"""The map prepared once per cloud: octree, candidate camera positions, coarse views, names of its scans."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,14 +10,16 @@ from numpy.typing import NDArray
 from ..arrays import Array, Bytes, Int8s, Int64s, Mask
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
-from ..cloud.soa import PackedPoints, pack_points
+from ..cloud.soa import MapFrame, PackedPoints, pack_points
+from ..cloud.stream import CloudStream
 from ..cloud.surfaces import paint_shape, surface_variance
-from ..cloud.voxels import Voxels
+from ..confidence.localization import Localization
+from ..errors import InputError
 from ..geometry.pose import Pose
 from ..gravity.alignment import find_up, find_yaw_of_walls
 from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.feature_map import FeatureMap, Look, make_feature_map, view_positions
-from ..prior import NOTHING_KNOWN, Prior
+from ..photo import NOTHING_KNOWN, Prior
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, render_wide
 from ..views.view import ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
@@ -26,30 +28,15 @@ from .storeys import Storeys, find_storeys
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
 LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
-
-
-class Voxelized(Protocol):
-    """A cloud in memory, or in files that are read once again."""
-
-    @property
-    def up(self) -> UpAxis:
-        """Upward axis, as the file declares it."""
-
-    @property
-    def has_colors(self) -> bool:
-        """False if its colours are greys, by the intensity of the points or all alike."""
-
-    def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Average the points in each voxel, in axes rotated by a matrix (3, 3)."""
+MAX_NAME = 100  # characters
+MAX_SCANS = 1000  # of a map
 
 
 @dataclass(frozen=True)
-class ScanMap:
-    """A prepared cloud, in a frame of its own: x_map = R_map_from_world @ (x_world - origin_world), z up."""
+class ScanMap(MapFrame):
+    """A prepared cloud, in a frame of its own."""
 
     octree: Octree
-    R_map_from_world: Array  # (3, 3), identity where the cloud's z is up
-    origin_world: Array  # (3,) [m] middle of the leaves' box, in whole metres along the map's axes
     surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
     centers: Array  # (candidates, 3) [m]
     scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
@@ -113,17 +100,6 @@ class ScanMap:
         """Return the local features, made now if they were deferred."""
         return self.late(workers) if self.late else self.local_features
 
-    def to_world(self, pose: Pose) -> Pose:
-        """Transform a pose of the map's frame to the world."""
-        R_map_from_world = self.R_map_from_world
-        center_world = R_map_from_world.T @ pose.center_world + self.origin_world
-        return Pose(pose.R_cam_from_world @ R_map_from_world, center_world)
-
-    def from_world(self, pose: Pose) -> Pose:
-        """Transform a pose of the world to the map's frame."""
-        center = self.R_map_from_world @ (pose.center_world - self.origin_world)
-        return Pose(pose.R_cam_from_world @ self.R_map_from_world.T, center)
-
 
 def sparse_candidates(centers: Array) -> tuple[Int64s, Int64s]:
     """Return indices of the candidates (N, 3) [m] that come first in their cells of the coarse grid.
@@ -158,7 +134,7 @@ def find_candidates(
 
 
 def prepare_map(
-    cloud: Voxelized,
+    cloud: CloudStream,
     workers: Workers,
     up: UpAxis | Array = "auto",
     watch: Stopwatch | None = None,
@@ -263,3 +239,76 @@ def add_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
 def defer_features(scan_map: ScanMap) -> ScanMap:
     """Return the map such that it makes its local features when they are first needed."""
     return replace(scan_map, late=Once(lambda workers: find_local_features(scan_map, workers)))
+
+
+def is_name(name: str) -> bool:
+    """Return True for one line of text that can be printed."""
+    return 1 <= len(name) <= MAX_NAME and name.isprintable() and name == name.strip()
+
+
+def check_name(name: str, taken: Sequence[str]) -> None:
+    """Refuse an invalid or duplicate name of a scan, or one scan too many."""
+    if not is_name(name):
+        raise InputError(f"`name`: found {name[:200]!r}, wanted 1 to {MAX_NAME} printable characters")
+    if name in taken:
+        raise InputError(f"`name`: found {name!r}, which the map has already: {_list_names(taken)}")
+    if len(taken) >= MAX_SCANS:
+        raise InputError(f"`add`: found a map of {len(taken)} scans, the most that one holds")
+
+
+def name_scan(scan_map: ScanMap, name: str) -> ScanMap:
+    """Name the scan of a map of one scan."""
+    check_name(name, ())
+    if len(scan_map.scan_names) > 1:
+        raise InputError(f"`name`: found a map of several scans: {_list_names(scan_map.scan_names)}")
+    return replace(scan_map, scan_names=(name,), scan_of_candidate=np.zeros_like(scan_map.scan_of_candidate))
+
+
+def _list_names(names: Sequence[str]) -> str:
+    return ", ".join(map(repr, names))
+
+
+def check_within(scan_map: ScanMap, within: Sequence[str]) -> None:
+    """Refuse names that are not names of the map's scans."""
+    names = scan_map.scan_names
+    if within and not names:
+        wanted = "wanted a map of tools/prepare_map.py with `name`"
+        raise InputError(f"`within`: found a scan without names, {wanted}")
+    for name in within:
+        if name not in names:
+            raise InputError(f"`within`: found {name!r}, wanted of {_list_names(names)}")
+
+
+def candidates_within(scan_map: ScanMap, within: Sequence[str]) -> Mask:
+    """Return a mask (N,) of the candidates in the scans of these names."""
+    named_so = [k for k, name in enumerate(scan_map.scan_names) if name in within]
+    return np.isin(scan_map.scan_of_candidate, named_so)
+
+
+def find_scan_at(scan_map: ScanMap, center_map: Array) -> str | None:
+    """Return the scan in which a place (3,) lies, by the nearest candidate; None if there are no names."""
+    if not (scan_map.scan_names and len(scan_map.centers)):
+        return None
+    offsets = scan_map.centers - center_map
+    nearest = np.einsum("ij,ij->i", offsets, offsets).argmin()
+    return scan_map.scan_names[int(scan_map.scan_of_candidate[nearest])]
+
+
+def add_places(scan_map: ScanMap, found: Localization) -> Localization:
+    """Return a result with the scans, the storey (from 1, the lowest) and the height above the floor."""
+    pose = found.pose
+    if pose is None:
+        return found
+    (storey,), (height,) = scan_map.storeys.at(scan_map.from_world(pose).center_world[None])
+    if storey >= 0:
+        found = replace(found, storey=int(storey) + 1, height_above_floor=round(float(height), 4))
+    if not scan_map.scan_names:
+        return found
+
+    alternatives = tuple(replace(a, scan=scan_of(scan_map, a.pose)) for a in found.alternatives)
+    return replace(found, scan=scan_of(scan_map, pose), alternatives=alternatives)
+
+
+def scan_of(scan_map: ScanMap, pose: Pose) -> str | None:
+    """Return the scan in which a pose of the world lies."""
+    return find_scan_at(scan_map, scan_map.from_world(pose).center_world)

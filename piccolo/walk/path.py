@@ -21,8 +21,7 @@ from ..arrays import Array, Mask
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, carry
 from ..scan_map.free_space import FreeSpace
-from .frames import MOST_EXPECTED, MOST_ODDS, Frame, State, state_centers
-from .motion import JUMP_LOG, REACH_SLACK, Motion
+from .frames import JUMP_LOG, MOST_EXPECTED, MOST_ODDS, REACH_SLACK, Frame, Motion, State, state_centers
 
 EVEN = 0.5  # less is not sure
 COPY_LOG_ODDS = 3.0  # copies of a place differ by less (2.1 in 50 probes), if one of them was scanned better

@@ -10,10 +10,8 @@ import numpy as np
 
 from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import MODELS, Standing, pose_features, posterior
-from ..geometry.nearness import ONE_ANSWER, ONE_PLACE
-from ..geometry.pose import Pose, carry, exp_so3, log_so3
-from ..geometry.rotations import uniform_yaws
-from ..geometry.suppression import non_maximum_suppression
+from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
+from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..localization.attempts import is_whole
 from ..localization.beam import Ends, brief_query, descend_briefly, score_briefly, score_mirror, score_near
@@ -31,15 +29,16 @@ from ..scan_map.scan_map import ScanMap
 from .frames import (
     MOST_EXPECTED,
     MOST_ODDS,
+    REACH_SLACK,
     Frame,
     How,
+    Motion,
     State,
     list_states,
     log_odds_of_place,
     log_ratio,
     put_state,
 )
-from .motion import REACH_SLACK, Motion
 from .path import COPY_LOG_ODDS, EVEN, Lattice
 
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own

@@ -7,18 +7,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piccolo.arrays import Array
-from piccolo.cloud import open_cloud
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.soa import pack_points
+from piccolo.cloud.stream import open_cloud
 from piccolo.confidence.occlusion import VIEW_WIDTH, measure_agreement
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
-from piccolo.scene import Query, Scene
 
-from .files import AXES
+from ..scene import Query, Scene
+from .model import AXES
 
 MIN_SCORE = 0.1  # other views of the same place may have as much, but seldom more than the right one
 AS_GIVEN = "as given"

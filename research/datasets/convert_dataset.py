@@ -13,25 +13,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from piccolo.cli.checks import check_folder_name, check_least
-from piccolo.cli.command import HelpFormatter, add_run_options, command, option
+from piccolo.cli.command import (
+    HelpFormatter,
+    add_run_options,
+    check_folder_name,
+    check_least,
+    command,
+    option,
+)
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, workers_from
-from piccolo.cloud import open_source
 from piccolo.cloud.readers.reader import CHUNK
 from piccolo.cloud.settings import IN_COLORS
-from piccolo.cloud.stream import PointValidator
+from piccolo.cloud.stream import PointValidator, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.errors import InputError, unreadable
 from piccolo.files.atomic import check_output_folder, replacing_folder, write_atomically
 from piccolo.geometry.pose import move, transform_points
 from piccolo.jobs.threads import Progress, Workers
-from piccolo.scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from piccolo.views.pictures import encode_image
 
+from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
 from . import generic, research, stanford
 from .checking import check_scene
-from .files import AXES, DIRECTIONS
-from .model import ConvertOptions, PosedPanorama, SceneList, SceneSpec
+from .model import AXES, DIRECTIONS, ConvertOptions, PosedPanorama, SceneList, SceneSpec
 
 DATASETS = {  # a line on each, and what finds its scenes
     stanford.NAME: ("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.list_scenes),

@@ -13,8 +13,19 @@ from piccolo.files.json_file import read_json, read_text
 from piccolo.geometry.pose import Pose, rotation_from_quaternion_wxyz
 from piccolo.panorama.cube import SUFFIXES
 
-from .files import AXES, DIRECTIONS, WORLD_FROM_CAM, array_of, only_cloud_in, pose_of_transform
-from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec
+from .model import (
+    AXES,
+    DIRECTIONS,
+    WORLD_FROM_CAM,
+    CloudPart,
+    ConvertOptions,
+    PosedPanorama,
+    SceneList,
+    SceneSpec,
+    array_of,
+    only_cloud_in,
+    pose_of_transform,
+)
 
 NAME = "generic"
 LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")

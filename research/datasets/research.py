@@ -14,8 +14,20 @@ from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.panorama.cube import SUFFIXES
 
-from .files import WORLD_FROM_CAM, array_of, is_cloud, only_cloud_in, pose_of_transform, read_matrix
-from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
+from .model import (
+    WORLD_FROM_CAM,
+    CloudPart,
+    ConvertOptions,
+    PosedPanorama,
+    SceneList,
+    SceneSpec,
+    array_of,
+    is_cloud,
+    only_cloud_in,
+    pose_of_transform,
+    read_matrix,
+    scene_list,
+)
 
 LOC360 = "360loc"
 QUERIES = "query_360"

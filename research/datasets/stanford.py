@@ -16,8 +16,18 @@ from piccolo.errors import InputError
 from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, move
 
-from .files import WORLD_FROM_CAM, array_of, labels_by_index, pose_of_transform
-from .model import CloudPart, ConvertOptions, PosedPanorama, SceneList, SceneSpec, scene_list
+from .model import (
+    WORLD_FROM_CAM,
+    CloudPart,
+    ConvertOptions,
+    PosedPanorama,
+    SceneList,
+    SceneSpec,
+    array_of,
+    labels_by_index,
+    pose_of_transform,
+    scene_list,
+)
 
 NAME = "stanford2d3ds"
 # As most users of S3DIS number them, less one: theirs begin at 0. Other names, <UNK> among them, are 0.

@@ -14,15 +14,17 @@ import numpy as np
 
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, options
-from piccolo.cli.checks import (
+from piccolo.cli.command import (
+    Terminated,
     UsageError,
     check_distinct,
     check_least,
     check_outputs,
     check_suffix,
     checking_options,
+    command,
+    option,
 )
-from piccolo.cli.command import Terminated, command, option
 from piccolo.cli.execution import Interruption
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, print_report, progress_bar
 from piccolo.errors import InputError
@@ -34,8 +36,8 @@ from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan, settings_json
 from piccolo.result import UNREADABLE, check_scan, describe_failure, read_results
 from piccolo.scan_map.open_map import scan_sha256_of
-from piccolo.scene import Query, Scene, find_scenes, input_files
 
+from ..scene import Query, Scene, find_scenes, input_files
 from . import query_result, tables
 from .plots import errors_figure, figure_png, risk_figure
 from .query_result import QueryResult, Thresholds
@@ -193,9 +195,8 @@ def run_scenes(
         found = ((s, [q for q in s.queries if (s.name, s.name_of(q)) in open_keys]) for s in scenes)
         if left := [(scene, queries) for scene, queries in found if queries]:
             file.cut(size)
-            num_jobs = execution.count_jobs(arguments, max(len(queries) for _, queries in left))
             with (
-                execution.connecting(arguments, num_jobs) as cluster,
+                execution.connecting(arguments) as cluster,
                 execution.interruptible() as interruption,
             ):
                 for scene, queries in left:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from piccolo.optional import new_figure
+from piccolo.optional import import_optional
 
 from .query_result import QueryResult, Thresholds
 from .tables import Point
@@ -16,6 +16,11 @@ Figure = Any  # of matplotlib, which is imported when one is drawn
 POSITIONS = (1e-4, 30.0)  # of the axis [m]
 ROTATIONS_DEG = (1e-3, 180.0)
 SHOWN_ANGLES_DEG = (1.0, 5.0, 10.0)  # at which recall over distance is drawn
+
+
+def new_figure(**options: Any) -> Figure:
+    """Return an empty figure that belongs to no window, by matplotlib, whose import takes half a second."""
+    return import_optional("a plot", "matplotlib.figure", "tools").Figure(**options)
 
 
 def figure_png(figure: Figure) -> bytes:

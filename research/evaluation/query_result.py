@@ -19,7 +19,8 @@ from piccolo.files.line_file import whole_size
 from piccolo.geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose, pose_errors
 from piccolo.opened_scan import OpenedScan
 from piccolo.result import Result
-from piccolo.scene import Query, Scene, document_of_pose, pose_of
+
+from ..scene import Query, Scene, document_of_pose, pose_of
 
 FORMAT = "piccolo-evaluation/2"
 WANTED = "wanted a run of tools/evaluate.py"
@@ -125,8 +126,8 @@ def make_query_result(scene: Scene, query: Query, result: Result, is_in_box: boo
 
 def is_in_box(scan: OpenedScan, pose: Pose) -> bool:
     """Return True if a pose lies in the bounding box of the scan's points (the paper's protocol)."""
-    points = scan.points
-    center: Array = scan.from_world(pose).center_world
+    points = scan.prepared.points
+    center: Array = scan.prepared.from_world(pose).center_world
     axes = zip(center, (points.x, points.y, points.z), strict=True)
     return all(bool(axis.min() <= value <= axis.max()) for value, axis in axes)
 

@@ -13,8 +13,8 @@ from piccolo.arrays import Array
 from piccolo.errors import printable
 from piccolo.export.formats import cell
 from piccolo.result import Result
-from piccolo.scene import Query, Scene
 
+from ..scene import Query, Scene
 from .query_result import PAPER_THRESHOLDS, QueryResult, Thresholds, make_query_result
 
 HUGE = 1e30  # stands for an error without a pose while quartiles are interpolated

@@ -18,25 +18,23 @@ from scipy.ndimage import minimum_filter
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Array, Int64s, Mask
-from piccolo.cli.checks import check_outputs, check_suffix, checking_options
-from piccolo.cli.command import command, option
+from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
 from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
 from piccolo.files.atomic import write_atomically
-from piccolo.geometry.rotations import uniform_rotations, uniform_yaws
+from piccolo.geometry.pose import uniform_rotations, uniform_yaws
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.sampling_loss import sampling_loss
-from piccolo.optional import new_figure
 from piccolo.panorama import read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels
 from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
-from piccolo.scene import read_scene
 from piccolo.views.zbuffer import is_free_space, visible_points
 
-from ..evaluation.plots import figure_png
+from ..evaluation.plots import figure_png, new_figure
+from ..scene import read_scene
 
 POOL_PER_POINT = 8  # points of which visible ones are taken, for one that is used
 FREE_SPACE_WIDTH = 32  # [px] of the view that tests for free space
@@ -115,7 +113,7 @@ def surface_png(
     surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: KnownPoses, title: str
 ) -> bytes:
     """Draw the surface over the plan, with the known poses marked, and return the PNG."""
-    shift = cloud.R_local_from_world @ cloud.origin_world  # (3,) [m] to the plan, with the world's origin
+    shift = cloud.R_map_from_world @ cloud.origin_world  # (3,) [m] to the plan, with the world's origin
     x = grid.x + shift[0]
     y = grid.y + shift[1]
     aspect = (y[-1] - y[0] + 1.0) / (x[-1] - x[0] + 1.0)

@@ -19,26 +19,31 @@ import numpy as np
 from piccolo import CoarseToFineSettings, InputError, PaperSettings, Photo
 from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
-from piccolo.cli.checks import check_distinct, check_folder_name, check_least, checking_options
-from piccolo.cli.command import command, option
+from piccolo.cli.command import (
+    check_distinct,
+    check_folder_name,
+    check_least,
+    checking_options,
+    command,
+    option,
+)
 from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
 from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
-from piccolo.cloud import read_cloud
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
-from piccolo.cloud.writers import vertex_rows, write_ply
+from piccolo.cloud.stream import open_cloud
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.colors import Labels
-from piccolo.geometry.pose import Pose, move, transform_points
-from piccolo.geometry.rotations import random_rotation
+from piccolo.geometry.pose import Pose, move, rotation_from_quaternion_wxyz, transform_points
 from piccolo.jobs.memory import limit_memory
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.open_map import CachePolicy
-from piccolo.scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 
 from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import statistics, table_of
+from ..scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 from ..synthetic.photos import UPSIDE_DOWN
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
@@ -52,7 +57,7 @@ def identity(scene: Scene, folder: Path) -> Scene:
 
 def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | None = None) -> Scene:
     """Return a number or a fraction of the points, drawn at random; InputError where there are fewer."""
-    cloud = read_cloud(scene.cloud, IN_COLORS)
+    cloud = open_cloud([scene.cloud], IN_COLORS).read()
     count = num_points or max(1, round(fraction * len(cloud.points)))
     if count > len(cloud.points):
         raise InputError(f"{scene.cloud}: found {len(cloud.points)} points, wanted at least {count}")
@@ -63,9 +68,9 @@ def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | No
 
 def with_random_rotation(scene: Scene, folder: Path) -> Scene:
     """Return the cloud turned by a rotation drawn from all of SO(3), the true poses with it."""
-    cloud = read_cloud(scene.cloud, IN_COLORS)
+    cloud = open_cloud([scene.cloud], IN_COLORS).read()
     T = np.eye(4)
-    T[:3, :3] = random_rotation(_rng(scene))
+    T[:3, :3] = rotation_from_quaternion_wxyz(_rng(scene).normal(size=4))
     points = transform_points(cloud.points.astype(np.float64) + cloud.origin_world, T)
     queries = tuple(replace(query, pose=move(query.pose, T, 1.0)) for query in scene.queries)
     return replace(scene, cloud=_write_cloud(folder, points, cloud.colors), queries=queries)
@@ -73,7 +78,8 @@ def with_random_rotation(scene: Scene, folder: Path) -> Scene:
 
 def _write_cloud(folder: Path, points: Array, colors: Bytes) -> Path:
     path = folder / CLOUD_NAME
-    write_ply(path, vertex_rows(points, colors))
+    with writing_ply(path) as writer:
+        writer.add(vertex_rows(points, colors))
     return path
 
 

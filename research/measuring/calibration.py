@@ -16,11 +16,11 @@ from piccolo.confidence import confidence
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED, ChoiceModel, EvidenceKind, Standing
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
-from piccolo.geometry.pose import is_correct
+from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose_gaussian import subtract
-from piccolo.scene import pose_of
 
 from ..evaluation.tables import Table, reliability_table
+from ..scene import pose_of
 
 EPILOG = """\
 example:
@@ -78,7 +78,7 @@ def read_outcome(line: str) -> Outcome | None:
     if trial["truth"] is not None:
         true_pose = pose_of(trial["truth"])
         error = subtract(true_pose, poses[0])
-        right = next((k for k, pose in enumerate(poses) if is_correct(pose, true_pose)), right)
+        right = next((k for k, pose in enumerate(poses) if RIGHT.holds(pose, true_pose)), right)
     is_refused = trial["probabilities"][-1] == 1.0
     return Outcome(str(trial["case"]), standings, covariance, trial["std_of_fit"], right, is_refused, error)
 

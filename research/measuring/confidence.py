@@ -10,16 +10,15 @@ import numpy as np
 from piccolo import CoarseToFineSettings, Photo
 from piccolo.cli.command import option
 from piccolo.cli.terminal import print_note
-from piccolo.cloud import read_cloud
-from piccolo.cloud.stream import stream_of_arrays
+from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.confidence.localization import Localization
-from piccolo.geometry.pose import is_correct
+from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
-from piccolo.scene import Scene, document_of_pose, read_scene
 
+from ..scene import Scene, document_of_pose, read_scene
 from ..synthetic.layout import PLAIN
 from ..synthetic.photos import change_sensor, cut_photo, occlude
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
@@ -100,7 +99,7 @@ def _make_trial(world: World, case: str, variant: str, workers: Workers, index: 
 
 def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points, list[Trial]]]:
     """Try every panorama of every scene in one scene's cloud; its own also spoilt, and in a thinned cloud."""
-    cloud = read_cloud(scene.cloud)
+    cloud = open_cloud([scene.cloud]).read()
     rng = np.random.default_rng([len(scene.queries), 52])
     own = [Trial(query.variant, read_panorama(query.image).rgb, query.pose) for query in scene.queries]
     upright = [trial for trial in own if trial.case == "clean"]
@@ -114,7 +113,7 @@ def scene_trials(scene: Scene, others: Sequence[Scene]) -> Iterator[tuple[Points
 
 def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator[tuple[Points, list[Trial]]]:
     """Cut `number` photos out of each panorama of every scene, and try them in one scene's cloud."""
-    cloud = read_cloud(scene.cloud)
+    cloud = open_cloud([scene.cloud]).read()
     rng = np.random.default_rng([len(scene.queries), 54])
     trials = []
     for one in (scene, *others):
@@ -191,7 +190,7 @@ def run(arguments: Namespace) -> int:
             for trial in trials:
                 found = localize_trial(scan_map, trial, workers)
                 truth = trial.true_pose
-                ok = truth is not None and is_correct(found.pose, truth)
+                ok = bool(truth and found.pose and RIGHT.holds(found.pose, truth))
                 rows.append((trial.case, found.status, ok))
                 file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
                 file.flush()

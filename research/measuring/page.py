@@ -17,18 +17,17 @@ from scipy.stats import chi2
 import piccolo
 from piccolo import InputError, PaperSettings, Pose, Result
 from piccolo.arrays import Bytes
-from piccolo.cli.checks import check_least
-from piccolo.cli.command import option
+from piccolo.cli.command import check_least, option
 from piccolo.cli.terminal import print_note
-from piccolo.cloud import read_cloud
+from piccolo.cloud.stream import open_cloud
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose_gaussian import subtract
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.panorama import read_panorama
-from piccolo.scene import Query, Scene, read_scene
 
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
+from ..scene import Query, Scene, read_scene
 from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
 from ..synthetic.world import make_query, make_world
 from .speed import clean_queries, kernel_table, size_table
@@ -180,7 +179,7 @@ class Bench:
                 name = f"{scene.name}/{query.image.name}"
                 result = scan.localize(piccolo.Photo(trial.rgb, mask=trial.is_masked))
                 self.add("damage", trial.case, name, trial.true_pose, result)
-        cloud = read_cloud(scene.cloud)
+        cloud = open_cloud([scene.cloud]).read()
         points: Points = (cloud.points + cloud.origin_world, cloud.colors)
         for label, change in DAMAGED_SCANS.items():
             damaged_points, colors = change(points, np.random.default_rng(61))
@@ -232,7 +231,7 @@ class Bench:
         if self.of_panoramas and "kernels" in self.arguments.only:
             scene = self.of_panoramas[0]
             rgb = read_panorama(scene.queries[0].image).rgb
-            speeds = kernel_table(read_cloud(scene.cloud), rgb)
+            speeds = kernel_table(open_cloud([scene.cloud]).read(), rgb)
             yield f"{PARTS['kernels']}\n{speeds.markdown()}"
 
     def note(self, text: str) -> None:

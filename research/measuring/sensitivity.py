@@ -17,12 +17,12 @@ from piccolo.cli.terminal import print_note
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.confidence.localization import Localization
-from piccolo.geometry.pose import is_correct
+from piccolo.geometry.nearness import RIGHT
 from piccolo.jobs.threads import Workers, num_cores
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
-from piccolo.scene import read_scene
 
 from ..evaluation.tables import table_of
+from ..scene import read_scene
 from .confidence import localize_trial, photo_trials, room_trials, scene_trials
 from .trials import Trial
 
@@ -127,7 +127,7 @@ def measure(places: Sequence[Place], workers: Workers) -> Measured:
             found = localize_trial(scan_map, trial, workers)
             measured.found.append(found)
             truth = trial.true_pose
-            if truth and found.pose and is_correct(found.pose, truth):
+            if truth and found.pose and RIGHT.holds(found.pose, truth):
                 measured.errors_m.append(found.pose.distance(truth))
             else:
                 measured.errors_m.append(math.nan)

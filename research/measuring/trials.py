@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from piccolo.arrays import Bytes, Floats, Mask
-from piccolo.geometry.pose import Pose
-from piccolo.geometry.rotations import Gravity
+from piccolo.geometry.pose import Gravity, Pose
 
 from ..synthetic import photos
 

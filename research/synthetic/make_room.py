@@ -8,13 +8,19 @@ from pathlib import Path
 
 import numpy as np
 
-from piccolo import scene as scenes
 from piccolo.camera import Calibration
 from piccolo.camera.calibration import read_cameras
-from piccolo.cli.checks import UsageError, check_folder_name, check_least, checking_options, refuse_given
-from piccolo.cli.command import command, option
+from piccolo.cli.command import (
+    UsageError,
+    check_folder_name,
+    check_least,
+    checking_options,
+    command,
+    option,
+    refuse_given,
+)
 from piccolo.cli.terminal import workers_from
-from piccolo.cloud.writers import vertex_rows, write_ply
+from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.export.formats import tum_lines, write_lines
 from piccolo.files.atomic import write_atomically
 from piccolo.jobs.threads import Workers
@@ -22,6 +28,7 @@ from piccolo.optional import import_optional
 from piccolo.panorama.video import writing_video
 from piccolo.views.pictures import encode_image
 
+from .. import scene as scenes
 from . import world as worlds
 from .office import Office, make_office
 from .walk_frames import BAD_KINDS, WalkOptions, frames_of
@@ -188,7 +195,8 @@ def write_scene(
     (folder / "images").mkdir(parents=True, exist_ok=True)
     points, colors, labels = worlds.scan_world(world, num_points, workers)
     rows = vertex_rows(points, colors, label=labels.astype(np.int32) if arguments.labels else None)
-    write_ply(folder / scenes.CLOUD_NAME, rows)
+    with writing_ply(folder / scenes.CLOUD_NAME) as writer:
+        writer.add(rows)
     if office is not None and arguments.walk:
         queries = write_walks(arguments, office, folder, workers)
     else:

@@ -16,8 +16,7 @@ from piccolo.arrays import Array, Array32, Bytes, Int64s
 from piccolo.camera import Calibration, Mount
 from piccolo.camera.calibration import compute_extent
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.geometry.rotations import uniform_rotations
+from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Workers
 

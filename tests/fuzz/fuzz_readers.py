@@ -14,15 +14,15 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from piccolo.batch.priors import read_priors
 from piccolo.camera.calibration import read_cameras, read_rig
-from piccolo.cloud import FORMATS
 from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
-from piccolo.prior import Prior
+from piccolo.photo import Prior
 from piccolo.result import Result
 from piccolo.scan_map.map_file import load_map
-from piccolo.scene import read_scene
+from research.scene import read_scene
 
 READERS = {suffix[1:]: form.open_source for form in FORMATS for suffix in form.suffixes}
 OTHERS = {

@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from .camera import Calibration, Mount
-from .camera.calibration import document_of, read_mounts
-from .errors import InputError
-from .files.atomic import write_atomically
-from .files.json_file import DAMAGE, describe, read_json
-from .geometry.pose import Pose, check_pose
-from .geometry.sphere import CONVENTION
+from piccolo.camera import Calibration, Mount
+from piccolo.camera.calibration import document_of, read_mounts
+from piccolo.errors import InputError
+from piccolo.files.atomic import write_atomically
+from piccolo.files.json_file import DAMAGE, describe, read_json
+from piccolo.geometry.pose import Pose, check_pose
+from piccolo.geometry.sphere import CONVENTION
 
 QUERIES_NAME = "queries.json"
 CLOUD_NAME = "cloud.ply"

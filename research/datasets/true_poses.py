@@ -1,0 +1,72 @@
+"""Write the true poses of scenes as results of localize.py, or those of an aligned scan beside it."""
+
+from argparse import ArgumentParser, Namespace
+from dataclasses import replace
+
+import numpy as np
+
+from piccolo import InputError, Result
+from piccolo.batch.results_file import write_results
+from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
+from piccolo.confidence.confidence import LOCALIZED
+from piccolo.files.json_file import read_text
+from piccolo.geometry.pose import move
+
+from ..scene import QUERIES_NAME, Scene, find_scenes, input_files, write_queries
+
+EPILOG = """\
+examples:
+  python tools/true_poses.py --scenes raw --out true.jsonl
+  python tools/export_poses.py --results true.jsonl --format colmap --images raw --out model
+  python tools/true_poses.py --scenes raw --transform aligned/cloud.txt --out aligned/queries.json
+
+The lines are those of photos localized beyond doubt, for all tools that take --results. --transform is the
+file that tools/align_gravity.py has written beside an aligned cloud of one scene.
+"""
+WANTED = "wanted four rows of four numbers, as tools/align_gravity.py writes them"
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--scenes FOLDER ...", "scenes with true poses (docs/DATASETS.md)", required=True)
+    option(parser, "--transform FILE", "write the queries.json of a scene under this transform")
+    option(parser, "--metres-per-unit X", "unit of the transform's translation [m]", default=1.0)
+    option(parser, "--out FILE", "JSON lines; with --transform a queries.json", required=True)
+
+
+def true_results(scene: Scene) -> list[Result]:
+    """Return true poses of a scene, as if they had been found beyond doubt."""
+    cloud = str(scene.cloud)
+    return [
+        Result(LOCALIZED, 1.0, cloud, str(query.image), query.pose, cameras=query.cameras)
+        for query in scene.queries
+    ]
+
+
+def write_moved(arguments: Namespace, scene: Scene) -> None:
+    """Write a scene's queries in the coordinates of the cloud beside the transform."""
+    rows = read_text(arguments.transform, WANTED).splitlines()
+    try:
+        T = np.array([row.split() for row in rows], np.float64).reshape(4, 4)
+    except ValueError as error:
+        raise InputError(f"{arguments.transform}: found {error}, {WANTED}") from error
+    moved = [replace(q, pose=move(q.pose, T, arguments.metres_per_unit)) for q in scene.queries]
+    write_queries(arguments.out.parent, moved, cloud=arguments.transform.with_suffix(".ply").name)
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: Namespace) -> int:
+    """Read and write."""
+    with checking_options():
+        if arguments.transform and arguments.out.name != QUERIES_NAME:
+            raise InputError(f"--out {arguments.out}: wanted a file {QUERIES_NAME} with --transform")
+        check_suffix("--out", arguments.out, (".jsonl", ".json"))
+    scenes = find_scenes(arguments.scenes)
+    check_outputs({"--out": arguments.out}, input_files(scenes))
+    if arguments.transform:
+        if len(scenes) > 1:
+            raise InputError(f"--transform: found {len(scenes)} scenes, wanted one")
+        write_moved(arguments, scenes[0])
+    else:
+        write_results(arguments.out, [result for scene in scenes for result in true_results(scene)])
+    return 0
