@@ -233,7 +233,7 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
 ):
     """As many matches as a clear whole view is worth, and no pose of the first look near it."""
     looked = at(9, 0.2)
-    monkeypatch.setattr(attempts, "match_poses", lambda query: [] if num_matches is None else ["pose"])
+    monkeypatch.setattr(attempts, "match_poses", lambda query, watch: [] if num_matches is None else ["pose"])
     monkeypatch.setattr(attempts, "count_matches", lambda matches, pose: num_matches)
     monkeypatch.setattr(attempts, "is_sure", lambda query, found: found[0] is looked and is_sure)
     monkeypatch.setattr(attempts, "refine_matches", lambda query, poses: [at(num_parts, 0.5)])

@@ -9,7 +9,7 @@ import pytest
 import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
-from piccolo.jobs.threads import Workers
+from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import Matches
@@ -140,7 +140,9 @@ def test_matches_beyond_a_prior_are_asked_too():
     query, world = _query(1), rooms.query(1).pose
     x, y, _ = world.center_world
     prior = Prior(near=(x + 1.4, y, None), radius=0.5)
-    poses = match_poses(replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)))
+    poses = match_poses(
+        replace(query, settings=CoarseToFineSettings(gravity="known", prior=prior)), Stopwatch()
+    )
     assert any(rooms.errors(pose, _true_pose(1))[0] < 0.1 for pose in poses)
 
 

@@ -18,6 +18,7 @@ from rooms import scan_map
 from piccolo.cloud.settings import IN_METRES
 from piccolo.files import cache
 from piccolo.jobs.threads import Once, Stopwatch, Workers
+from piccolo.localization.attempts import match_poses
 from piccolo.opening import Cloud, open_scan
 from piccolo.scan_map import map_file, open_map, scan_map as making
 from piccolo.scan_map.map_file import load_map, save_map
@@ -266,6 +267,20 @@ def test_the_cache_keeps_them_for_the_next_process(opened, finding):
     other = opened()
     assert not other.lacks_features
     np.testing.assert_array_equal(other.features_now(WORKERS).points, first.features_now(WORKERS).points)
+    assert finding == [1]
+
+
+def test_looking_for_them_is_told_and_is_no_work_on_the_photo(opened, finding, caplog):
+    first, watch = opened(), Stopwatch()
+    query = rooms.ask(rooms.scene(1)[1], first)
+    with caplog.at_level("INFO", "piccolo"):
+        poses = match_poses(query, watch)
+    assert "tools/prepare_map.py" in caplog.text
+    assert not first.awaits_features
+    assert sorted(watch.seconds) == ["match", "prepare"]
+    again = Stopwatch()
+    assert [p.key for p in match_poses(query, again)] == [p.key for p in poses]
+    assert list(again.seconds) == ["match"]
     assert finding == [1]
 
 

@@ -102,8 +102,7 @@ def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) ->
 
 def search_part(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Search by a part of the features; its poses are dropped unless they are sure: all find better ones."""
-    with watch.stage("match"):
-        poses = match_poses(query)
+    poses = match_poses(query, watch)
     if not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES:
         return known, False
     found, is_enough = refine_matched(query, poses, known, watch)
@@ -112,9 +111,7 @@ def search_part(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Pose
 
 def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Refine the poses that feature matches vote for; True if the result is sure."""
-    with watch.stage("match"):
-        poses = match_poses(query)
-    return refine_matched(query, poses, known, watch)
+    return refine_matched(query, match_poses(query, watch), known, watch)
 
 
 def refine_matched(query: Query, poses: list[Pose], known: list[Hypothesis], watch: Stopwatch) -> Poses:
@@ -164,11 +161,15 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
     return search_and_refine(anywhere, "known", FIRST_BEAM, watch)
 
 
-def match_poses(query: Query) -> list[Pose]:
+def match_poses(query: Query, watch: Stopwatch) -> list[Pose]:
     """Return poses from feature matches, best first; without whole views, those that the prior allows."""
+    if query.scan_map.awaits_features:
+        with watch.stage("prepare"):
+            query.scan_map.features_now(query.workers)
     is_level = query.settings.gravity == "known" and (query.photo.has_tilt or not query.photo.is_partial)
     level = query.photo.R_cam_from_level if is_level else None
-    poses = [f.pose for f in propose_poses(query.matches, level, NUM_MATCHED, query.workers)]
+    with watch.stage("match"):
+        poses = [f.pose for f in propose_poses(query.matches, level, NUM_MATCHED, query.workers)]
     if query.method.uses_search:
         return poses
     return [pose for pose in poses if not contradictions(query.scan_map, pose, query.settings.prior)]

@@ -25,9 +25,8 @@ from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
-from ..geometry.pose import Pose
+from ..geometry.pose import Pose, uniform_yaws
 from ..geometry.pose_gaussian import PoseGaussian, std_of
-from ..geometry.rotations import uniform_yaws
 from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine

@@ -1,5 +1,6 @@
 """The map prepared once per cloud: octree, candidate camera positions, coarse views, names of its scans."""
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -25,6 +26,7 @@ from ..views.view import ranges_around
 from .camera_positions import COARSE_SPACING, Ball, TooManyPositionsError, candidate_centers
 from .storeys import Storeys, find_storeys
 
+LOG = logging.getLogger("piccolo")
 SHAPE_ALONE = "photos are localized by the shape of the scan, without colours"
 LEAST_DEVIATION = 0.004  # of luminance, by rounding colours to 8 bits
 MAX_TILT = np.radians(5.0)  # of the floors to the axis taken for up; a larger one is warned of
@@ -95,6 +97,11 @@ class ScanMap(MapFrame):
     def lacks_features(self) -> bool:
         """True if no view was searched for local features, though there are candidates."""
         return len(self.local_features.view_centers) == 0 < len(self.centers) and not self.has_shape
+
+    @property
+    def awaits_features(self) -> bool:
+        """True if the local features are made when they are next asked for."""
+        return self.late is not None and not self.late.is_known
 
     def features_now(self, workers: Workers) -> FeatureMap:
         """Return the local features, made now if they were deferred."""
@@ -238,7 +245,12 @@ def add_features(scan_map: ScanMap, workers: Workers) -> ScanMap:
 
 def defer_features(scan_map: ScanMap) -> ScanMap:
     """Return the map such that it makes its local features when they are first needed."""
-    return replace(scan_map, late=Once(lambda workers: find_local_features(scan_map, workers)))
+
+    def find(workers: Workers) -> FeatureMap:
+        LOG.info("looking for local features of the scan, once; a map of tools/prepare_map.py has them")
+        return find_local_features(scan_map, workers)
+
+    return replace(scan_map, late=Once(find))
 
 
 def is_name(name: str) -> bool:
