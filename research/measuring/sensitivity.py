@@ -51,12 +51,12 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.comparison": ("LEAST_SHARED",),
     "localization.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
     "localization.focal_length": ("CLEARLY", "EDGE_ERROR", "INFLATION", "MATCHED_DEVIATION", "NEXT_REACH"),
-    "localization.judge": ("ENOUGH_EXPLAINED", "MIRROR_RATIO"),
+    "localization.judge": ("ENOUGH_EXPLAINED", "MIRROR_RATIO", "WORTH_ASKING"),
     "localization.ladder": ("MAX_PERTURBATIONS", "MIN_GAIN", "PERTURBED_ANGLE", "PERTURBED_DISTANCE"),
     "localization.last_descent": ("FAINT_MATCHES", "FAINT_SCORE", "NEAR_MATCHES", "NEAR_SCORE"),
     "localization.search": ("CANDIDATES_PER_START", "POSES_PER_START"),
-    "localization.selection": ("CLEAR_MARGIN", "CLEAR_SCORE", "SURE_MARGIN", "SURE_MATCHES", "SURE_SCORE"),
-    "localization.verification": ("COS_AGREE", "DISTINCT_RATIO"),
+    "localization.selection": ("CLEAR_MARGIN", "CLEAR_SCORE", "SURE_ODDS", "SURE_SCORE", "SURE_WHOLE"),
+    "localization.verification": ("COS_AGREE", "DISTINCT_RATIO", "MOST_PICTURES", "RIVAL_SCORE", "SURE_MATCHES"),
     "local_features.hypotheses": ("MAX_VOTERS", "NUM_CLUSTERS"),
 }
 
