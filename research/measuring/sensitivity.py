@@ -56,7 +56,13 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.last_descent": ("FAINT_MATCHES", "FAINT_SCORE", "NEAR_MATCHES", "NEAR_SCORE"),
     "localization.search": ("CANDIDATES_PER_START", "POSES_PER_START"),
     "localization.selection": ("CLEAR_MARGIN", "CLEAR_SCORE", "SURE_ODDS", "SURE_SCORE", "SURE_WHOLE"),
-    "localization.verification": ("COS_AGREE", "DISTINCT_RATIO", "MOST_PICTURES", "RIVAL_SCORE", "SURE_MATCHES"),
+    "localization.verification": (
+        "COS_AGREE",
+        "DISTINCT_RATIO",
+        "MOST_PICTURES",
+        "RIVAL_SCORE",
+        "SURE_MATCHES",
+    ),
     "local_features.hypotheses": ("MAX_VOTERS", "NUM_CLUSTERS"),
 }
 
