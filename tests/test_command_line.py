@@ -112,7 +112,8 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
 
     monkeypatch.setattr(localize.Localizer, "open_scan", opened)
     run = localize.prepare_run(_parse(*["--quiet"] * quiet))
-    localize.open_scan(run, run.localizer, 1)
+    with terminal.showing_log(quiet):
+        localize.open_scan(run, run.localizer, 1)
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: set --up to -y\n")
 
 
