@@ -164,4 +164,5 @@ def test_without_features_the_search_finds_the_pose():
     assert rooms.errors(result.pose, rooms.query(1).pose)[0] < 0.02
     unsure = rooms.locate(rooms.scene(1)[1], featureless, replace(settings, gravity="unknown"))
     assert rooms.errors(unsure.pose, rooms.query(1).pose)[0] < 0.02
-    assert (unsure.evidence.num_matches, unsure.evidence.alternative_matches) == (0, 0)
+    assert unsure.evidence.num_matches > 40  # with the drawn scan
+    assert unsure.evidence.alternative_matches < 6

@@ -42,7 +42,7 @@ class Line(NamedTuple):
 
     @property
     def is_doubtful(self) -> bool:
-        """True if it may be surer beside others, or was not sure before it was looked at beside others."""
+        """True for a photo of a camera that is not localized, or was not before others were beside it."""
         was_doubtful = self.beside is not None or self.status in (AMBIGUOUS, NOT_LOCALIZED)
         return self.has_camera and was_doubtful
 

@@ -4,8 +4,8 @@ A photo's way from its file to a result:
 1. `opened_scan.OpenedScan.localize` reads it (`panorama.read_panorama`) and asks for its GPS position;
 2. `localize.localize` prepares its images and the part of the map that the prior allows (`query`, `photo`);
 3. `attempts.plan_attempts` lists the searches: a brief one by views, local features, all views;
-4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`),
-   until one is sure (`selection.is_sure`, `is_clear`);
+4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`), or
+   draws the scan at poses that are known (`verification`), until one is sure (`selection.is_sure`);
 5. `last_descent.refine_best` refines the best poses to the end and selects among them (`selection.select`);
 6. `focal_length.calibrate` fits the focal length of a photo of one camera;
 7. `judge.judge` measures the best pose, its covariance (`covariance`) and its probability, and decides;

@@ -210,9 +210,10 @@ def agree(
 def blur_local(
     bundle: Bundle, own: dict[int, Estimate], local_shares: dict[int, float], errors: RelativeErrors
 ) -> dict[int, Estimate]:
-    """Give own poses the errors of local optima, as far as they may be such by themselves and by the others.
+    """Add the errors of local optima to the photos' own poses, times the probability that each is one.
 
-    Both are found in turn (expectation maximization): a pose that is where the others expect it is none.
+    That is the photo's own, and less if the pose is near the one that the others expect. Poses and
+    probabilities are found in turn (expectation maximization).
     """
     shares = local_shares
     for _ in range(NUM_ROUNDS):
@@ -280,7 +281,9 @@ def judge_member(
     if member.alone.status == LOCALIZED and own and before:
         # that others show nothing says nothing against a photo that is sure
         gain = of_own / probability_within(before.largest_std)
-        confidence = max(confidence, member.alone.confidence * min(gain, 1.0))
+        focal = member.alone.focal_length
+        doubt = focal.doubt if focal else 0.0  # which the judge takes off again
+        confidence = max(confidence, member.alone.confidence / (1.0 - doubt) * min(gain, 1.0))
     others = probabilities[1:-1] * min(1.0, (1.0 - confidence) / max(1.0 - probabilities[0], LEAST_NONE))
     p = np.array([confidence, *others, max(1.0 - confidence - others.sum(), 0.0)])
     query, fit = recalibrate_at(member, support)

@@ -79,8 +79,8 @@ class Support(NamedTuple):
     def weights(self) -> Array:
         """Odds (4,): own pose right; own pose missed; photo outside of the scan; photo at another pose.
 
-        A photo alone has the odds of the best of all places. Once the others say which place it is, or
-        which few it may be if photos were exchanged, they are `num_places` times larger.
+        The odds of a photo alone allow for `num_places` places, of which it has the best. If the others leave
+        one place, or the few of exchanged photos, the odds are multiplied by `num_places`.
         """
         belongs = 1.0 - CONTRADICTED
         here = self.odds * self.num_places
@@ -210,10 +210,10 @@ def list_near(query: Query, expected: Pose) -> list[Hypothesis]:
 def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:
     """Return the probability (K + 1,) of each of K poses of the bundle, and of none.
 
-    The photos are independent evidence. A third of them may show nothing, or not belong to the others. If
-    more have missed a pose, these count as one: bare walls and changed places lie together. That photos have
-    found one pose of the bundle counts only beyond what chance gives among all that were proposed. If the
-    relative poses are wrong, each photo may have any of its own poses; that counts as none.
+    The photos are independent evidence, but a missed pose is charged once, as bare walls and changed places
+    lie together, and the third of the photos with the least odds is not charged. Agreement of photos counts
+    as far as it exceeds chance among all proposed poses. Wrong relative poses, with each photo at any of its
+    own poses, count as none.
     """
     num_proposed = max(sum(len(member.own_poses) for member in members), 1)
     logits = []

@@ -332,10 +332,10 @@ def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
 def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:
     """Estimate the covariance of a pose in the map.
 
-    Photos have the errors of the scan in common, and of a scan without colours all errors: edges lie beside
-    those of the photos in the same way. `seen` is the comparison at the pose, `seen_from` a pose so near that
-    it sees the same points; of a whole photo those behind occluders are then left out, which takes less time
-    than to normalise a masked photo.
+    Photos have the errors of the scan in common, and of a scan without colours most errors: edges lie beside
+    those of the photos in the same way. `seen` is the comparison at the pose, `seen_from` a pose so near
+    that it sees the same points; of a whole photo those behind occluders are then left out, which takes less
+    time than to normalise a masked photo.
     """
     is_partial = query.photo.is_partial
     masked = mask_occluders(query, seen)

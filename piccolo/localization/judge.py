@@ -1,11 +1,12 @@
 """The judge: of the default method the only maker of a status, of confidences and of what is ruled out.
 
-Every status is made in `decide`. A photo alone comes here with its evidence (`judge`). Photos that help each
-other never make a status; each way for them hands over probabilities, and a pose with its errors:
+Every status is made in `decide`, by `classify`. A photo alone comes here with its evidence (`judge`). Photos
+that help each other make no status; each way hands over probabilities, or a pose with errors:
 - `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`; a new way does this;
 - `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
 - `batch.second_look`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
-- `walk.results`: the probabilities of a frame's places along the path, to `decide`.
+- `walk.results`: the probabilities of a frame's places along the path, to `decide`, its pose to `take_pose`;
+- `coloring`: nothing; each photo is localized as one alone, in colours of the others.
 """
 
 import math
@@ -93,7 +94,8 @@ def judge_together(
     """Return the result of a photo whose pose is what it and others say together.
 
     `gaussian` is that pose in the map; `found.best` has the same pose. `probabilities` (K + 1,) are of it, of
-    each alternative and of none, by all photos together. What the photo itself rules out stays so.
+    each alternative and of none, by all photos together, each that the pose is within 0.1 m. The doubt about
+    a focal length is not in them. What the photo itself rules out stays so.
     """
     measured = measure(query, found, fit)
     if measured is None:
@@ -168,10 +170,11 @@ def reconsider(found: Localization, factor: float, min_confidence: float) -> Loc
 
 
 def follow_consensus(found: Localization, consensus: Opinion, min_confidence: float) -> Localization:
-    """Return the result of a photo whose focal length, as given, other photos of its camera confirm or doubt.
+    """Return a photo's result, its given focal length compared with that of all photos of its camera.
 
-    `consensus` is that of all of them. What it contradicts is ruled out, with a warning. A pose that rests on
-    what the others say is not doubted with what was given.
+    The doubt about what was given, and with it the confidence, follow from `consensus`. The doubt of a photo
+    that was localized with the others' focal length stays. If `consensus` contradicts what was given, every
+    result is ruled out, with a warning.
     """
     focal = found.focal_length
     assert focal is not None
@@ -283,8 +286,8 @@ def collect_evidence(
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
     """Return True if the mirrored photo has a pose that explains more, and with which more features agree.
 
-    In a symmetric scene both are about equal. The test is skipped for a pose that explains nearly all of the
-    photo, and after a first look, which has compared the mirrored photo itself.
+    In a symmetric scene both are about equal. A pose that explains nearly all of the photo is not tested, nor
+    one by whole views alone: the first look has compared the mirrored photo itself.
     """
     if best.score >= ENOUGH_EXPLAINED or not query.uses_matches:
         return False

@@ -86,8 +86,8 @@ def count_each(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> 
 def verify(query: Query, pose: Pose) -> Verified:
     """Find the pose that most matches near a pose agree with, and count these.
 
-    They are matches with the scan drawn there, and with each of the photos beside: the one with most counts.
-    Photos beside are as right as their own poses.
+    The pose is fitted to all matches: with the scan drawn there, and with each of the photos beside. Those of
+    the one picture with which most agree are counted. A wrong pose of a photo beside misleads this one.
     """
     pictures = [matches_near(query, pose), *query.beside]
     found = exact_pose(merge_matches(pictures), pose, None)

@@ -62,7 +62,7 @@ class Frame:
     alone: Localization | None = None  # if it was searched without regard to the others
     is_key: bool = False
     key: int | None = None  # number of the key frame from which it was tracked, perhaps by way of others
-    arrived: Pose | None = None  # where it was tracked to, in the map, if that key frame is at its `departed`
+    arrived: Pose | None = None  # pose that tracking gave, supposing that the key frame is at its `departed`
     departed: Pose | None = None  # of a key frame, where the frames after it were tracked from
     odometry: Pose | None = None  # in the frame of the odometry [m]
 

@@ -72,8 +72,8 @@ class _Column(NamedTuple):
 def emissions(frame: Frame, tracked: float = -math.inf) -> tuple[Array, float]:
     """Return log odds (S,) of a key frame's states against none.
 
-    They share the odds of the frame's best state, or of the best frame tracked from it if that has more; the
-    second result is the log of the number that share these.
+    The odds of the frame's best state, or of the best frame tracked from it if greater, are divided among its
+    states: less for those behind the best. The second result is the log of the effective number of them.
     """
     odds = np.array([state.log_odds for state in frame.states])
     tolerance = 0.0 if frame.is_localized_alone else COPY_LOG_ODDS
@@ -223,9 +223,9 @@ class Lattice:
         return m, [state.pose for state in states]
 
     def filter_path(self) -> Path:
-        """Return the path of the last key frames, back to one from which frames are tracked.
+        """Return the path of the last key frames, back to the newest from which frames are tracked.
 
-        Their probabilities are those of the time when each was the last.
+        The probabilities of a key frame are given the frames up to it, not later ones.
         """
         path = self._empty_path()
         for column, ended in zip(self.columns[::-1], self.ended[::-1], strict=False):

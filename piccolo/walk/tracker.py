@@ -283,10 +283,10 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
 
 
 def find_near(query: Query, expected: Expected) -> Followed | None:
-    """Find a frame where it is expected, unless a place within reach looks better than a copy of that would.
+    """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 
-    If it is not found there, the best place within reach is tried. What is not where it was expected is to be
-    sure by itself. None also if the photo is mirrored.
+    Else, or if that fails, it is tracked from that place. An end away from the expected pose counts only if
+    the photo is sure of it by itself. None if neither holds, or if the mirrored photo fits better.
     """
     near = query_near(query, expected.last, expected.reach)
     ends = descend_briefly(near)
