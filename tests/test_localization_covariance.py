@@ -119,8 +119,8 @@ def test_covariance_is_in_the_worlds_axes(found):
 def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found):
     prepared, pose, _ = found
     points = _points(prepared, pose)
-    larger = points._replace(offsets=points.offsets * np.float32(10.0))
-    small, large = (covariance.compute_covariance(prepared, some, pose, False) for some in (points, larger))
+    places = [points._replace(offsets=points.offsets * np.float32(size)) for size in (4.0, 40.0)]
+    small, large = (covariance.compute_covariance(prepared, place, pose, False) for place in places)
     per_metre = np.repeat([1.0, 0.1], 3)
     np.testing.assert_allclose(large * np.outer(per_metre, per_metre), small, rtol=0.02, atol=1e-9)
 

@@ -30,6 +30,7 @@ ONE_BLOCK = 1.001  # above 1, so that one block may hold all information
 PIXEL_SHARE = 0.04  # of a pixel that is left in a pose, by trials with photos of 256 and 2048 px
 UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration is better known
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
+LEAST_RANGE = 2.9  # [m] for moves of the differences: shorter ones are lost in the noise of scans
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
 SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
 SHAPE_MOVE = 0.01  # [m]
@@ -128,7 +129,7 @@ def compute_hessian(problem: ChannelProblem, pose: Pose, turn: float, median_ran
     The Gauss-Newton matrix ignores that the loss flattens, and would make deviations several times too small.
     The points of the problem are around the pose; the median of their ranges [m] makes moves of turns [rad].
     """
-    sizes = np.repeat([turn, turn * median_range], 3)
+    sizes = np.repeat([turn, turn * max(median_range, LEAST_RANGE)], 3)
     ends = [step(pose, sign * delta) for delta in np.diag(sizes) for sign in (1.0, -1.0)]
     rotations = np.array([end.R_cam_from_world for end in ends])
     centers = np.array([end.center_world for end in ends]) - pose.center_world
@@ -279,6 +280,8 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     sphere, even without occluders: then the covariance is larger, as few blocks tell it
     (`few_blocks_factor`). The points are around the pose.
     """
+    if points.offsets.shape[1] == 0:
+        return None
     median_range = compute_median_range(points)
     points, begins = sort_by_block(points)
 
