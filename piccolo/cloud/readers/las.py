@@ -308,7 +308,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
     if options.labels or channel == "shape":
         read = partial(_read, header, layout, "class")
-        return reader.make_source(path, read, channel, options.labels, header.num_points)
+        return reader.make_source(path, read, channel, options, header.num_points)
     if channel == "colors" and not header.has_colors:
         raise MissingChannelError(
             f"{path}: has no colours: point format {header.point_format} has none, {WANTED}"
@@ -321,12 +321,12 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         is_zero = f"0 in all {num_samples} points checked"
         what = f"has no colours: red green blue are {is_zero}, {WANTED}"
         raise MissingChannelError(f"{path}: {what if field == 'rgb' else f'the intensity is {is_zero}'}")
-    is_8_bit = field == "rgb" and largest <= 255
+    is_8_bit = field == "rgb" and (options.color_range or largest) <= 255
     read = partial(_read, header, layout, field, is_8_bit)
-    source = reader.make_source(path, read, channel, num_points=header.num_points)
+    source = reader.make_source(path, read, channel, options, header.num_points)
     checked = f"(largest value {largest} in {num_samples} points checked)"
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields {checked}"
-    return source._replace(warnings=(note,) if is_8_bit else ())
+    return source._replace(warnings=(note,) if is_8_bit and options.color_range is None else ())
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:
@@ -383,5 +383,6 @@ def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> Bytes
     if not is_8_bit:
         return TO_8_BIT[rgb]
     if (rgb > 255).any():
-        raise InputError(f"{header.path}: a colour of {rgb.max()} in a file whose other colours are 8-bit")
+        found = f"a colour of {rgb.max()} in a file whose other colours are 8-bit"
+        raise InputError(f"{header.path}: {found}; if they are not, set `color_range`")
     return rgb.astype(np.uint8)

@@ -14,6 +14,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ...optional import import_optional
+from ..settings import IN_METRES, CloudSettings
 from . import mesh_files
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture
 
@@ -46,6 +47,8 @@ class Loaded:
     scene: Any  # trimesh.Scene
     materials: list[Material] | None = None  # of glTF, named by their rows
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
+    settings: CloudSettings = IN_METRES
+    notes: dict[str, None] = field(default_factory=dict)  # for the user, in order
 
     @property
     def is_gltf(self) -> bool:
