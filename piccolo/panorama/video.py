@@ -67,7 +67,7 @@ def measure_sharpness(rgb: Bytes) -> float:
 
 
 def _upright(frame: Any) -> Bytes:
-    """Return the RGB (H, W, 3) of a frame, turned as players show it: a phone stores it as its sensor lies."""
+    """Return the RGB (H, W, 3) of a frame, turned as players show it; phones store it as the sensor lies."""
     rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
     return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90)))
 
@@ -81,12 +81,10 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
             if not container.streams.video:
                 raise InputError(f"{video}: found no picture in it, {WANTED}")
             stream = container.streams.video[0]
-            lenses = [
-                s for s in container.streams.video if (s.width, s.height) == (stream.width, stream.height)
-            ]
-            if len(lenses) > 1:
-                found = f"{len(lenses)} videos of {stream.width} x {stream.height}, of one lens each"
-                raise InputError(f"{video}: found {found}, wanted one that the camera's program has stitched")
+            sizes = [(some.width, some.height) for some in container.streams.video]
+            if sizes.count(sizes[0]) > 1:
+                found = f"found {len(sizes)} videos of {stream.width} x {stream.height}, of one lens each"
+                raise InputError(f"{video}: {found}, wanted one that the camera's program has stitched")
             label = f"{video}: frames of {stream.width} x {stream.height}"
             check_memory(stream.width * stream.height * BYTES_PER_PIXEL, label, "make the video smaller")
             stream.thread_type = "AUTO"
