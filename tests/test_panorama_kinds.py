@@ -48,7 +48,7 @@ def test_pictures_for_two_eyes_are_refused(tmp_path):
     half = textured(256, 256)
     half[:, :, 0] //= 2
     half[:, :128] //= 4
-    path = write(tmp_path / "a.png", encoded(np.hstack([half, np.roll(half, 3, axis=1)]), ".png"))
+    path = write(tmp_path / "a.png", encoded(np.hstack([half, np.roll(half, 1, axis=1)]), ".png"))
     assert_refused(r"two half spheres side by side, one for each eye \(VR180\)", read_panorama, path)
     path = write(tmp_path / "b.png", encoded(np.vstack([textured(), textured()]), ".png"))
     assert_refused("two panoramas above each other, one for each eye", read_panorama, path)

@@ -271,7 +271,7 @@ def note_left_handed(run: Run, records: Records, executor: Executor, interruptio
             path.write_bytes(encode_image(shown[:, ::-1], ".png"))
         answers = execution.answer_all(executor, localizer, map(localizer.task, paths))
         found = [answer.result.status for answer in answers]
-        if 2 * found.count(LOCALIZED) > NUM_MIRRORED:
+        if 2 * found.count(LOCALIZED) >= NUM_MIRRORED:
             terminal.print_note(run.arguments, LEFT_HANDED)
 
 

@@ -126,7 +126,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
         "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times longer"
     )
     option(group, "--refine-focal", text)
-    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON as in docs/CAMERAS.md; "
+    text = "calibration: of COLMAP, OpenSfM, nerfstudio, OpenCV and others, or JSON as in docs/CAMERAS.md; "
     text += "or a folder with NAME.camera.json or NAME.json for each photo"
     option(group, "--camera FILE", text)
     text = "calibration of a rig: COLMAP's rig_config.json, or JSON of docs/CAMERAS.md; a query is a folder"
@@ -173,9 +173,9 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks, and of photos that belong together in another way."""
     group = parser.add_argument_group("photos together")
-    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt (of any "
-    text += "scale), or in metres a transforms.json (nerfstudio, phone apps), or a TUM trajectory with the "
-    text += "photos' names as times"
+    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt or .bin, or "
+    text += "hloc's (of any scale), or in metres a transforms.json (nerfstudio, phone apps), or a TUM "
+    text += "trajectory or a tracker's table with the photos' names as times"
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)

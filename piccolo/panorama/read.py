@@ -223,9 +223,9 @@ def _unroll(picture: Picture, angle: float) -> Picture:
     half = math.atan(height / 2.0 / radius)
     elevations = half - (np.arange(max(round(2.0 * half * radius), 1)) + 0.5) / radius
     rows = (height / 2.0 - radius * np.tan(elevations) - 0.5).astype(np.float32)
-    at = np.tile(np.arange(width, dtype=np.float32), (len(rows), 1)), np.repeat(rows[:, None], width, axis=1)
-    rgb = cv2.remap(picture.rgb, *at, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    counts = cv2.remap(picture.is_valid.astype(np.uint8), *at, cv2.INTER_NEAREST)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), rows)
+    rgb = cv2.remap(picture.rgb, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    counts = cv2.remap(picture.is_valid.astype(np.uint8), u, v, cv2.INTER_NEAREST)
     return replace(picture, rgb=np.asarray(rgb, np.uint8), is_valid=np.asarray(counts > 0))
 
 

@@ -24,6 +24,7 @@ from . import reader
 from .reader import CHUNK, MissingChannelError, PointSource, quote_line
 
 MAGIC = b"LASF"
+WORTH = 0.5  # of the promised points: a file that is cut off is read if it has as many
 MIN_HEADER_SIZE = 227  # [byte]
 MIN_HEADER_SIZE_1_4 = 375  # [byte]
 COMPRESSED_BIT = 0x80  # of the point format
@@ -80,6 +81,7 @@ class LasHeader(NamedTuple):
     scales: Array  # (3,) x y z
     offsets: Array  # (3,)
     is_compressed: bool
+    warnings: tuple[str, ...] = ()
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -131,12 +133,14 @@ def read_header(path: Path) -> LasHeader:
     if not (np.isfinite([scales, offsets]).all() and scales.all()):
         raise InputError(f"{path}: scales {scales} and offsets {offsets}, wanted finite ones and no scale 0")
     room = (size - points_offset) // record_size
-    if num_points == 0 or (num_points > room and not is_compressed):
-        promised = f"promises {num_points} points of {record_size} bytes, found room for {room}"
-        raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
+    found = f"promises {num_points} points of {record_size} bytes, found room for {room}"
+    is_cut = num_points > room and not is_compressed
+    if num_points == 0 or (is_cut and room < WORTH * num_points):
+        raise InputError(f"{path}: the header {found}; the file is cut off or broken")
     return LasHeader(
-        path, size, header_size, points_offset, num_vlrs, point_format, record_size, num_points,
-        scales, offsets, is_compressed,
+        path, size, header_size, points_offset, num_vlrs, point_format, record_size,
+        room if is_cut else num_points, scales, offsets, is_compressed,
+        (f"{path}: the header {found}; read up to there",) if is_cut else (),
     )  # fmt: skip
 
 
@@ -326,7 +330,8 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     source = reader.make_source(path, read, channel, options, header.num_points)
     checked = f"(largest value {largest} in {num_samples} points checked)"
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields {checked}"
-    return source._replace(warnings=(note,) if is_8_bit and options.color_range is None else ())
+    notes = (note,) if is_8_bit and options.color_range is None else ()
+    return source._replace(warnings=(*header.warnings, *notes))
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:

@@ -11,13 +11,11 @@ from functools import partial
 from io import BytesIO
 from itertools import takewhile
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
-from ...arrays import Bytes, Int64s
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
@@ -180,29 +178,6 @@ def _lists_before(header: PlyHeader) -> bool:
     return any(_is_list(prop) for some in header.elements[: header.index + 1] for prop in some.properties)
 
 
-class Segment(NamedTuple):
-    """Properties of one length in a row, and the list behind them, if there is one."""
-
-    fixed: np.dtype[np.void]
-    count_size: int = 0  # [byte]
-    item_size: int = 0  # [byte]
-
-
-def _segments(element: PlyElement, byte_order: str) -> list[Segment]:
-    segments = []
-    fields: list[tuple[str, str]] = []
-    for prop in element.properties:
-        if not _is_list(prop):
-            fields.append((prop.name, byte_order + prop.val_dtype))
-            continue
-        if np.dtype(prop.len_dtype).kind == "f":
-            raise InputError(f"a list '{prop.name}' whose length is no whole number, {WANTED}")
-        sizes = (np.dtype(type_).itemsize for type_ in (prop.len_dtype, prop.val_dtype))
-        segments.append(Segment(np.dtype(fields), *sizes))
-        fields = []
-    return [*segments, Segment(np.dtype(fields))]
-
-
 def _read_among_lists(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
     """Yield the named columns of the vertices of a binary file with lists in them or before them."""
     with header.path.open("rb") as file:
@@ -210,45 +185,40 @@ def _read_among_lists(header: PlyHeader, names: Sequence[str]) -> Iterator[reade
         rest = b""
         for element, num_rows in header.pairs[: header.index + 1]:
             count = num_rows
-            segments = _segments(element, header.byte_order)
+            types = {p.name: np.dtype(header.byte_order + p.val_dtype) for p in element.properties}
             while count > 0:
                 block = file.read(MAX_ROW_SIZE)
                 rest += block
-                starts, end = _walk(rest, min(count, reader.CHUNK), segments, header.byte_order)
+                starts, end = _walk(rest, min(count, reader.CHUNK), element, header.byte_order)
                 if not starts and (not block or len(rest) > MAX_ROW_SIZE):
                     raise InputError(f"{header.path}: {count} rows of '{element.name}' are missing or broken")
                 if element is header.vertices and starts:
                     data = np.frombuffer(rest, np.uint8)
-                    yield [_column(data, np.array(starts), segments, name) for name in names]
+                    places = dict(zip(types, np.array(starts).T[:, :, None], strict=True))
+                    bits = {name: data[places[name] + np.arange(types[name].itemsize)] for name in names}
+                    yield [bits[name].view(types[name])[:, 0] for name in names]
                 rest = rest[end:]
                 count -= len(starts)
 
 
-def _walk(data: bytes, count: int, segments: list[Segment], byte_order: str) -> tuple[list[list[int]], int]:
-    """Return the starts [byte] of the segments of up to `count` whole rows, and the end of these."""
+def _walk(data: bytes, count: int, element: PlyElement, byte_order: str) -> tuple[list[list[int]], int]:
+    """Return where [byte] the properties of up to `count` whole rows begin, and where the last row ends."""
     order: Literal["little", "big"] = "big" if byte_order == ">" else "little"
-    sizes = [(segment.fixed.itemsize, segment.count_size, segment.item_size) for segment in segments]
+    sizes = [
+        (np.dtype(prop.val_dtype).itemsize, np.dtype(prop.len_dtype).itemsize if _is_list(prop) else 0)
+        for prop in element.properties
+    ]
     starts: list[list[int]] = []
     end = 0
     while len(starts) < count:
         at = end
         row = []
-        for size, count_size, item_size in sizes:
+        for size, count_size in sizes:
             row.append(at)
-            at += size
-            if count_size:
-                at += count_size + item_size * int.from_bytes(data[at : at + count_size], order)
+            num_items = int.from_bytes(data[at : at + count_size], order) if count_size else 1
+            at += count_size + size * num_items
         if at > len(data) or at == end:
             break
         starts.append(row)
         end = at
     return starts, end
-
-
-def _column(data: Bytes, starts: Int64s, segments: list[Segment], name: str) -> NDArray[Any]:
-    """Return the values (R,) of a property of rows that start at places (R, S) in the data."""
-    index, segment = next((k, some) for k, some in enumerate(segments) if name in (some.fixed.names or ()))
-    dtype, offset = dict(segment.fixed.fields or {})[name][:2]
-    places = starts[:, index, None] + offset + np.arange(dtype.itemsize)
-    values: NDArray[Any] = data[places].view(dtype)[:, 0]
-    return values
