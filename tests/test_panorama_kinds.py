@@ -106,3 +106,16 @@ def test_a_cylinder_by_its_metadata_asks_for_its_angle(tmp_path):
     content = with_metadata(encoded(textured(100, 200), ".jpg"), xmp=xmp_packet(fields))
     path = write(tmp_path / "a.jpg", content)
     assert_refused("of a cylinder `projection` cylindrical and `fov_deg`", read_panorama, path)
+
+
+@pytest.mark.parametrize(("name", "is_upper_left"), [("a.png", 0), ("a.jpg.png", 1), ("a_mask.png", 1)])
+def test_black_is_ignored_in_masks_that_are_named_as_colmap_does(tmp_path, name, is_upper_left):
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[HEIGHT // 2 :] = 0
+    write(folder / name, encoded(mask, ".png"))
+    panorama = read_panorama(Photo(write(tmp_path / "a.jpg", encoded(textured(), ".jpg")), mask=folder))
+    assert (panorama.is_valid[: HEIGHT // 2] == is_upper_left).all()
+    assert (panorama.is_valid[HEIGHT // 2 :] != is_upper_left).all()
+    assert any("black is ignored" in warning for warning in panorama.warnings) == is_upper_left

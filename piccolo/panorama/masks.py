@@ -215,10 +215,10 @@ def find_mask(mask: Path, pano: Path) -> Path | None:
     return next((file for name in names if (file := mask / name).is_file()), None)
 
 
-def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, Mask]:
+def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool = False) -> tuple[int, Mask]:
     """Return the index of the size (width, height) whose shape a mask has, and its pixels that count (H, W).
 
-    A larger mask masks a pixel if any of its own pixels there is white, a smaller one is enlarged.
+    A larger mask masks a pixel if any of its own pixels there is ignored, a smaller one is enlarged.
 
     Raises InputError if the mask can't be read, or has the shape of none of the sizes, within 1 %.
     """
@@ -226,7 +226,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, Mask]:
     height, width = rgb.shape[:2]
     for k, size in enumerate(sizes):
         if abs(width * size[1] - height * size[0]) <= ASPECT_TOLERANCE * height * size[0]:
-            is_white = (rgb.max(axis=2) >= WHITE).astype(np.float32)
+            is_white = ((rgb.max(axis=2) >= WHITE) != is_black_ignored).astype(np.float32)
             # averages of a larger mask are above 0 where any pixel is white
             method = cv2.INTER_AREA if width > size[0] else cv2.INTER_NEAREST
             return k, np.asarray(cv2.resize(is_white, size, interpolation=method) == 0)

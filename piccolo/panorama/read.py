@@ -274,7 +274,10 @@ def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: l
     if file is None:
         notes.append(f"found no mask {path.stem} in {photo.mask}")
         return {}
-    index, counts = read_mask(file, sizes)
+    is_folder = Path(photo.mask).is_dir()
+    if is_black_ignored := is_folder and file.stem != path.stem:  # a name that COLMAP or Metashape gives
+        notes.append(f"of the mask {file.name}, black is ignored, as COLMAP and Metashape have it")
+    index, counts = read_mask(file, sizes, is_black_ignored)
     return {index: counts}
 
 
