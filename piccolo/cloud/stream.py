@@ -78,10 +78,8 @@ class PointValidator:
         if self.num_finite < MIN_POINTS:
             found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
             raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
-        if self.is_colored and (self.brightest < MIN_BRIGHTEST or not self.is_varied):
+        if self.is_colored and self.brightest < MIN_BRIGHTEST:
             found = f"all points are black (brightest value {self.brightest} of 255)"
-            if self.brightest >= MIN_BRIGHTEST and self.color is not None:
-                found = f"all points have one colour ({' '.join(map(str, self.color.tolist()))})"
             raise InputError(f"{self.path}: {found}, wanted their colours; `color_range` sets their range")
 
     def warnings(self) -> tuple[str, ...]:
@@ -89,6 +87,9 @@ class PointValidator:
         found = []
         if self.num_dropped:
             found.append(f"{self.num_dropped} points with NaN or infinite coordinates left out")
+        if self.is_colored and not self.is_varied and self.color is not None:
+            color = " ".join(map(str, self.color.tolist()))
+            found.append(f"all points have one colour ({color}), which shows nothing: wanted their colours")
         if self.step >= COARSE:
             what = f"its float32 coordinates, far from the origin, are rounded to {self.step:.2g} m"
             found.append(f"{what}: export it in float64, or nearer to its origin")
