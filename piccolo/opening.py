@@ -39,7 +39,7 @@ class Cloud:
         Path of a scan in any format of docs/USAGE.md; several paths, which together are one scan; the path
         of a map that `Scan.save` or tools/prepare_map.py wrote; or points (N, 3) [m].
     colors
-        RGB of the points (N, 3), in uint8, uint16, or floats in [0, 1]. Only with an array of points.
+        RGB of the points (N, 3). Only with an array of points.
     units
         Unit of the coordinates in files. Arrays and all poses are in metres.
     up
@@ -50,6 +50,11 @@ class Cloud:
         Use semantic labels in place of colours, in scan and panoramas.
     ignore_labels
         Labels that are left out of the scan and masked in panoramas. Only with `labels`.
+    color_range
+        Full brightness of the colours: 1, 255 or 65535. By default it follows from the files.
+    columns
+        Names of the columns of text, PTS and .npy files, such as "xyzirgb". By default they follow from a
+        header or from the values.
     crs
         Coordinate system of the scan, such as "EPSG:25832", to use GPS positions of photos. By default the
         one that a LAS, LAZ or E57 file names.
@@ -68,6 +73,8 @@ class Cloud:
     ignore_colors: bool = False
     labels: bool = False
     ignore_labels: Sequence[int] = ()
+    color_range: float | None = None
+    columns: Sequence[str] = ()
     crs: str | None = None
 
     def __post_init__(self) -> None:
@@ -96,7 +103,10 @@ class Cloud:
         """Settings with which the scan is read."""
         channels = WITHOUT_COLORS if self.ignore_colors else IN_METRES.channels
         labels = Labels(tuple(sorted(set(self.ignore_labels)))) if self.labels else None
-        return CloudSettings(METRES[self.units], self.up, channels, labels, self.crs)
+        columns = tuple(self.columns)
+        return CloudSettings(
+            METRES[self.units], self.up, channels, labels, self.crs, self.color_range, columns
+        )
 
 
 def open_scan(
@@ -150,7 +160,9 @@ def open_scan(
     show = report_progress(progress) if progress else no_progress
     workers = Workers(num_cores() if num_threads is None else num_threads, show)
     if isinstance(given.source, np.ndarray):
-        stream = stream_of_arrays(given.source, None if given.ignore_colors else given.colors)
+        stream = stream_of_arrays(
+            given.source, None if given.ignore_colors else given.colors, given.color_range
+        )
         return Scan(scan_of(stream, str(ARRAYS), given.settings, settings, workers, Stopwatch()))
     policy = CachePolicy(cache is not False, None if isinstance(cache, bool) else Path(cache))
     return Scan(open_files(given.paths, given.settings, settings, policy, workers))

@@ -17,7 +17,7 @@ from .errors import InputError
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
 MAX_FOCAL_PX = 1e6
-Projection = Literal["equirectangular", "pinhole", "fisheye"]
+Projection = Literal["equirectangular", "pinhole", "fisheye", "cylindrical"]
 File = str | PathLike[str]
 Vector = tuple[float, float, float]
 HEADING_TOLERANCE_DEG = 20.0
@@ -47,7 +47,7 @@ class Photo:
         Focal length [px] of a pinhole photo in its own pixels, known to 1 %; by default EXIF's.
     fov_deg
         Horizontal field of view [deg], by default from the file's metadata: of a part of the sphere about
-        the horizon (only for files), or of a pinhole or fisheye picture, as `projection` says.
+        the horizon (only for files), or of a pinhole, fisheye or cylindrical picture, as `projection` says.
     projection
         By default "pinhole" if EXIF has a focal length and W is not 2 H, else "equirectangular".
     gravity_vector
@@ -172,10 +172,9 @@ class Photo:
         ways = self.list_ways()
         if len(ways) > 1:
             raise InputError(f"{', '.join(ways)}: wanted only one of them")
-        if self.projection == "fisheye" and self.fov_deg is None:
-            raise InputError(
-                "`projection` fisheye: found no `fov_deg`, wanted the angle that the width shows"
-            )
+        if self.projection in ("fisheye", "cylindrical") and self.fov_deg is None:
+            found = f"`projection` {self.projection}: found no `fov_deg`"
+            raise InputError(f"{found}, wanted the angle that the width shows")
 
     def _check_array(self, picture: Bytes) -> None:
         """Refuse an array that is no picture, and options that need a file."""

@@ -100,9 +100,9 @@ def test_options_that_do_not_go_together_are_refused(scene, relative, capsys, op
     assert err.count("\n") == 1
 
 
-def test_a_file_without_a_photos_pose_is_refused_before_any_work(scene, relative, tmp_path, capsys):
+def test_a_file_without_the_photos_poses_is_refused_before_any_work(scene, relative, tmp_path, capsys):
     document = json.loads(relative.read_text())
-    document["frames"].pop()
+    del document["frames"][1:]
     (tmp_path / "less.json").write_text(json.dumps(document))
     out = tmp_path / "out.jsonl"
     assert main(_command(scene, tmp_path / "less.json", "--out", out)) == 3

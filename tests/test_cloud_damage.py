@@ -16,7 +16,7 @@ from plyfile import PlyData
 from refusals import assert_input_error, assert_refused, mutated, read_or_refused
 from scans import read_cloud
 from test_cloud_las import RAW
-from test_cloud_morton import read
+from test_cloud_morton import read, whole
 from test_cloud_npz import PAIR, WHOLE
 from test_cloud_pcd import COLORS, ENCODINGS, content_of
 from test_cloud_ply import vertices
@@ -101,8 +101,13 @@ def test_references_are_held_to_the_folder(tmp_path, name):
     (tmp_path / "wall.png").write_bytes(made.png())
     gltf = made.textured_gltf()
     gltf.tree["images"] = [{"uri": name}]
+    obj = open_source(made.write_obj(folder, mtl=f"newmtl wall\nmap_Kd {name}\n"))
+    if name in ("https://example.com/wall.png", "C:\\wall.png"):  # the one of that name beside it
+        assert (obj.channel, obj.warnings) == ("colors", ())
+        return
+    assert obj.channel == "shape"
+    assert f"names the file {name[:100]!a}" in obj.warnings[0]
     paths = [
-        made.write_obj(folder, mtl=f"newmtl wall\nmap_Kd {name}\n"),
         gltf.glb(folder / "a.glb"),
         made.textured_gltf().gltf(folder / "a.gltf", name, is_written=False),
         made.write_ply(
@@ -119,8 +124,33 @@ def test_a_link_out_of_the_folder_is_refused_and_missing_materials_are_named(tmp
     path = made.write_obj(folder)
     (folder / "wall.png").rename(tmp_path / "wall.png")
     (folder / "wall.png").symlink_to(tmp_path / "wall.png")
-    assert "names the file 'wall.png', wanted names in the mesh's own folder or below" in refusal(path)
-    assert "names the file 'room.mtl', which is not in its" in refusal(made.write_obj(tmp_path, mtl=""))
+    wanted = "names the file 'wall.png', wanted names in the mesh's own folder or below"
+    assert wanted in open_source(path).warnings[0]
+    bare = open_source(made.write_obj(tmp_path, mtl=""))
+    assert "names the file 'room.mtl', which is not in its" in bare.warnings[0]
+
+
+NAMES = ["C:\\scans\\wall.png", "/home/me/wall.png", "WALL.PNG", "-s 1 1 1 wall.png", "-clamp on wall.png"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_file_of_that_name_beside_an_obj_is_taken(tmp_path, name):
+    expected = whole(open_source, made.write_obj(tmp_path))
+    found = open_source(made.write_obj(tmp_path, mtl=f"newmtl wall\nmap_Kd {name}\n"))
+    assert (found.channel, found.warnings) == ("colors", ())
+    chunks = list(found.read_chunks())
+    np.testing.assert_array_equal(np.vstack([chunk.colors for chunk in chunks]), expected.colors)
+
+
+def test_vertex_colors_stand_in_for_missing_materials(tmp_path):
+    vertices = np.concatenate([made.SQUARE, made.CORNER_COLORS / 255.0], axis=1)
+    path = tmp_path / "a.obj"
+    path.write_text(made.obj_text(vertices, None, library="gone.mtl", material=""))
+    source = open_source(path)
+    assert source.channel == "colors"
+    assert (
+        "names the file 'gone.mtl', which is not in its folder; its colours are missing" in source.warnings[0]
+    )
 
 
 def test_a_texture_that_says_it_is_huge_is_refused(tmp_path):
@@ -167,24 +197,21 @@ def test_empty_meshes_are_refused(tmp_path, text):
     refusal(path)
 
 
-def test_float_colors_beyond_1_are_refused_not_cut_off(tmp_path):
-    colors = made.CORNER_COLORS.astype(float)
+def test_float_colors_out_of_range_are_refused_not_cut_off(tmp_path):
+    colors = made.CORNER_COLORS * 3.0
     obj = tmp_path / "a.obj"
     vertices = np.concatenate([made.SQUARE, colors], axis=1)
     obj.write_text(made.obj_text(vertices, None, library="", material=""))
     ply = made.write_wedges(tmp_path / "a.ply", colors=colors, kind="float")
-    assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(obj)
-    assert "a colour of 255, wanted 0 to 1 or bytes" in refusal(ply)
+    assert "a colour of 765, wanted 0 to 255" in refusal(obj)
+    assert "a colour of 765, wanted 0 to 255" in refusal(ply)
 
 
-def test_several_textures_and_colors_of_other_types_of_a_ply_are_refused(tmp_path):
+def test_several_textures_of_a_ply_are_refused(tmp_path):
     for name in ("a.png", "b.png"):
         (tmp_path / name).write_bytes(made.png())
     path = made.write_wedges(tmp_path / "a.ply", textures=("a.png", "b.png"))
     assert "names 2 textures, wanted one" in refusal(path)
-    path = made.write_ply(tmp_path / "a.ply", colors=made.CORNER_COLORS, options={"text": True})
-    path.write_text(path.read_text().replace("uchar green", "ushort green"))
-    assert "'green' is of type u2" in refusal(path)
 
 
 PRIMITIVE = ("meshes", 0, "primitives", 0)

@@ -144,9 +144,6 @@ def test_color_ranges_are_those_that_the_file_declares(tmp_path, dtype, low, hig
 def test_colors_without_or_outside_of_their_range_and_files_without_points_are_refused(tmp_path):
     path = write(tmp_path / "a.e57", [scan(limits=color_limits(0, 100))])
     assert_refused(r"scan 1 of 1 \('a scan'\) has a colour of \d+, wanted 0 to 100", read, path)
-    written = ScanToWrite(cartesian() | colored(RAW.colors / 255.0))
-    with pytest.raises(InputError, match="colours without a range: neither colorLimits nor a declared"):
-        open_source(write(tmp_path / "a.e57", [written]), IN_COLORS)
     empty = ScanToWrite({name: column[:0] for name, column in (cartesian() | colored()).items()}, BYTES)
     assert_refused(r"scan 1 of 1 \('a scan'\) has 0 points", open_source, write(tmp_path / "a.e57", [empty]))
     assert_refused("no scans, wanted scans with", open_source, write(tmp_path / "b.e57"))

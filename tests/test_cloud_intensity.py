@@ -170,13 +170,14 @@ def test_e57_scans_without_intensity_are_named(tmp_path):
     assert sum(len(chunk.colors) for chunk in source.read_chunks()) == 2000
 
 
-def test_ptx_scan_with_colors_after_one_without_is_read_by_its_intensity(tmp_path):
+def test_ptx_scans_without_colors_are_left_out_beside_others(tmp_path):
     header = ["1", "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
     path = tmp_path / "a.ptx"
     path.write_text("\n".join([*header, "1 2 3 0.5", *header, "1 2 3 0.5 10 20 30"]) + "\n")
     read = whole(open_source, path, IN_METRES)
-    np.testing.assert_array_equal(read.points_world, [[1.0, 2.0, 3.0]] * 2)
-    assert (read.colors == 128).all()
+    np.testing.assert_array_equal(read.points_world, [[1.0, 2.0, 3.0]])
+    np.testing.assert_array_equal(read.colors, [[10, 20, 30]])
+    assert "1 of 2 scans without colours left out" in open_source(path).warnings[0]
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])

@@ -149,7 +149,7 @@ CUT = "the file is cut off or broken"
         (FORMAT, "B", 11, "unknown point format 11, wanted LAS or LAZ"),
         (FORMAT, "B", 0x83, "compressed, but no record says how"),
         (RECORD_SIZE, "<H", 33, "records of 33 bytes, wanted 34 or more in point format 3"),
-        (COUNT, "<I", 1201, f"promises 1201 points of 34 bytes, found room for 1200; {CUT}"),
+        (COUNT, "<I", 2401, f"promises 2401 points of 34 bytes, found room for 1200; {CUT}"),
         (COUNT, "<I", 0, "promises 0 points"),
         (SCALE_X, "<d", 0.0, r"scales \[.*\] and offsets .*, wanted finite ones and no scale 0"),
         (SCALE_X + 24, "<d", float("inf"), r"offsets \[ *inf"),
@@ -160,7 +160,19 @@ def test_damaged_headers_are_refused(tmp_path, position, form, value, message):
     assert_refused(message, las.open_las, path)
 
 
-@pytest.mark.parametrize("count", [1201, 10**15, 2**64 - 1])
+@pytest.mark.parametrize("point_format", [3, 7])
+def test_a_file_that_is_cut_off_is_read_to_its_end(tmp_path, point_format):
+    content = las_bytes(RAW, point_format)
+    expected = read(write(tmp_path, content))
+    source = las.open_las(write(tmp_path, content[:-1000]))
+    parts = list(source.read_chunks())
+    num_left = sum(len(part.colors) for part in parts)
+    assert 1150 < num_left < 1200
+    np.testing.assert_array_equal(np.vstack([part.colors for part in parts]), expected[1][:num_left])
+    assert f"found room for {num_left}; read up to there" in source.warnings[0]
+
+
+@pytest.mark.parametrize("count", [2401, 10**15, 2**64 - 1])
 def test_counts_of_las_1_4_are_refused_before_memory_is_taken(tmp_path, count):
     content = las_bytes(RAW, 7)
     with pytest.raises(InputError, match=f"promises {count} points of 36 bytes, found room for 1200"):

@@ -86,11 +86,10 @@ def test_nan_points_need_no_color(tmp_path):
     ("array", "message"),
     [
         (XYZ, r"an array \(1200, 3\) of type 'float64', wanted .npy of x y z r g b \(N, 6\)"),
-        (np.hstack([WHOLE, XYZ]), r"an array \(1200, 9\)"),
+        (np.hstack([WHOLE] * 11), r"an array \(1200, 66\)"),
         (WHOLE.astype(str), r"an array \(1200, 6\) of type '<U32'"),
         (np.zeros(1200, [("x", "f8")]), r"an array \(1200,\) of type"),
         (WHOLE + 400.0, r"point 1 has the colour .*, wanted 0 to 255"),
-        (WHOLE / [1, 1, 1, 255, 255, 255], r"numbers without a declared range are 0-255, not 0-1"),
     ],
 )
 def test_other_arrays_are_refused(tmp_path, array, message):
@@ -105,7 +104,6 @@ def test_other_arrays_are_refused(tmp_path, array, message):
         ({"colors": RGB, "rgb": RGB}, r"the arrays are 'colors rgb'"),
         ({}, r"the arrays are ''|damaged|unknown format"),
         ({"points": XYZ, "colors": RGB[:-1]}, r"an array \(1200, 3\) of .* and an array \(1199, 3\)"),
-        ({"points": XYZ, "colors": RGB.astype(int)}, r"the colours are of type i8, wanted uint8 0-255"),
         ({"points": XYZ, "colors": RGB / 200.0}, r"point \d+ has the colour .*, wanted 0 to 1"),
     ],
 )

@@ -132,7 +132,6 @@ def test_nan_points_of_a_grid_need_no_color(tmp_path, encoding, kind):
         (XYZ, {}, "the fields are 'x y z', wanted a PCD file with the fields x y z and rgb"),
         ([*XYZ, *XYZ[:1], ("rgb", "u4", 1, PACKED)], {}, "the fields are 'x y z x rgb'"),
         ([*XYZ, ("rgb", "f8", 1, PACKED)], {}, "'rgb' is of type f8, wanted uint32, int32 or float32"),
-        (separate("i4", 255), {}, "of type i4 i4 i4, wanted uint8 0-255, uint16 0-65535 or float 0-1"),
         ([("x", "i2", 1, PACKED), *XYZ[1:], ("rgb", "u4", 1, PACKED)], {}, "'x' is of type i2, wanted float"),
         (None, {"SIZE": "4 4 4"}, "4 FIELDS, 3 of SIZE, 4 of TYPE"),
         (None, {"SIZE": "4 4 4 3"}, "'rgb 3 U 1', wanted SIZE 1 2 4 or 8"),

@@ -1,5 +1,6 @@
 """PLY files as they are written: read back by our reader and by plyfile."""
 
+import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from refusals import assert_input_error, assert_refused
 from scans import read_cloud
 from test_cloud_morton import seeded_cloud, whole
 
+from piccolo.cloud.readers import ply
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud
@@ -107,12 +109,15 @@ def test_promises_of_more_vertices_are_refused_before_memory_is_taken(tmp_path, 
         (b"ascii 1.0", b"ascii 9.0", "broken header .*expected version '1.0'"),
         (b"property float x", b"property flaot x", "broken header .*flaot"),
         (b"property float x", b"property float y", "broken header .*two properties with same name"),
-        (b"property float x", b"property list uchar float x", "'vertex' has the list property 'x'"),
+        (
+            b"property float x",
+            b"property list uchar float x",
+            "have no properties before a list, wanted",
+        ),
         (b"element vertex 1200", b"element vertex -1", "the header counts '-1' elements"),
         (b"element vertex 1200", b"element points 1200", "no element 'vertex'"),
         (b"element vertex 1200", b"element vertex 0", "found 0 finite points"),
         (b"property float z", b"property float h", "vertices have x y h red green blue, wanted"),
-        (b"property uchar red", b"property int red", "the colours are of type i4 u1 u1, wanted uint8"),
         (b"end_header\n", b"end_header\n1 2 3 4 5 6 7\n", "line 11: 7 instead of 6 columns"),
         (b"end_header\n", b"end_header\n1 2 3 4 \x7f 5\n", r"line 11: '\\x7f' is not a number"),
         (b"end_header\n", b"end_header\n1 2 3 4 5 256\n", "point 1 has the colour 4 5 256, wanted"),
@@ -124,12 +129,81 @@ def test_broken_files_are_refused(tmp_path, old, new, message):
     assert_refused(message, read_cloud, path, IN_COLORS)
 
 
-def test_gaussian_splats_and_lists_before_the_vertices_are_refused(tmp_path):
-    names = ("f_dc_0", "f_dc_1", "f_dc_2")
-    with pytest.raises(InputError, match="Gaussian splats without red green blue, the vertices have x y z"):
-        read_cloud(write(tmp_path / "a.ply", vertices(color="f4", names=names)), IN_COLORS)
-    with pytest.raises(InputError, match="'strip' has the list property 'vertex_indices', wanted vertices"):
-        read_cloud(write(tmp_path / "a.ply", TRIANGLES, vertices()))
+def with_lists(order):
+    """A PLY file with faces before vertices that have lists; by hand, as plyfile errs."""
+    rng = np.random.default_rng(4)
+    names = {"<": "little", ">": "big"}
+    lines = ["ply", f"format binary_{names[order]}_endian 1.0", "element face 2"]
+    lines += ["property list uchar int vertex_indices", "element vertex 1200"]
+    lines += [f"property float {name}" for name in "xyz"] + ["property list ushort uint views"]
+    lines += [f"property uchar {name}" for name in RGB] + [
+        "property list uchar float weights",
+        "end_header",
+        "",
+    ]
+    content = ["\n".join(lines).encode()] + [struct.pack(f"{order}B3i", 3, 0, 1, 2)] * 2
+    for point, color in zip(RAW.points_world, RAW.colors, strict=True):
+        views = rng.integers(0, 99, rng.integers(0, 5)).tolist()
+        content.append(struct.pack(f"{order}3fH{len(views)}I", *point, len(views), *views))
+        content.append(struct.pack(f"{order}3BB{len(views)}f", *color, len(views), *views))
+    return b"".join(content)
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_lists_before_and_in_the_vertices_are_passed_over(tmp_path, monkeypatch, order):
+    expected = read_cloud(write(tmp_path / "a.ply", vertices()))
+    path = tmp_path / "b.ply"
+    path.write_bytes(with_lists(order))
+    monkeypatch.setattr(ply, "MAX_ROW_SIZE", 256)
+    read = read_cloud(path)
+    np.testing.assert_array_equal(read.points, expected.points)
+    np.testing.assert_array_equal(read.colors, expected.colors)
+    path.write_bytes(path.read_bytes()[:-1])
+    assert_refused("1 rows of 'vertex' are missing or broken", read_cloud, path)
+
+
+def test_lists_in_text_are_passed_over_behind_the_colors(tmp_path):
+    path = write(tmp_path / "a.ply", TRIANGLES, vertices(), text=True)
+    expected = read_cloud(path)
+    head, _, body = path.read_text().partition("end_header\n")
+    rows = body.splitlines()
+    rows = [*rows[:2], *(f"{row} {k % 3}" + " 7" * (k % 3) for k, row in enumerate(rows[2:]))]
+    path.write_text(head + "property list uchar int views\nend_header\n" + "\n".join(rows) + "\n")
+    np.testing.assert_array_equal(read_cloud(path).colors, expected.colors)
+
+
+def test_a_list_that_promises_more_than_the_file_has_takes_no_memory(tmp_path):
+    strip = np.array([(np.zeros(3, "u4"),)], [("l", object)])
+    element = PlyElement.describe(strip, "strip", {"l": "u4"}, {"l": "u4"})
+    path = write(tmp_path / "a.ply", element, vertices())
+    content = path.read_bytes()
+    place = content.index(b"end_header\n") + len(b"end_header\n")
+    path.write_bytes(content[:place] + b"\xff" * 4 + content[place + 4 :])
+    assert_refused("1 rows of 'strip' are missing or broken", read_cloud, path)
+
+
+def test_opaque_gaussian_splats_are_read_in_their_constant_color(tmp_path):
+    element = vertices(color="f4", brightest=1)
+    names = (*"xyz", "f_dc_0", "f_dc_1", "f_dc_2", "opacity")
+    rows = np.empty(len(element.data), [(name, "f4") for name in names])
+    for name in "xyz":
+        rows[name] = element.data[name]
+    for k, name in enumerate(("red", "green", "blue")):
+        rows[f"f_dc_{k}"] = (element.data[name] - 0.5) / 0.28209479177387814
+    rows["opacity"] = np.where(np.arange(len(rows)) < 1100, 2.0, -2.0)
+    read = whole(open_ply, write(tmp_path / "a.ply", PlyElement.describe(rows, "vertex")))
+    expected = whole(open_ply, write(tmp_path / "b.ply", vertices()))
+    np.testing.assert_array_equal(read.colors, expected.colors[:1100])
+
+
+def test_stray_faces_make_no_mesh_and_capitals_do_not_count(tmp_path):
+    plain = vertices()
+    capital = plain.data.astype([(name.upper(), type_) for name, type_ in plain.data.dtype.descr])
+    expected = read_cloud(write(tmp_path / "a.ply", plain))
+    faces = PlyElement.describe(FACES, "face")
+    read = read_cloud(write(tmp_path / "b.ply", PlyElement.describe(capital, "vertex"), faces))
+    np.testing.assert_array_equal(read.colors, expected.colors)
+    assert any("2 faces left out" in warning for warning in read.warnings)
 
 
 def test_paths_that_are_no_cloud_and_unreadable_files_are_refused(tmp_path, monkeypatch):

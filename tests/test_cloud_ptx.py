@@ -123,7 +123,6 @@ def test_a_line_that_may_be_cut_off_is_not_read_and_infinite_points_are(tmp_path
         (2, "-4", r"line 2 is '-4', wanted a count"),
         (3, "1 2", r"line 3 is '1 2', wanted 3 numbers of a scan's header"),
         (8, "0 1 0 5", r"line 10 ends a matrix with the last column .*, wanted 0 0 0 1"),
-        (11, "1 2 3 0.5", r"has intensity and no colours, wanted a PTX"),
         (12, "1 2 3 0.5", r"line 12: 4 instead of 7 columns \('1 2 3 0.5'\)"),
         (14, "1 2 3 0.5 4 5 256", r"line 14 has the colour 4 5 256, wanted 0 to 255"),
         (1210, None, r"line 1212 is '12.5 -3.0 1.75', wanted a count"),
@@ -163,12 +162,15 @@ def test_counts_stand_between_scans_of_pts(tmp_path, monkeypatch, chunk):
 @pytest.mark.parametrize(
     ("lines", "message"),
     [
-        (["1200", *["1 2 3 4"] * 1200], r"line 2 has 4 columns, no colours: .*, wanted lines x y z inten"),
-        (["1 2 3"] * 1200, r"line 1 has 3 columns, no colours"),
+        (
+            ["1200", *["1 2 3 4"] * 1200],
+            r"line 2 has 4 columns \(no colors\?\): .*, wanted lines x y",
+        ),
+        (["1 2 3"] * 1200, r"line 1 has 3 columns \(no colors\?\)"),
         (["400", *pts()[:400], "800", *pts("")[400:]], r"line 403: 6 instead of 7 columns"),
         ([*pts()[:900], "12.5", *pts()[900:]], r"line 901: 1 instead of 7 columns"),
         (["400", *pts()[:400], "5", "", "1 2 3 4 5 6 777"], r"line 404 has the colour 5 6 777"),
-        (["lorem ipsum dolor sit amet consectetur"], r"line 1: 'lorem' is not a number"),
+        (["lorem ipsum dolor sit amet consectetur"], "no line of numbers at its beginning"),
     ],
 )
 def test_broken_pts_are_refused(tmp_path, lines, message):
@@ -179,7 +181,7 @@ def test_broken_pts_are_refused(tmp_path, lines, message):
 def test_empty_files_and_scans_that_have_gone_between_two_readings_are_refused(tmp_path):
     (tmp_path / "a").touch()
     for reader in (open_ptx, open_pts):
-        assert_refused("no line of numbers, wanted", reader, tmp_path / "a")
+        assert_refused("no line of numbers.*, wanted", reader, tmp_path / "a")
     path = write(tmp_path / "a.ptx", TWO_SCANS)
     source = open_source(path)
     write(path, TWO_SCANS[:300])

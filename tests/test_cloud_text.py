@@ -62,12 +62,17 @@ def test_comments_are_passed_over_and_headers_name_columns(tmp_path):
     assert_read_as_written(write(tmp_path / "a.csv", ['index,"class",x,y,z,R,G,B', *lines]))
     assert_read_as_written(write(tmp_path / "a.txt", [line + " 0.5 label" for line in lines_of(RAW)]))
     lines = [" ".join([*f[:3], "0.25", *f[3:]]) for f in map(str.split, lines_of(RAW))]
-    for header in ("//X Y Z Intensity R G B", "x y z i Red Green Blue", '"X" "Y" "Z" "I" r g b'):
+    for header in (
+        "//X Y Z Intensity R G B",
+        "X[m] Y[m] Z[m] I[-] R[-] G[-] B[-]",
+        "x y z i Red Green Blue",
+        '"X" "Y" "Z" "I" r g b',
+    ):
         assert_read_as_written(write(tmp_path / "a.asc", [header, "1500", *lines]))
     assert_read_as_written(write(tmp_path / "a.txt", ["# x y z are metres", *lines_of(RAW)]))
 
 
-@pytest.mark.parametrize("header", ["//X Y Z Classification Row Column", "x y z Rf Gf Bf"])
+@pytest.mark.parametrize("header", ["//X Y Z Classification Row Column"])
 def test_columns_without_colors_are_refused(tmp_path, header):
     with pytest.raises(InputError, match=f"the columns are '{header}', wanted lines of numbers x y z r g b"):
         whole(open_text, write(tmp_path / "a.txt", [header, *lines_of(RAW)]))
@@ -102,13 +107,10 @@ def test_broken_lines_are_named(tmp_path, broken, message):
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"1 2 3\n" * 2000, r"line 1 has 3 columns \(no colours\?\): '1 2 3', wanted lines of numbers"),
+        (b"1 2 3\n" * 2000, r"line 1 has 3 columns \(no colors\?\): '1 2 3', wanted lines of numbers"),
         (b"\x7fELF\x00\x00\x01 1 2 3 4 5 6\n" * 2000, "holds bytes that are no text"),
         (b"lorem ipsum\n" * 2000, "no line of numbers at its beginning"),
-        (b"\xff\xfe" + "1 2 3 4 5 6\n".encode("utf-16-le") * 2000, "holds bytes that are no text"),
-        (b"1,5;2,5;3,5;10;20;30\n" * 2000, "line 1: '1,5' is not a number .* with decimal points"),
-        (b"1,5;2,5;3,5;0,1;0,2;0,3\n" * 2000, "no line of numbers at its beginning, .* with decimal points"),
-        (b"1 2 3 0.25 0.75 1\n" * 2000, "all points are black .* declared range are 0-255, not 0-1"),
+        (b"1 2 3 0 0 0\n" * 2000, r"all points are black .* `color_range` sets their range"),
         (b"", "the file is empty"),
     ],
 )

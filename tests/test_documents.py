@@ -18,6 +18,7 @@ import pytest
 from batches import main_of
 
 import piccolo
+from piccolo.cloud.stream import FORMATS
 from research.synthetic import make_room
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -189,3 +190,9 @@ def test_docstrings(name, folder, monkeypatch):
     failures, tried = doctest.testmod(import_module(name), extraglobs=known, optionflags=FLAGS)
     assert failures == 0
     assert tried > 0
+
+
+def test_the_table_of_formats_names_what_is_read():
+    section = (ROOT / "docs/USAGE.md").read_text().partition("## Scans")[2].partition("##")[0]
+    named = set(re.findall(r"`(\.[a-z0-9]+)`", section.partition("Colours go")[0]))
+    assert named == {suffix for form in FORMATS for suffix in form.suffixes}

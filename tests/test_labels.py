@@ -118,7 +118,7 @@ def test_clouds_without_labels_are_refused(tmp_path):
     with pytest.raises(InputError, match=r"a.pts: labels are not read from PTS, wanted PLY, LAS, LAZ, PCD"):
         open_source(write(tmp_path / "a.pts", b"3\n1 2 3 9 1 1 1\n"), READ)
     mesh = PlyData.read(str(tmp_path / "a.ply"))
-    faces = np.array([([0, 1, 2],)], dtype=[("vertex_indices", "i4", (3,))])
+    faces = np.array([([0, 1, 2],)] * 200, dtype=[("vertex_indices", "i4", (3,))])
     PlyData([mesh["vertex"], PlyElement.describe(faces, "face")]).write(str(tmp_path / "mesh.ply"))
     with pytest.raises(InputError, match=r"mesh.ply: found a mesh, wanted points with labels"):
         open_source(tmp_path / "mesh.ply", READ)

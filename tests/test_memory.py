@@ -79,7 +79,7 @@ def test_address_space_is_a_limit_too(monkeypatch):
 
 
 def test_work_begins_only_where_errors_can_still_be_raised(monkeypatch):
-    cloud = stream_of_arrays(np.zeros((1000, 3)), np.full((1000, 3), 9, np.uint8))
+    cloud = stream_of_arrays(np.zeros((1000, 3)), np.arange(3000, dtype=np.uint8).reshape(1000, 3))
     monkeypatch.setattr(memory, "free_of_process", lambda: 1.9e8)
     with pytest.raises(MemoryError, match=r"^ulimit -v leaves 0.19 GB, wanted 0.2 or more"):
         cloud.read()

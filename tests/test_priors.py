@@ -181,3 +181,14 @@ def test_a_photo_is_searched_about_its_position_and_then_anywhere(tmp_path):
     near = tuple(here.tolist())
     assert scan.localize(path, prior=Prior(near=near, radius=2.0)).gps_prior is None
     assert rooms.scan(1).localize(path).gps_prior is None  # of no known coordinate system
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16"])
+@pytest.mark.parametrize("delimiter", [";", "\t"])
+def test_tables_of_spreadsheets(tmp_path, encoding, delimiter):
+    rows = [("Name", "X", "Y", "Radius"), ("a.jpg", "1,5", "-3,25", "2")]
+    text = "\r\n".join(delimiter.join(row) for row in rows) + "\r\n"
+    path = tmp_path / "a.csv"
+    path.write_bytes(text.encode(encoding))
+    prior, _ = read_priors(path, Prior()).by_name["a.jpg"]
+    assert (prior.near, prior.radius) == ((1.5, -3.25, None), 2.0)

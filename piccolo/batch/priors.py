@@ -77,18 +77,22 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     Columns: name (the panorama's path as given, or its file name), x, y, z [m] in the scan's frame (without z
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
     [deg], height [m] above the floor, gravity_x, gravity_y, gravity_z (down, in the camera's axes, of any
-    length), within (names of the map's scans, with semicolons between them).
+    length), within (names of the map's scans, with semicolons between them). Between columns are commas, or
+    semicolons or tabs; then numbers may have decimal commas.
     Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
-    rows = csv.DictReader(read_text(path, WANTED).splitlines(), restkey="more")
-    names = [name.strip() for name in rows.fieldnames or ()]
+    lines = read_text(path, WANTED).splitlines()
+    delimiter = next((mark for mark in "\t;" if lines and mark in lines[0]), ",")
+    rows = csv.DictReader(lines, restkey="more", delimiter=delimiter)
+    names = [name.strip().lower() for name in rows.fieldnames or ()]
     rows.fieldnames = names
     odd = sorted(set(names) - {"name", *COLUMNS})
     if "name" not in names or odd or len(set(names)) < len(names):
         found = f"found a column {odd[0]!r}" if "name" in names and odd else f"found the columns {names}"
         raise InputError(f"{path}: {found}, {WANTED}")
     by_name: dict[str, Row] = {}
-    for row in rows:
+    for cells in rows:
+        row = dict(cells)
         where = f"{path}, line {rows.line_num}"
         name = (row.pop("name") or "").strip()
         if "more" in row:
@@ -96,6 +100,8 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
         if not name or name in by_name:
             raise InputError(f"{where}: found {f'the name {name!r} twice' if name else 'no name'}")
         within = (row.pop("within", None) or "").split(BETWEEN_NAMES)
+        if delimiter != ",":
+            row = {column: cell and cell.replace(",", ".") for column, cell in row.items()}
         numbers = _numbers(where, row)
         try:
             by_name[name] = _row_from(numbers, tuple(w.strip() for w in within if w.strip()), general)

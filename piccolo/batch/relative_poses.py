@@ -1,15 +1,19 @@
 """Relative poses of photos, as other tools write them."""
 
+import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from pathlib import Path
+from itertools import takewhile
+from operator import eq
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 
 from ..arrays import Array
+from ..camera.foreign import read_binary_images
 from ..errors import InputError
-from ..files.json_file import DAMAGE, describe, read_json, read_text
+from ..files.json_file import DAMAGE, MAX_SIZE, describe, read_bytes, read_json, read_text
 from ..geometry.pose import (
     OPENGL_FROM_CAM,
     OPTICAL_FROM_CAM,
@@ -18,51 +22,69 @@ from ..geometry.pose import (
     rotation_from_quaternion_wxyz,
 )
 from ..localization.bundle_adjustment import RelativeScale
+from ..panorama.cube import SUFFIXES
 
-WANTED = "wanted COLMAP's images.txt, a transforms.json of nerfstudio [m], or a TUM trajectory [m]"
+WANTED = (
+    "wanted COLMAP's images.txt or .bin, hloc's poses, or in metres a transforms.json of nerfstudio, "
+    "a TUM trajectory or a tracker's table with a header"
+)
 ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
 NUM_KITTI = 12  # columns: T_world_from_cam without its last row
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
+TUM_NAMES = (  # of a header's columns, without what is no letter
+    re.compile("time.*|t|stamp|name|image|file.*"),
+    *(re.compile(f"(p|t|pos.*|tr.*|prsr|)_?{axis}") for axis in "xyz"),
+    *(re.compile(f"(q|rot|ori|quat).*{axis}") for axis in "xyzw"),
+)
+NOT_IN_NAMES = re.compile(r"[\[(].*|[^a-z]")
+UNIT_LENGTH = 0.01  # by which the length of a quaternion may differ from 1
 NamedPose = tuple[str, Pose]
 
 
-def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose]:
-    """Return each photo's pose in the common frame of a file of poses.
+def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose | None]:
+    """Return each photo's pose in the common frame of a file of poses; None of one that it has not.
 
-    COLMAP's images.txt and transforms.json name their photos; in a TUM trajectory the time is the photo's
-    name without suffix. Raises InputError if the file is none of these, or has no pose of a photo, or two.
+    COLMAP's files, hloc's and transforms.json name their photos; in a TUM trajectory the time is the photo's
+    name without suffix. Raises InputError if the file is none of these, or has two poses of a photo, or
+    fewer than two photos'.
     """
     poses = read_transforms(path) if path.suffix == ".json" else read_lines(path)
     found = match_names(path, poses, photos)
-    for photo, pose in zip(photos, found, strict=True):
-        if pose is None:
-            raise InputError(f"{path}: found 0 poses of {photo}, wanted one of each photo")
-    return [pose for pose in found if pose is not None]
+    if sum(pose is not None for pose in found) < min(2, len(photos)):
+        missing = next(photo for photo, pose in zip(photos, found, strict=True) if pose is None)
+        raise InputError(f"{path}: found 0 poses of {missing}, wanted one of each photo, or of most")
+    return found
 
 
 def find_scale(path: Path) -> RelativeScale:
     """Return the unit of a file's positions: structure from motion, as in COLMAP's files, has none."""
     if path.suffix == ".json":
         return "metres"
-    lines = read_text(path, WANTED).splitlines()
-    first = next((line for line in lines if line.strip() and not line.startswith("#")), "")
-    return "unknown" if len(first.split(None, NUM_COLMAP - 1)) == NUM_COLMAP else "metres"
+    if path.suffix == ".bin":
+        return "unknown"
+    rows = _rows(path)
+    return "unknown" if _are_colmap(rows) or _are_hloc(rows) else "metres"
 
 
 def match_names(path: Path, poses: Sequence[NamedPose], photos: Sequence[Path]) -> list[Pose | None]:
-    """Return the pose of each photo by its path, its name or its stem; InputError if there are two."""
-    by_path = defaultdict[str, list[Pose]](list)
-    by_name = defaultdict[str, list[Pose]](list)
+    """Return the pose of each photo by the end of its path, as much as is in common, or by its stem.
+
+    Raises InputError if two fit alike.
+    """
+    by_name = defaultdict[str, list[tuple[tuple[str, ...], Pose]]](list)
     for name, pose in poses:
-        by_path[name].append(pose)
-        by_name[Path(name).name].append(pose)
+        parts = PurePosixPath(name.replace("\\", "/")).parts or ("",)
+        by_name[parts[-1]].append((parts[::-1], pose))
     chosen: list[Pose | None] = []
     for photo in photos:
-        found = by_path.get(str(photo)) or by_name.get(photo.name) or by_name.get(photo.stem) or []
+        own = photo.parts[::-1]
+        found = by_name.get(photo.name) or by_name.get(photo.stem) or []
+        lengths = [sum(1 for _ in takewhile(bool, map(eq, own[1:], parts[1:]))) for parts, _ in found]
+        found = [entry for entry, length in zip(found, lengths, strict=True) if length == max(lengths)]
         if len(found) > 1:
             raise InputError(f"{path}: found {len(found)} poses of {photo}, wanted one of each photo")
-        chosen.append(found[0] if found else None)
+        chosen.append(found[0][1] if found else None)
     return chosen
 
 
@@ -79,8 +101,7 @@ def read_odometry(
     if path.suffix == ".json":
         found = match_names(path, read_transforms(path), frames)
     else:
-        rows = [line.split() for line in read_text(path, ODOMETRY).splitlines() if line.strip()]
-        rows = [row for row in rows if not row[0].startswith("#")]
+        rows = _rows(path)
         is_kitti = all(len(row) == NUM_KITTI for row in rows)
         with naming(path, ODOMETRY):
             poses = [read_kitti_row(row) if is_kitti else read_tum_row(row) for row in rows]
@@ -140,13 +161,66 @@ def read_transforms(path: Path) -> list[NamedPose]:
 
 
 def read_lines(path: Path) -> list[NamedPose]:
-    """Return the poses in a text file of COLMAP, by the photos' names, or of TUM, by times."""
-    lines = [line for line in read_text(path, WANTED).splitlines() if not line.startswith("#")]
-    rows = [line.split(None, NUM_COLMAP - 1) for line in lines]
+    """Return the poses in a file of COLMAP or hloc, by the photos' names, or of a tracker, by times."""
     with naming(path, WANTED):
-        if rows and len(rows[0]) == NUM_COLMAP:
-            return [read_colmap_row(row) for row in rows[::2] if row]  # points follow each photo
-        return [read_tum_row(row) for row in rows if row]
+        if path.suffix == ".bin":
+            rows = list(read_binary_images(read_bytes(path, WANTED, MAX_SIZE)))
+            return [read_colmap_row(row) for row in rows]
+        rows = _rows(path)
+        if _are_colmap(rows):
+            return [read_colmap_row(row) for row in rows if not all(map(_is_number, row))]  # else points
+        if _are_hloc(rows):
+            return [read_colmap_row(["", *row[1:], "", row[0]]) for row in rows]
+        return [read_tum_row(row) for row in rows]
+
+
+def _rows(path: Path) -> list[list[str]]:
+    """Return the rows of a file of poses, those of a tracker's table as TUM has them.
+
+    A header of such a table names its columns; without one a ninth column is a node's number.
+    """
+    lines = [line.strip() for line in read_text(path, WANTED).splitlines() if line.strip()]
+    rows = [_split(line) for line in lines if not line.startswith("#")]
+    if _are_colmap(rows):
+        return rows
+    names = [NOT_IN_NAMES.sub("", name.lower()) for name in _split(lines[0].lstrip("# "))] if lines else []
+    columns = [next((k for k, name in enumerate(names) if some.fullmatch(name)), None) for some in TUM_NAMES]
+    if all(column is not None for column in columns):
+        rows = rows[not lines[0].startswith("#") :]
+        return [[row[k] for k in columns if k is not None and k < len(row)] for row in rows]
+    if rows and all(len(row) == NUM_TUM + 1 and all(map(_is_number, row[1:])) for row in rows):
+        return [row[:NUM_TUM] for row in rows]
+    return rows
+
+
+def _split(line: str) -> list[str]:
+    """Split a row at blanks, or at commas; a name at the end of COLMAP's may have blanks."""
+    words = line.split(",") if line.count(",") >= NUM_TUM - 1 else line.split()
+    is_named = len(words) > NUM_COLMAP and not all(map(_is_number, words))
+    return line.split(None, NUM_COLMAP - 1) if is_named else [word.strip() for word in words]
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+def _are_colmap(rows: Sequence[Sequence[str]]) -> bool:
+    return any(len(row) == NUM_COLMAP and not _is_number(row[-1]) for row in rows[:2])
+
+
+def _are_hloc(rows: Sequence[Sequence[str]]) -> bool:
+    """Return True for rows of a name, a quaternion w x y z, a position; TUM has the position first."""
+    if not rows or not all(len(row) == NUM_TUM and all(map(_is_number, row[1:])) for row in rows):
+        return False
+    values = np.array([row[1:] for row in rows], float)
+    with np.errstate(over="ignore"):
+        lengths = [np.linalg.norm(values[:, begin : begin + 4], axis=1) for begin in (0, 3)]
+    is_first, is_last = (bool(np.all(np.abs(length - 1.0) < UNIT_LENGTH)) for length in lengths)
+    return is_first and (not is_last or Path(rows[0][0]).suffix.lower() in SUFFIXES)
 
 
 def read_colmap_row(row: Sequence[str]) -> NamedPose:
@@ -162,6 +236,8 @@ def read_tum_row(row: Sequence[str]) -> NamedPose:
     """Return the time and the pose of a row: T_world_from_cam, camera axes right, down, forward."""
     if len(row) != NUM_TUM:
         raise ValueError(f"{len(row)} columns")
+    if wrong := [word for word in row[1:] if not _is_number(word)]:
+        raise ValueError(f"{wrong[0][:40]!r}, which is no number")
     values = np.array(row[1:], float)
     T = np.column_stack([read_quaternion(np.roll(values[3:], 1)), values[:3]])
     return row[0], check_transform(T, row[0], OPTICAL_FROM_CAM)

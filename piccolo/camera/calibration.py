@@ -15,8 +15,9 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, unreadable
-from ..files.json_file import DAMAGE, describe, read_text
+from ..files.json_file import DAMAGE, describe, read_bytes, read_text
 from ..geometry.pose import OPTICAL_FROM_CAM, Pose, check_pose, rotation_from_quaternion_wxyz
+from . import foreign
 from .model import Camera
 
 IDENTITY = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
@@ -25,7 +26,10 @@ MAX_CAMERAS = 64
 Rows = tuple[tuple[float, ...], ...]
 FORMAT = "piccolo-camera/1"
 MAX_SIZE = 1 << 22  # [byte] of a file
-WANTED = "wanted COLMAP's cameras.txt, OpenSfM's camera_models.json or the JSON of docs/CAMERAS.md"
+WANTED = (
+    f"wanted COLMAP's cameras.txt or .bin, OpenSfM's camera_models.json, {foreign.READ} (docs/CAMERAS.md)"
+)
+MARKUP = (".yaml", ".yml", ".xml")
 WANTED_RIG = "wanted COLMAP's rig_config.json, or the JSON of docs/CAMERAS.md with an image for each camera"
 ANY_SIZE = 1, 1  # of cameras whose file does not say it
 # OpenSfM's projections: COLMAP's model, and OpenSfM's names of its parameters after focal lengths and centre
@@ -195,10 +199,15 @@ def find_calibration(given: Calibration | Path | None, pano: Path) -> Calibratio
 
 def read_cameras(path: Path) -> Calibration:
     """Return the cameras in a file, told by its content; InputError if it holds none."""
+    if path.suffix.lower() == ".bin":
+        with _naming(path, WANTED):
+            return _of_colmap(path, foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_SIZE)))
     text = read_text(path, WANTED, MAX_SIZE)
     with _naming(path, WANTED):
         if text.lstrip()[:1] in ("{", "["):
             return _of_document(path, json.loads(text))
+        if path.suffix.lower() in MARKUP:
+            return _of_foreign(path, foreign.parse_markup(text))
         return _of_colmap(path, text)
 
 
@@ -288,8 +297,17 @@ def _whole(value: Any) -> int:
 def _of_document(path: Path, document: Any) -> Calibration:
     if "format" in document:
         return Calibration(str(path), read_mounts(document))
-    cameras = {name: _of_opensfm(entry) for name, entry in document.items()}
-    return Calibration(str(path), tuple(map(Mount, cameras.values())), is_choice=True)
+    entries = list(document.values()) if isinstance(document, dict) else []
+    if not (entries and all(isinstance(entry, dict) and "projection_type" in entry for entry in entries)):
+        return _of_foreign(path, document)
+    return Calibration(str(path), tuple(Mount(_of_opensfm(entry)) for entry in entries), is_choice=True)
+
+
+def _of_foreign(path: Path, document: Any) -> Calibration:
+    cameras = foreign.cameras_in(document)
+    if not cameras:
+        raise ValueError("no camera with its size and focal length")
+    return Calibration(str(path), tuple(map(Mount, cameras)), is_choice=True)
 
 
 def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
@@ -322,6 +340,8 @@ def _of_colmap(path: Path, text: str) -> Calibration:
         if not words:
             continue
         try:
+            if len(words) < 5:
+                raise ValueError(f"{len(words)} words")
             _, model, width, height, *params = words
             camera = Camera(model, int(width), int(height), tuple(map(float, params)))
         except ValueError as error:

@@ -29,6 +29,7 @@ from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube
+from ..panorama.masks import find_mask
 from ..panorama.photo import sha256_of
 from ..result import FAILED, UNREADABLE
 from ..scan_map.open_map import scan_sha256_of
@@ -42,7 +43,7 @@ from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, locali
 
 MAX_STEM = 255 - len(".png")  # [byte] of a file name
 STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
-NUM_MIRRORED = 3  # of the photos that were not localized
+NUM_MIRRORED = 2  # of the photos that were not localized
 LEFT_HANDED = (
     "the photos fit the scan mirrored, left for right: its axes are left-handed, which `up` can't mend; "
     "negate one of its coordinates, or export it with right-handed axes"
@@ -79,6 +80,9 @@ def check_files(arguments: Namespace, panoramas: list[Path], total: int | None) 
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
     outputs = {"--out": a.out or STDOUT, "--color-scan": a.color_scan, **pictures}
     check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
+    mask = arguments.mask and Path(arguments.mask)
+    if mask and mask.is_dir() and panoramas and total and not any(find_mask(mask, p) for p in panoramas):
+        raise InputError(f"{mask}: found no mask of {panoramas[0].name} or another photo, wanted NAME.png")
     check_output(arguments.out or STDOUT)
     if arguments.color_scan:
         check_output(arguments.color_scan)
@@ -266,7 +270,7 @@ def note_left_handed(run: Run, records: Records, executor: Executor, interruptio
             path.write_bytes(encode_image(shown[:, ::-1], ".png"))
         answers = execution.answer_all(executor, localizer, map(localizer.task, paths))
         found = [answer.result.status for answer in answers]
-        if 2 * found.count(LOCALIZED) > NUM_MIRRORED:
+        if 2 * found.count(LOCALIZED) >= NUM_MIRRORED:
             terminal.print_note(run.arguments, LEFT_HANDED)
 
 

@@ -9,7 +9,7 @@ from typing import Any, get_args, get_type_hints
 from .. import __version__
 from ..batch.inputs import EXIF, NAMES, ORDER
 from ..batch.localizer import Localizer
-from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis, check_crs
+from ..cloud.settings import IN_METRES, METRES, RANGES, WITHOUT_COLORS, CloudSettings, UpAxis, check_crs
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
@@ -92,6 +92,13 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     text = "axis of the cloud that points up; auto: z, or y in glTF (default auto; with preset default only)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     option(group, "--ignore-colors", "localize by the shape and intensity of the scan even if it has colours")
+    ranges = ["auto", *(f"{value:g}" for value in RANGES)]
+    text = "full brightness of the cloud's colours (default auto: by the file, then by their values)"
+    option(group, "--color-range", text, choices=ranges, default=ranges[0])
+    text = (
+        "columns of text, PTS and .npy files, such as x,y,z,i,r,g,b; - for others (default: by a header or "
+    )
+    option(group, "--columns NAMES", text + "their values)", type=lambda names: names.split(","), default=[])
     text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
     option(group, "--labels N ...", f"{text}; points and pixels with labels N are left out", nargs="*")
 
@@ -117,7 +124,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
         "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times longer"
     )
     option(group, "--refine-focal", text)
-    text = "calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON as in docs/CAMERAS.md; "
+    text = "calibration: of COLMAP, OpenSfM, nerfstudio, OpenCV and others, or JSON as in docs/CAMERAS.md; "
     text += "or a folder with NAME.camera.json or NAME.json for each photo"
     option(group, "--camera FILE", text)
     text = "calibration of a rig: COLMAP's rig_config.json, or JSON of docs/CAMERAS.md; a query is a folder"
@@ -164,9 +171,9 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks, and of photos that belong together in another way."""
     group = parser.add_argument_group("photos together")
-    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt (of any "
-    text += "scale), or in metres a transforms.json (nerfstudio, phone apps), or a TUM trajectory with the "
-    text += "photos' names as times"
+    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt or .bin, or "
+    text += "hloc's (of any scale), or in metres a transforms.json (nerfstudio, phone apps), or a TUM "
+    text += "trajectory or a tracker's table with the photos' names as times"
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
@@ -207,7 +214,8 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
         check_crs(crs)
     channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
     labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
-    return CloudSettings(scale, arguments.up, channels, labels, crs)
+    color_range = None if arguments.color_range == "auto" else float(arguments.color_range)
+    return CloudSettings(scale, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns))
 
 
 def cache_from(arguments: argparse.Namespace) -> CachePolicy:

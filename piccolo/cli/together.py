@@ -139,11 +139,17 @@ def make_bundle_job(
     poses = read_relative_poses(arguments.relative, photos)
     more = {"relative_sha256": sha256_of(arguments.relative, None)}
     asked = [localizer.ask(path)[0] for path in photos]
+    posed = [(photo, pose) for photo, pose in zip(asked, poses, strict=True) if pose is not None]
 
     def run(_journal: Journal) -> list[Result]:
         scale = find_scale(arguments.relative)
-        found = scan.localize_bundle(asked, poses, localizer.settings, scale)
-        return [replace(result, settings={**result.settings, **more}) for result in found]
+        of_all = [pose for _, pose in posed]
+        found = iter(scan.localize_bundle([photo for photo, _ in posed], of_all, localizer.settings, scale))
+        answer = localizer.answer_in(scan)
+        pairs = zip(photos, poses, strict=True)
+        # a photo that structure from motion did not register is localized alone
+        results = [next(found) if pose else answer(localizer.task(path)).result for path, pose in pairs]
+        return [replace(result, settings={**result.settings, **more}) for result in results]
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
         for result in results:

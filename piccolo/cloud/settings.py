@@ -16,7 +16,9 @@ from ..optional import import_optional
 Channel = Literal["colors", "intensity", "shape"]
 UpAxis = Literal["auto", "z", "y", "x", "-z", "-y", "-x"]
 
+RANGES = (1.0, 255.0, 65535.0)  # values of full brightness
 WITHOUT_COLORS: tuple[Channel, ...] = ("intensity", "shape")
+COLUMNS = {"i": "intensity", "r": "red", "g": "green", "b": "blue"}  # short names of a line's numbers
 METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}  # per unit of length
 
 
@@ -29,6 +31,8 @@ class CloudSettings:
     channels: tuple[Channel, ...] = get_args(Channel)  # the first one that the files have is taken
     labels: Labels | None = None  # the points' labels are taken for their colours
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
+    color_range: float | None = None  # the value of full brightness; None: by the file
+    columns: tuple[str, ...] = ()  # names of the numbers of a line, such as x y z i r g b; none: by the file
 
     def __post_init__(self) -> None:
         if self.labels and "colors" not in self.channels:
@@ -37,6 +41,13 @@ class CloudSettings:
             raise InputError(f"`up`: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
         if not (math.isfinite(self.scale) and self.scale > 0.0):
             raise InputError(f"`units`: found {self.scale}, wanted a number above 0 (metres a unit)")
+        if self.color_range not in (None, *RANGES):
+            raise InputError(f"`color_range`: found {self.color_range}, wanted 1, 255 or 65535")
+        if self.columns and not {*"xyz"} <= {*self.columns}:
+            found = ",".join(self.columns)
+            raise InputError(
+                f"`columns`: found {found[:80]!r}, wanted x, y, z among them, as in x,y,z,i,r,g,b"
+            )
         if self.crs:
             check_crs(self.crs)
 

@@ -40,9 +40,12 @@ class PointValidator:
 
     path: Path
     scale: float  # metres per unit of the file
+    is_colored: bool = True
     num_finite: int = 0
     num_dropped: int = 0  # with NaN or infinite coordinates
     brightest: int = 0
+    color: Bytes | None = None  # (3,) of the first point
+    is_varied: bool = False  # another point has another colour
     step: float = 0.0  # [m] between numbers at the farthest point that is stored in float32
 
     def filter(self, raw: reader.RawCloud) -> Chunk:
@@ -60,6 +63,8 @@ class PointValidator:
         if num_finite:
             points = points * self.scale
             self.brightest = max(self.brightest, int(colors.max()))
+            self.color = colors[0] if self.color is None else self.color
+            self.is_varied = self.is_varied or bool((colors != self.color).any())
             farthest = max(-float(points.min()), float(points.max()))
             if farthest > MAX_COORDINATE:
                 found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
@@ -73,15 +78,18 @@ class PointValidator:
         if self.num_finite < MIN_POINTS:
             found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
             raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
-        if self.brightest < MIN_BRIGHTEST:
+        if self.is_colored and self.brightest < MIN_BRIGHTEST:
             found = f"all points are black (brightest value {self.brightest} of 255)"
-            raise InputError(f"{self.path}: {found}; numbers without a declared range are 0-255, not 0-1")
+            raise InputError(f"{self.path}: {found}, wanted their colours; `color_range` sets their range")
 
     def warnings(self) -> tuple[str, ...]:
         """Return warnings if points were left out, or are stored with too few digits."""
         found = []
         if self.num_dropped:
             found.append(f"{self.num_dropped} points with NaN or infinite coordinates left out")
+        if self.is_colored and not self.is_varied and self.color is not None:
+            color = " ".join(map(str, self.color.tolist()))
+            found.append(f"all points have one colour ({color}), which shows nothing: wanted their colours")
         if self.step >= COARSE:
             what = f"its float32 coordinates, far from the origin, are rounded to {self.step:.2g} m"
             found.append(f"{what}: export it in float64, or nearer to its origin")
@@ -154,7 +162,7 @@ class CloudStream:
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres; append each file's validator once it is read."""
         for source in self.sources:
-            validator = PointValidator(source.path, self.scale)
+            validator = PointValidator(source.path, self.scale, source.channel == "colors")
             total = None if source.num_points is None else math.ceil(source.num_points / reader.CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
@@ -207,19 +215,23 @@ class CloudStream:
         return Cloud(points, colors, origin_world, warnings, self.up, self.has_colors)
 
 
-def stream_of_arrays(points: Floats, colors: NDArray[Any] | None) -> CloudStream:
-    """Return a cloud in memory: points (N, 3), and colours (N, 3): uint8, uint16, floats in [0, 1], None."""
+def stream_of_arrays(
+    points: Floats, colors: NDArray[Any] | None, color_range: float | None = None
+) -> CloudStream:
+    """Return a cloud in memory: points (N, 3), and colours (N, 3) of any range, or None."""
     if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"
         raise InputError(f"points, colors: found shapes {shapes}, wanted arrays of shape (N, 3)")
     if points.dtype.kind not in "fiu":
         raise InputError(f"points: found {points.dtype}, wanted numbers")
     given = np.full(points.shape, reader.GRAY, np.uint8) if colors is None else colors
-    brightest = reader.find_full_brightness(ARRAYS, [f"{given.dtype.kind}{given.dtype.itemsize}"])
     parts = [(reader.points_of([*points.T]), given)]
+    usual = reader.USUAL.get(given.dtype.str[1:], reader.BYTE_RANGE)
+    settings = replace(IN_METRES, color_range=255.0 if given.dtype == np.uint8 else color_range)
+    brightest, notes = reader.find_brightest(ARRAYS, parts, settings, usual)
     chunk = next(reader.color_chunks(parts, brightest, lambda row: f"{ARRAYS}, row {row}"))
     channel: Channel = "shape" if colors is None else "colors"
-    source = reader.PointSource(ARRAYS, lambda: iter([chunk]), len(given), channel=channel)
+    source = reader.PointSource(ARRAYS, lambda: iter([chunk]), len(given), notes, channel=channel)
     return CloudStream([source], sha256=sha256_of_arrays(points, given))
 
 
@@ -232,6 +244,7 @@ class CloudFormat(NamedTuple):
     # MissingChannelError if the file has no such channel
     open_source: Callable[[Path, CloudSettings, Channel], reader.PointSource]
     has_labels: bool = False  # the reader knows them
+    has_columns: bool = False  # that can be named
 
 
 def _begins(*magic: bytes) -> Callable[[bytes], bool]:
@@ -244,13 +257,19 @@ FORMATS = (
     CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
     CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd, has_labels=True),
     CloudFormat("PTX", (".ptx",), text.has_ptx_magic, text.open_ptx),
-    CloudFormat("PTS", (".pts",), _begins(), text.open_pts),
+    CloudFormat("PTS", (".pts",), _begins(), text.open_pts, has_columns=True),
     CloudFormat("NumPy .npz", (".npz",), npz.has_npz_magic, npz.open_npz),
-    CloudFormat("NumPy .npy", (".npy",), _begins(npz.NPY_MAGIC), npz.open_npy),
+    CloudFormat("NumPy .npy", (".npy",), _begins(npz.NPY_MAGIC), npz.open_npy, has_columns=True),
     CloudFormat(
         "OBJ, GLB and glTF meshes", (".obj", ".glb", ".gltf"), _begins(mesh_files.GLB_MAGIC), mesh.open_mesh
     ),
-    CloudFormat("text x y z r g b", (".txt", ".xyz", ".asc", ".csv", ".xyzrgb"), _begins(), text.open_text),
+    CloudFormat(
+        "text x y z r g b",
+        (".txt", ".xyz", ".asc", ".csv", ".xyzrgb"),
+        _begins(),
+        text.open_text,
+        has_columns=True,
+    ),
 )
 WANTED = f"wanted a point cloud: {', '.join(f.name for f in FORMATS)}"
 
@@ -283,6 +302,9 @@ def open_source(path: Path, settings: CloudSettings = IN_METRES) -> reader.Point
         if settings.labels and not format_.has_labels:
             known = ", ".join(f.name for f in FORMATS if f.has_labels)
             raise InputError(f"{path}: labels are not read from {format_.name}, wanted {known}")
+        if settings.columns and not format_.has_columns:
+            known = ", ".join(f.name for f in FORMATS if f.has_columns)
+            raise InputError(f"{path}: {format_.name} names its columns; `columns` is for {known}")
         try:
             return _open_channel(format_, path, settings)
         except reader.MissingChannelError:

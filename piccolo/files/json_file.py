@@ -3,6 +3,7 @@
 import json
 import math
 import stat
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -57,9 +58,10 @@ def reading_once() -> Iterator[None]:
 
 
 def read_text(path: Path, wanted: str, max_size: int = MAX_SIZE) -> str:
-    """Return the text of a UTF-8 file."""
+    """Return the text of a UTF-8 file, or of one in UTF-16 with a mark."""
+    content = read_bytes(path, wanted, max_size)
     try:
-        return read_bytes(path, wanted, max_size).decode("utf-8-sig")
+        return content.decode("utf-16" if content[:2] in (BOM_UTF16_LE, BOM_UTF16_BE) else "utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: found bytes that are no text, {wanted}") from error
 
@@ -106,5 +108,7 @@ def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> li
 
 
 def describe(error: Exception) -> str:
-    """Return what one of DAMAGE says: errors of our own in words, a missing key with its kind."""
-    return str(error) if isinstance(error, ValueError) else repr(error)
+    """Return what one of DAMAGE says, in words."""
+    if isinstance(error, KeyError):
+        return f"no field {str(error.args[0])[:40]!r}"
+    return str(error) if isinstance(error, ValueError) else "fields of another kind"

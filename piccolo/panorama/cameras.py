@@ -27,6 +27,8 @@ TURNED: dict[object, tuple[Array, int]] = {
     8: (np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]), -1),
 }
 HOW = "; `camera`, `focal_px`, or `fov_deg` with `projection` pinhole set it exactly"
+LONGEST = 2.5  # times as long as high is no photo, but a panorama that a phone has swept
+LONG = "no photo is that long: `projection` cylindrical and `fov_deg` tell of a phone's sweep panorama"
 AS_SPHERE = "read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole: it has "
 GUESS = "`refine_focal` needs EXIF, `focal_px`, `camera`, or `projection` pinhole and `fov_deg`"
 MIN_REPORTED = 0.01  # of a picture: black borders below this are masked without a warning
@@ -86,7 +88,8 @@ def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     fov = 2.0 * math.degrees(math.atan(width / 2.0 / found.focal))
     focal = f"focal length {found.focal:.0f} px from {found.source}"
     note = f"read as a pinhole photo {fov:.1f} deg wide, {focal}"
-    return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, "EXIF", (note + HOW,))
+    notes = (note + HOW, LONG) if max(picture.size) > LONGEST * min(picture.size) else (note + HOW,)
+    return Cameras((Mount(pinhole(width, height, found.focal)),), found.deviation, "EXIF", notes)
 
 
 def _calibrate(path: Path, picture: Picture, calibration: Calibration) -> tuple[Mount, ...]:

@@ -22,9 +22,8 @@ from ..arrays import Array, Bytes, Mask
 from ..errors import InputError
 from ..geometry.pose import DECIMALS
 from .model import GPano
-from .picture import MAX_WIDTH, open_picture
+from .picture import MAX_WIDTH, SPHERE_NAMESPACE as NAMESPACE, open_picture
 
-NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
 PREFIX = re.compile(rb"xmlns:([A-Za-z_][\w.-]{0,40})\s{0,9}=\s{0,9}[\"']" + re.escape(NAMESPACE))
 FIELD = rb"\b%s:(\w{1,60})(?:\s{0,9}=\s{0,9}[\"']([^\"'<>]{0,80})[\"']|\s{0,9}>([^<>]{0,80})</)"
 MAX_NUMBER = 1e9

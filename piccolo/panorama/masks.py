@@ -5,6 +5,7 @@ is narrow, as wrongly masked pixels are lost. The thresholds were set by hand, a
 tests/test_panorama_masks.py has the rooms that they must not change and the patches that they find.
 """
 
+import math
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -46,6 +47,7 @@ FISHEYE_BLACK = 24  # levels: the dark around the circles carries some noise
 MIN_BLACK_OUTSIDE = 0.98
 MIN_BRIGHT_INSIDE = 0.7  # of each sector of a ring within the circle
 FISHEYE_SECTORS = 8
+MIN_ALIKE = 0.9  # correlation of the pictures of two eyes, without the mean of each row
 MIN_MASK = (16, 8)  # [px]
 WHITE = 128  # and above is to be ignored
 
@@ -188,17 +190,35 @@ def is_dual_fisheye(rgb: Bytes) -> bool:
     return True
 
 
+def shows_twice(rgb: Bytes, axis: int) -> bool:
+    """Return True if two halves along an axis show the same, as the pictures of two eyes do.
+
+    Beside each other, they have an edge between them; a sphere has none, also of a room that repeats.
+    """
+    small = cv2.resize(rgb, (2 * FISHEYE_SIZE, 2 * FISHEYE_SIZE), interpolation=cv2.INTER_AREA).astype(float)
+    steps = np.abs(np.diff(small, axis=1)).mean(axis=(0, 2))
+    if axis and steps[FISHEYE_SIZE - 1] < max(MIN_STEP, MIN_DETAIL_RATIO * float(np.median(steps))):
+        return False
+    halves = [half - half.mean(axis=1, keepdims=True) for half in np.split(small, 2, axis=axis)]
+    scale = math.sqrt(float(np.square(halves[0]).sum() * np.square(halves[1]).sum()))
+    return float((halves[0] * halves[1]).sum()) > MIN_ALIKE * scale
+
+
 def find_mask(mask: Path, pano: Path) -> Path | None:
-    """Return the file of a mask: `mask`, or in that folder the file named as the panorama, or None."""
+    """Return the file of a mask: `mask`, or in that folder the file named as the panorama, or None.
+
+    COLMAP appends `.png` to the panorama's name, Metashape `_mask` to that without suffix.
+    """
     if not mask.is_dir():
         return mask
-    return next((file for suffix in SUFFIXES if (file := mask / (pano.stem + suffix)).is_file()), None)
+    names = (f"{stem}{suffix}" for stem in (pano.stem, pano.name, f"{pano.stem}_mask") for suffix in SUFFIXES)
+    return next((file for name in names if (file := mask / name).is_file()), None)
 
 
-def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, Mask]:
+def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool = False) -> tuple[int, Mask]:
     """Return the index of the size (width, height) whose shape a mask has, and its pixels that count (H, W).
 
-    A larger mask masks a pixel if any of its own pixels there is white, a smaller one is enlarged.
+    A larger mask masks a pixel if any of its own pixels there is ignored, a smaller one is enlarged.
 
     Raises InputError if the mask can't be read, or has the shape of none of the sizes, within 1 %.
     """
@@ -206,7 +226,7 @@ def read_mask(path: Path, sizes: list[tuple[int, int]]) -> tuple[int, Mask]:
     height, width = rgb.shape[:2]
     for k, size in enumerate(sizes):
         if abs(width * size[1] - height * size[0]) <= ASPECT_TOLERANCE * height * size[0]:
-            is_white = (rgb.max(axis=2) >= WHITE).astype(np.float32)
+            is_white = ((rgb.max(axis=2) >= WHITE) != is_black_ignored).astype(np.float32)
             # averages of a larger mask are above 0 where any pixel is white
             method = cv2.INTER_AREA if width > size[0] else cv2.INTER_NEAREST
             return k, np.asarray(cv2.resize(is_white, size, interpolation=method) == 0)

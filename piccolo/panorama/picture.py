@@ -15,7 +15,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, features
 from PIL.ExifTags import IFD, Base
 from PIL.Image import Transpose
 from PIL.ImageFile import ImageFile
@@ -31,12 +31,13 @@ from ..geometry.colors import Labels, label_colors
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 
-WANTED = "wanted a whole JPEG, PNG, TIFF, WebP or HEIC picture"
+WANTED = "wanted a whole JPEG, PNG, TIFF, WebP, HEIC or AVIF picture"
 MIN_WIDTH = 128
 MIN_HEIGHT = 64
 MAX_WIDTH = 32768
 MAX_HEIGHT = 16384
 BYTES_PER_PIXEL = 12  # while a picture is decoded, turned and masked; 10 were measured, more with alpha
+SPHERE_NAMESPACE = b"http://ns.google.com/photos/1.0/panorama/"
 MAX_XMP_SIZE = 1 << 20  # [byte] what is longer is left aside
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 FORMATS: dict[bytes, type[ImageFile]] = {
@@ -48,7 +49,8 @@ FORMATS: dict[bytes, type[ImageFile]] = {
 # of still pictures, behind a box's size and "ftyp"
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
 # at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing
-MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840, "WEBP": 1 << 30, "HEIF": 1 << 30}
+MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840}
+MAX_PIXELS_PER_BYTE |= dict.fromkeys(("WEBP", "HEIF", "AVIF"), 1 << 30)
 # what a viewer does to the stored picture, by EXIF's number
 TURNS: dict[object, Transpose] = {
     2: Transpose.FLIP_LEFT_RIGHT,
@@ -61,6 +63,9 @@ TURNS: dict[object, Transpose] = {
 }
 PHOTOMETRIC = 262  # tags of TIFF
 SAMPLE_FORMAT = 339
+DNG_VERSION = 50706
+SUBFILE_TYPE = 254
+REDUCED = 1
 WHITE_IS_ZERO = 0
 UNSIGNED = 1
 LABEL_KINDS = (b"\x08\x00", b"\x10\x00", b"\x08\x02")  # in a PNG's header: grey of 8 and 16 bits, RGB of 8
@@ -157,6 +162,8 @@ def open_picture(path: Path, data: bytes) -> Iterator[ImageFile]:
     kind = next((kind for magic, kind in FORMATS.items() if data.startswith(magic)), None)
     if data[4:8] == b"ftyp" and data[8:12] in HEIF_BRANDS:
         kind = import_optional(path, "pillow_heif").HeifImageFile
+    if data[4:12] == b"ftypavif" and features.check("avif"):  # of Pillow 11.3 and newer
+        kind = import_optional(path, "PIL.AvifImagePlugin").AvifImageFile
     if kind is None:
         raise InputError(f"{path}: begins with {data[:8]!r}, {WANTED}")
     try:
@@ -184,6 +191,8 @@ def _check(path: Path, image: ImageFile, num_bytes: int, min_size: tuple[int, in
     if image.format in ("PNG", "WEBP") and getattr(image, "is_animated", False):
         raise InputError(f"{path}: the {image.format} is animated, wanted a still picture")
     tags = image.tag_v2 if isinstance(image, TiffImageFile) else {}
+    if DNG_VERSION in tags or tags.get(SUBFILE_TYPE) == REDUCED:
+        raise InputError(f"{path}: a raw file, or a thumbnail, wanted the developed picture (JPEG, TIFF)")
     is_inverted = image.mode.startswith("I;16") and tags.get(PHOTOMETRIC) == WHITE_IS_ZERO
     if image.mode in ("I", "F") or is_inverted or set(tags.get(SAMPLE_FORMAT, ())) - {UNSIGNED}:
         wanted = "wanted unsigned ones of 8 or 16 bits"
@@ -254,8 +263,12 @@ def _is_cut(data: bytes, image: JpegImageFile) -> bool:
 
 
 def _xmp(image: ImageFile) -> bytes:
-    """Return the picture's XMP packet; empty if it has none, or one that is damaged or long."""
-    xmp = image.info.get("xmp", b"")
+    """Return the picture's XMP packet; empty if it has none, or one that is damaged or long.
+
+    Of several in a JPEG it is the one with fields of a Photo Sphere.
+    """
+    packets = [content for name, content in getattr(image, "applist", []) if name == "APP1"]
+    xmp = next((some for some in packets if SPHERE_NAMESPACE in some), image.info.get("xmp", b""))
     return xmp if isinstance(xmp, bytes) and len(xmp) <= MAX_XMP_SIZE else b""
 
 

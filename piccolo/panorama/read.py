@@ -1,8 +1,10 @@
 """A picture file or a folder of cube faces, read as a panorama: a full sphere, and the pixels that count."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..arrays import Bytes, Mask
@@ -17,7 +19,7 @@ from . import gpano
 from .cameras import Cameras, cameras_of, read_views, rig_cameras
 from .cube import cube_of_cells, face_paths, read_cube_folder
 from .gpano import ASPECT_TOLERANCE, CropRegion
-from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask
+from .masks import black_borders, find_mask, is_dual_fisheye, mask_pole, polar_disc, read_mask, shows_twice
 from .model import FocalPrior, GPano, Panorama
 from .photo import elevation_deg
 from .picture import BYTES_PER_PIXEL, Picture, picture_shape, read_labels, read_picture
@@ -38,7 +40,7 @@ MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a w
 
 
 def read_panorama(photo: File | Bytes | Photo, labels: Labels | None = None) -> Panorama:
-    """Return the full sphere of a JPEG, PNG, TIFF, WebP or HEIC file, a folder of six cube faces or an array.
+    """Return the full sphere of a picture file, a folder of six cube faces or an array.
 
     Colours have 8 bits (of 16 the upper 8, v >> 8), grey becomes RGB, EXIF's orientation is applied. Not
     valid are pixels of alpha 0, outside a crop, masked, in black borders and in discs over a pole. Labels
@@ -78,6 +80,8 @@ def _read_picture(photo: Photo) -> Panorama:
     """Read the photo in one file."""
     path = photo.path
     picture = read_picture(path)
+    if photo.projection == "cylindrical" and photo.fov_deg is not None:
+        picture = _unroll(picture, math.radians(photo.fov_deg))
     if cube := cube_of_cells(path, picture, photo.cube_order):
         return _embed_and_mask(photo, cube, CropRegion(), None)
     fields = gpano.gpano_fields(picture.xmp)
@@ -186,7 +190,12 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
         return gpano.region_of_fov(photo.fov_deg, width, height), notes
     name = fields.get("ProjectionType", "").lower()
     if name not in ("", "equirectangular"):
-        raise InputError(f"{photo.path}: its metadata names the projection {name!r}, wanted equirectangular")
+        wanted = "wanted equirectangular, or of a cylinder `projection` cylindrical and `fov_deg`"
+        raise InputError(f"{photo.path}: its metadata names the projection {name!r}, {wanted}")
+    if width == height and shows_twice(picture.rgb, 0):
+        raise InputError(
+            f"{photo.path}: two panoramas above each other, one for each eye, wanted one of them"
+        )
     notes = []
     region = gpano.crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
@@ -201,7 +210,23 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
     if region.is_full and is_dual_fisheye(picture.rgb):
         found = "two fisheye pictures side by side, wanted their calibration as `camera` (docs/CAMERAS.md)"
         raise InputError(f"{photo.path}: {found}, or a panorama that the camera's program has stitched")
+    if region.is_full and shows_twice(picture.rgb, 1):
+        found = "two half spheres side by side, one for each eye (VR180)"
+        raise InputError(f"{photo.path}: {found}, wanted a full sphere, or one of them as a fisheye photo")
     return region, notes
+
+
+def _unroll(picture: Picture, angle: float) -> Picture:
+    """Return a cylinder's picture, which shows `angle` [rad] across, as a strip of the sphere."""
+    width, height = picture.size
+    radius = width / angle  # [px]
+    half = math.atan(height / 2.0 / radius)
+    elevations = half - (np.arange(max(round(2.0 * half * radius), 1)) + 0.5) / radius
+    rows = (height / 2.0 - radius * np.tan(elevations) - 0.5).astype(np.float32)
+    u, v = np.meshgrid(np.arange(width, dtype=np.float32), rows)
+    rgb = cv2.remap(picture.rgb, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    counts = cv2.remap(picture.is_valid.astype(np.uint8), u, v, cv2.INTER_NEAREST)
+    return replace(picture, rgb=np.asarray(rgb, np.uint8), is_valid=np.asarray(counts > 0))
 
 
 def _is_like_photo(picture: Picture) -> bool:
@@ -249,7 +274,10 @@ def _user_masks(path: Path, sizes: list[tuple[int, int]], photo: Photo, notes: l
     if file is None:
         notes.append(f"found no mask {path.stem} in {photo.mask}")
         return {}
-    index, counts = read_mask(file, sizes)
+    is_folder = Path(photo.mask).is_dir()
+    if is_black_ignored := is_folder and file.stem != path.stem:  # a name that COLMAP or Metashape gives
+        notes.append(f"of the mask {file.name}, black is ignored, as COLMAP and Metashape have it")
+    index, counts = read_mask(file, sizes, is_black_ignored)
     return {index: counts}
 
 

@@ -40,7 +40,7 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
             best = None
             slot += 1
         if time >= (slot - NEIGHBORHOOD) * every:
-            rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+            rgb = _upright(frame)
             sharpness = measure_sharpness(rgb)
             if best is None or sharpness > best[0]:
                 best = sharpness, time, rgb
@@ -54,7 +54,7 @@ def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[V
     for time, frame in _decode(video) if left else ():
         if round(1000.0 * time) in left:
             left.remove(round(1000.0 * time))
-            yield _write_frame(video, folder, time, np.asarray(frame.to_ndarray(format="rgb24"), np.uint8))
+            yield _write_frame(video, folder, time, _upright(frame))
         if not left:
             return
 
@@ -66,6 +66,12 @@ def measure_sharpness(rgb: Bytes) -> float:
     return float(cv2.Laplacian(cv2.cvtColor(small, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
 
 
+def _upright(frame: Any) -> Bytes:
+    """Return the RGB (H, W, 3) of a frame, turned as players show it; phones store it as the sensor lies."""
+    rgb = np.asarray(frame.to_ndarray(format="rgb24"), np.uint8)
+    return np.ascontiguousarray(np.rot90(rgb, round(frame.rotation / 90)))
+
+
 def _decode(video: Path) -> Iterator[tuple[float, Any]]:
     """Yield times [s] from the first frame, and the frames as PyAV returns them."""
     av = import_optional(video, "av", "video")
@@ -75,6 +81,10 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
             if not container.streams.video:
                 raise InputError(f"{video}: found no picture in it, {WANTED}")
             stream = container.streams.video[0]
+            sizes = [(some.width, some.height) for some in container.streams.video]
+            if sizes.count(sizes[0]) > 1:
+                found = f"found {len(sizes)} videos of {stream.width} x {stream.height}, of one lens each"
+                raise InputError(f"{video}: {found}, wanted one that the camera's program has stitched")
             label = f"{video}: frames of {stream.width} x {stream.height}"
             check_memory(stream.width * stream.height * BYTES_PER_PIXEL, label, "make the video smaller")
             stream.thread_type = "AUTO"

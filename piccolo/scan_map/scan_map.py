@@ -223,7 +223,8 @@ def check_up(octree: Octree, R_map_from_world: Array, taken: UpAxis) -> tuple[st
     nearest = f"{'-' if up_world[k] < 0.0 else ''}{'xyz'[k]}"
     angle = np.degrees(np.arccos(max(cosine, -1.0)))
     text = f"the floors face {angle:.0f} deg away from {taken}, which is used as up ({reason})"
-    return (f"{text}; set `up` to {nearest}, or rotate the scan with tools/align_gravity.py",)
+    advice = "" if nearest == taken else f"set `up` to {nearest}, or "
+    return (f"{text}; {advice}rotate the scan with tools/align_gravity.py",)
 
 
 def find_local_features(scan_map: ScanMap, workers: Workers) -> FeatureMap:

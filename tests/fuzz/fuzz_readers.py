@@ -13,6 +13,7 @@ import atheris
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from piccolo.batch.priors import read_priors
+from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.camera.calibration import read_cameras, read_rig
 from piccolo.cloud.settings import IN_METRES
 from piccolo.cloud.stream import FORMATS
@@ -29,7 +30,8 @@ OTHERS = {
     "jpg": read_panorama,
     "tif": read_photo_facts,
     "rig.json": read_rig,
-    "cameras.txt": read_cameras,
+    **dict.fromkeys(("cameras.txt", "cameras.bin", "camera.json", "c.yaml", "c.xml"), read_cameras),
+    **dict.fromkeys(("images.txt", "images.bin", "t.json"), lambda path: read_relative_poses(path, [])),
     "map": load_map,
     "csv": lambda path: read_priors(path, Prior()),
     "scene.json": read_scene,

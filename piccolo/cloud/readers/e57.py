@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
@@ -14,7 +14,7 @@ import numpy as np
 from ...arrays import Array, Bytes
 from ...errors import InputError
 from ...geometry.pose import Pose, rotate_points
-from ..settings import IN_METRES, Channel, CloudSettings
+from ..settings import IN_METRES, RANGES, Channel, CloudSettings
 from . import e57_file, reader
 from .e57_file import E57File, open_file, parse_integer, read_number, refusing
 from .reader import CHUNK, MissingChannelError, PointSource
@@ -29,6 +29,8 @@ INVALID = {  # fields that are 0 in valid points
     COLORS: "isColorInvalid",
     (INTENSITY,): "isIntensityInvalid",
 }
+OPEN = {"Float": (1.0, 1.0)}  # ranges that follow from the values: the usual brightest one, twice
+WIDE = RANGES[-1], RANGES[-1]  # of whole numbers
 TOLERANCE = 0.01  # of 255, what a float colour may lie outside of its range
 CHANNELS: dict[Channel, tuple[str, ...]] = {"colors": COLORS, "intensity": (INTENSITY,), "shape": ()}
 WANTED: dict[Channel, str] = {
@@ -68,21 +70,23 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     """Return the points of all scans of an E57 file that have colours, or another channel.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
-    range is the scan's colorLimits, or else that of the field's declaration; it is never guessed. If only
-    some scans have the channel, the others are left out, with a warning.
+    range is the scan's colorLimits, or else that of the field's declaration; one of 16 bits or more may have
+    room to spare: then the values decide, as in all formats. If only some scans have the channel, the others
+    are left out, with a warning.
     """
     with open_file(path) as file:
         scans, left_out = _scans(file, CHANNELS[channel])
+        notes = _set_ranges(file, scans, options)
     if not scans:
         error = InputError if channel == "shape" else MissingChannelError
         raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
     num_points = sum(scan.num_points for scan in scans)
-    source = reader.make_source(path, partial(_read, path, scans), channel, num_points=num_points)
+    source = reader.make_source(path, partial(_read, path, scans), channel, options, num_points)
     poses = [scan.pose for scan in scans if scan.pose is not None]
     # programs that know of no scanner write the identity
     placed = [p for p in poses if not np.array_equal(p.R_cam_from_world, np.eye(3)) or p.center_world.any()]
     return source._replace(
-        warnings=tuple(f"{path}: {what}; left out" for what in left_out),
+        warnings=(*(f"{path}: {what}; left out" for what in left_out), *notes),
         station_axes=tuple(pose.R_cam_from_world[2] for pose in placed),
     )
 
@@ -147,11 +151,30 @@ def _color_range(path: Path, element: Element, field: Element) -> tuple[float, f
         return low, high
     declared = [field.get(end) for end in ("minimum", "maximum")]
     if None in declared:
-        raise _UnusableError(f"has colours without a range: neither colorLimits nor a declared {name}")
+        return OPEN.get(field.get("type", ""), WIDE)
     first, last = (e57_file.read_scaled(path, field, text or "") for text in declared)
     if not first < last:
         raise _UnusableError(f"has colours without a range: {name} is declared {first:g} to {last:g}")
-    return first, last
+    return (first, last) if last < RANGES[-1] else OPEN.get(field.get("type", ""), WIDE)
+
+
+def _set_ranges(file: E57File, scans: list[E57Scan], settings: CloudSettings) -> tuple[str, ...]:
+    """Set the ranges of colours that the file leaves open, in place; return warnings."""
+    notes: list[str] = []
+    for k, scan in enumerate(scans):
+        usual = next((high for low, high in scan.color_ranges if low == high), None)
+        if not scan.color_ranges or (usual is None and settings.color_range is None):
+            continue
+
+        def read(scan: E57Scan = scan) -> Iterator[reader.Part]:
+            for columns in _read_scan(file, scan):
+                values = np.stack([columns[name] for name in COLORS], axis=1)
+                yield values, values
+
+        brightest, found = reader.find_brightest(file.path, read(), settings, usual or RANGES[-1])
+        scans[k] = replace(scan, color_ranges=((0.0, brightest),) * len(COLORS))
+        notes += found
+    return tuple(dict.fromkeys(notes))
 
 
 def _read(path: Path, scans: list[E57Scan]) -> Iterator[reader.Part]:

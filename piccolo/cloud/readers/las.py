@@ -24,6 +24,7 @@ from . import reader
 from .reader import CHUNK, MissingChannelError, PointSource, quote_line
 
 MAGIC = b"LASF"
+WORTH = 0.5  # of the promised points: a file that is cut off is read if it has as many
 MIN_HEADER_SIZE = 227  # [byte]
 MIN_HEADER_SIZE_1_4 = 375  # [byte]
 COMPRESSED_BIT = 0x80  # of the point format
@@ -80,6 +81,7 @@ class LasHeader(NamedTuple):
     scales: Array  # (3,) x y z
     offsets: Array  # (3,)
     is_compressed: bool
+    warnings: tuple[str, ...] = ()
 
     @property
     def dtype(self) -> np.dtype[np.void]:
@@ -131,12 +133,14 @@ def read_header(path: Path) -> LasHeader:
     if not (np.isfinite([scales, offsets]).all() and scales.all()):
         raise InputError(f"{path}: scales {scales} and offsets {offsets}, wanted finite ones and no scale 0")
     room = (size - points_offset) // record_size
-    if num_points == 0 or (num_points > room and not is_compressed):
-        promised = f"promises {num_points} points of {record_size} bytes, found room for {room}"
-        raise InputError(f"{path}: the header {promised}; the file is cut off or broken")
+    found = f"promises {num_points} points of {record_size} bytes, found room for {room}"
+    is_cut = num_points > room and not is_compressed
+    if num_points == 0 or (is_cut and room < WORTH * num_points):
+        raise InputError(f"{path}: the header {found}; the file is cut off or broken")
     return LasHeader(
-        path, size, header_size, points_offset, num_vlrs, point_format, record_size, num_points,
-        scales, offsets, is_compressed,
+        path, size, header_size, points_offset, num_vlrs, point_format, record_size,
+        room if is_cut else num_points, scales, offsets, is_compressed,
+        (f"{path}: the header {found}; read up to there",) if is_cut else (),
     )  # fmt: skip
 
 
@@ -308,7 +312,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
     if options.labels or channel == "shape":
         read = partial(_read, header, layout, "class")
-        return reader.make_source(path, read, channel, options.labels, header.num_points)
+        return reader.make_source(path, read, channel, options, header.num_points)
     if channel == "colors" and not header.has_colors:
         raise MissingChannelError(
             f"{path}: has no colours: point format {header.point_format} has none, {WANTED}"
@@ -321,12 +325,13 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         is_zero = f"0 in all {num_samples} points checked"
         what = f"has no colours: red green blue are {is_zero}, {WANTED}"
         raise MissingChannelError(f"{path}: {what if field == 'rgb' else f'the intensity is {is_zero}'}")
-    is_8_bit = field == "rgb" and largest <= 255
+    is_8_bit = field == "rgb" and (options.color_range or largest) <= 255
     read = partial(_read, header, layout, field, is_8_bit)
-    source = reader.make_source(path, read, channel, num_points=header.num_points)
+    source = reader.make_source(path, read, channel, options, header.num_points)
     checked = f"(largest value {largest} in {num_samples} points checked)"
     note = f"{path}: the colours are read as 8-bit values in 16-bit fields {checked}"
-    return source._replace(warnings=(note,) if is_8_bit else ())
+    notes = (note,) if is_8_bit and options.color_range is None else ()
+    return source._replace(warnings=(*header.warnings, *notes))
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:
@@ -383,5 +388,6 @@ def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> Bytes
     if not is_8_bit:
         return TO_8_BIT[rgb]
     if (rgb > 255).any():
-        raise InputError(f"{header.path}: a colour of {rgb.max()} in a file whose other colours are 8-bit")
+        found = f"a colour of {rgb.max()} in a file whose other colours are 8-bit"
+        raise InputError(f"{header.path}: {found}; if they are not, set `color_range`")
     return rgb.astype(np.uint8)

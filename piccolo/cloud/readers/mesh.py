@@ -10,6 +10,7 @@ nor on chance.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,7 +22,7 @@ from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import BRIGHTEST, CHUNK, GRAY, MissingChannelError, PointSource, RawCloud
+from .reader import CHUNK, GRAY, USUAL, MissingChannelError, PointSource, RawCloud, find_brightest
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -168,7 +169,9 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
     if channel == "intensity":
         raise MissingChannelError(f"{path}: has no intensity")
     scale = options.scale
+    loaded = replace(loaded, settings=options)
     surfaces, notes = _surfaces(loaded, channel == "shape")
+    notes += loaded.notes
     num_triangles = sum(len(surface.triangles) for surface in surfaces)
     if num_triangles > MAX_TRIANGLES:
         raise InputError(f"{path}: {num_triangles} triangles, wanted at most {MAX_TRIANGLES}")
@@ -262,13 +265,13 @@ def _with_colors(surface: Surface, loaded: Loaded, mesh: Any, factor: Array | No
     of_vertices = (mesh.visual if loaded.is_gltf else mesh).vertex_attributes.get("color")
     of_faces = mesh.face_attributes.get("color")
     if of_vertices is not None:
-        colors = _fractions(loaded.path, of_vertices, len(surface.vertices))
+        colors = _fractions(loaded, of_vertices, len(surface.vertices))
         if loaded.is_gltf and factor is not None:
             colors = colors * factor
         return surface._replace(colors=colors, corners=triangles)
     rows = np.zeros(1, np.int64)
     if of_faces is not None:
-        factor = _fractions(loaded.path, of_faces, len(triangles))
+        factor = _fractions(loaded, of_faces, len(triangles))
         rows = np.arange(len(triangles))
     if factor is None or (surface.texture is not None and np.all(factor == 1.0)):
         return surface
@@ -286,12 +289,18 @@ def _check_uv(path: Path, raw: Any, vertices: Array) -> Array:
     return uv
 
 
-def _fractions(path: Path, raw: Any, count: int) -> Array:
-    """Return colours (N, 3) in [0, 1]; their range in the file follows from their type."""
+def _fractions(loaded: Loaded, raw: Any, count: int) -> Array:
+    """Return colours (N, 3) in [0, 1]; in glTF their range follows from their type."""
+    path = loaded.path
     colors = np.array(raw)
     if colors.ndim != 2 or len(colors) != count or colors.shape[1] < 3:
         raise InputError(f"{path}: colours of shape {colors.shape}, wanted {count} rows of red green blue")
-    fractions: Array = colors[:, :3] / BRIGHTEST.get(colors.dtype.str[1:], 1.0)
+    brightest = USUAL.get(colors.dtype.str[1:], 255.0)
+    if not loaded.is_gltf and (colors.dtype != np.uint8 or loaded.settings.color_range):
+        parts = [(colors[:, :3], colors[:, :3])]
+        brightest, notes = find_brightest(path, parts, loaded.settings, brightest)
+        loaded.notes.update(dict.fromkeys(notes))
+    fractions: Array = colors[:, :3] / brightest
     if not np.all((fractions >= 0.0) & (fractions <= 1.0)):
-        raise InputError(f"{path}: a colour of {np.abs(colors).max():g}, wanted 0 to 1 or bytes")
+        raise InputError(f"{path}: a colour of {np.abs(colors).max():g}, wanted 0 to {brightest:g}")
     return np.asarray(fractions, dtype=np.float64)

@@ -6,6 +6,7 @@ here, and unread parts are removed from the JSON.
 """
 
 import json
+import re
 import struct
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -21,6 +22,8 @@ from PIL import Image
 from ...arrays import Bytes
 from ...errors import InputError
 
+# of a map in a material library, before the name of its file
+MAP_OPTIONS = re.compile(r"^(?:-\w+(?:\s+(?:-?[\d.]+|on|off|[a-z]))*\s+)+", re.IGNORECASE)
 MAX_TEXELS = 1 << 28  # 16,384 x 16,384: 1 GiB while it is looked up, three while it is decoded
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
@@ -117,7 +120,9 @@ class FolderResolver:
     """
 
     path: Path  # the mesh
+    is_lenient: bool = False  # a missing file costs its colours only
     refusal: InputError | None = None
+    notes: dict[str, None] = field(default_factory=dict)  # of missing files, in order
     _contents: dict[Path, bytes] = field(default_factory=dict)
 
     @property
@@ -126,9 +131,17 @@ class FolderResolver:
         return sum(map(len, self._contents.values()))
 
     def get(self, name: str) -> bytes:
-        """Return the content of a file, by the name that the mesh gives it."""
+        """Return the content of a file by the name that the mesh gives it, or else of the one beside it.
+
+        Of its name, capitals don't count then.
+        """
         folder = self.path.parent.resolve()
         problem = ""
+        name = MAP_OPTIONS.sub("", name.strip())
+        last = name.replace("\\", "/").rpartition("/")[2].lower()
+        beside = [entry.name for entry in folder.iterdir() if entry.name.lower() == last]
+        if len(beside) == 1 and not (folder / name.replace("\\", "/")).is_file():
+            name = beside[0]
         try:
             file = (folder / name.strip().replace("\\", "/")).resolve()  # names may be written on Windows
             if ":" in name or not file.is_relative_to(folder):  # ':' of a drive or a URL
@@ -140,11 +153,23 @@ class FolderResolver:
         except (OSError, ValueError, RuntimeError) as error:
             problem = f" ({error})"
         if problem:
-            self.refusal = InputError(f"{self.path}: names the file {name[:100]!a}{problem}")
-            raise self.refusal
+            refusal = InputError(f"{self.path}: names the file {name[:100]!a}{problem}")
+            self.refusal = None if self.is_lenient else refusal
+            self.notes[f"{refusal}; its colours are missing"] = None
+            raise refusal
         return self._contents[file]
 
     __getitem__ = get
+
+    @contextmanager
+    def noting(self) -> Iterator[None]:
+        """Within this, a missing file ends the block, with a note, if that costs colours only."""
+        num_notes = len(self.notes)
+        try:
+            yield
+        except InputError:
+            if not self.is_lenient or len(self.notes) == num_notes:
+                raise
 
 
 class Material(NamedTuple):

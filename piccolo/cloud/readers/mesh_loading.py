@@ -14,6 +14,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ...optional import import_optional
+from ..settings import IN_METRES, CloudSettings
 from . import mesh_files
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture
 
@@ -46,6 +47,8 @@ class Loaded:
     scene: Any  # trimesh.Scene
     materials: list[Material] | None = None  # of glTF, named by their rows
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
+    settings: CloudSettings = IN_METRES
+    notes: dict[str, None] = field(default_factory=dict)  # for the user, in order
 
     @property
     def is_gltf(self) -> bool:
@@ -93,20 +96,21 @@ def load_obj(path: Path, content: bytes) -> Loaded:
     odd = ODD_FACE.search(content)
     if odd:
         raise InputError(f"{path}: a face {odd[0][:40].decode('latin-1')!a}, wanted indices from 1 upwards")
-    resolver = FolderResolver(path)
+    resolver = FolderResolver(path, is_lenient=True)
     names = set(LIBRARY_LINE.findall(content))
     if len(names) > 1:
         raise InputError(f"{path}: names {len(names)} files of materials, wanted one")
     for name in names:
-        text = resolver.get(name.decode()).decode("utf-8", "replace")
-        _check_textures(resolver, TEXTURE_LINE.findall(text))
-    return Loaded(path, _scene(resolver, content, "obj"))
+        with resolver.noting():
+            text = resolver.get(name.decode()).decode("utf-8", "replace")
+            _check_textures(resolver, TEXTURE_LINE.findall(text))
+    return Loaded(path, _scene(resolver, content, "obj"), notes=resolver.notes)
 
 
 def _check_textures(resolver: FolderResolver, names: list[str]) -> None:
     """Refuse what is no image, which trimesh would ignore."""
     for name in sorted(set(names)):
-        with mesh_files.open_image(resolver.path, resolver.get(name), f" {name[:100]!a}"):
+        with resolver.noting(), mesh_files.open_image(resolver.path, resolver.get(name), f" {name[:100]!a}"):
             pass
 
 

@@ -20,15 +20,17 @@ from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
+from .text_columns import MAX_COLUMNS, name_columns, names_of_user, note_names
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
 ZIP_NAME_AT = 30  # [byte] in an archive: the name of its first member
+NUM_SAMPLES = 10_000  # rows by whose values columns are named
 MAX_RATIO = 200  # unpacked to packed; real scans stay below 10, deflate could reach 1032
 MAX_UNPACKED = 1 << 34  # [byte] of an archive's arrays, which are read whole
 POINTS_NAMES = ("points", "xyz")
 COLORS_NAMES = ("colors", "rgb")
-WANTED = "wanted .npy of x y z r g b (N, 6) with colours 0-255, or .npz with points (N, 3) and colors (N, 3)"
+WANTED = "wanted .npy of x y z r g b (N, 6), or .npz with points (N, 3) and colors (N, 3)"
 
 
 class ArrayInFile(NamedTuple):
@@ -60,43 +62,51 @@ class ArrayInFile(NamedTuple):
 
 
 def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
-    """Return the points of a .npy file: an array (N, 6) of x y z r g b, colours 0-255, or (N, 3) of x y z."""
+    """Return the points of a .npy file: an array (N, 6) of x y z r g b, or others as in a text file."""
     array = _open_array(path, None, path.stat().st_size)
-    if len(array.shape) != 2 or array.shape[1] not in (3, 6) or array.dtype.kind not in "fiu":
+    num_columns = array.shape[-1] if len(array.shape) == 2 else 0
+    if not 3 <= num_columns <= MAX_COLUMNS or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
-    if channel == "intensity" or (channel == "colors" and array.shape[1] == 3):
+    names = names_of_user(path, options, num_columns)
+    note = ""
+    if not names:
+        rows = next(array.read_rows(), np.empty((0, num_columns)))
+        names = name_columns(rows[:: 1 + len(rows) // NUM_SAMPLES].astype(np.float64))
+        note = note_names(path, names, "")
+    chosen = reader.find_fields([name for name in names if names.count(name) == 1], channel)
+    if not chosen:
         raise MissingChannelError(f"{path}: {array}, {WANTED}")
-    return _source(path, channel, array, array, "u1")
+    columns = [names.index(name) for name in chosen]
+
+    def read_columns() -> Iterator[reader.Columns]:
+        return (list(rows[:, columns].T) for rows in array.read_rows())
+
+    # as in text, where no type is declared
+    types = ["i8" if len(chosen) == reader.NUM_COLORED else "u4"] * len(chosen)
+    source = reader.Table(path, read_columns, chosen, types, array.shape[0]).source(channel, options)
+    return source._replace(warnings=(*filter(None, [note]), *source.warnings))
 
 
 def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
-    The range of colours follows from their type: uint8 0-255, uint16 0-65535, float 0-1. An archive whose
-    arrays promise more than 200 times the size of the file, or 16 GB, is refused.
+    An archive whose arrays promise more than 200 times the size of the file, or 16 GB, is refused.
     """
     if channel == "intensity":
         raise MissingChannelError(f"{path}: has no intensity")
     arrays = [_open_array(path, m.filename, m.file_size) for m in _members(path, channel == "shape")]
     points = arrays[0]
     colors = arrays[-1]
-    if points.shape != colors.shape or points.shape[1:] != (3,) or points.dtype.kind not in "fiu":
+    kinds = points.dtype.kind, colors.dtype.kind
+    is_right = points.shape[1:] == (3,) and colors.shape[1:] in ((3,), (4,)) and len({*kinds, *"fiu"}) == 3
+    if not is_right or points.shape[0] != colors.shape[0]:
         raise InputError(f"{path}: {points} and {colors}, {WANTED}")
-    return _source(path, channel, points, colors, colors.dtype.str[1:])
-
-
-def _source(
-    path: Path, channel: Channel, points: ArrayInFile, colors: ArrayInFile, type_: str
-) -> PointSource:
-    """Return points with colours of a type, of an array (N, 3) of each or of one (N, 6); or points alone."""
 
     def read() -> Iterator[reader.Part]:
-        if colors is points:
-            return ((reader.points_of([*rows.T]), rows[:, 3:]) for rows in points.read_rows())
         pairs = zip(points.read_rows(), colors.read_rows(), strict=True)
-        return ((reader.points_of([*xyz.T]), rgb) for xyz, rgb in pairs)
+        return ((reader.points_of([*xyz.T]), rgb[:, :3]) for xyz, rgb in pairs)
 
-    return reader.make_source(path, read, channel, None, points.shape[0], [type_])
+    return reader.make_source(path, read, channel, options, points.shape[0], [colors.dtype.str[1:]])
 
 
 def has_npz_magic(head: bytes) -> bool:

@@ -5,16 +5,14 @@ compression is LZF: literal runs of bytes, and copies of earlier ones.
 """
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ...arrays import Array, Mask
 from ...errors import InputError
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
@@ -31,13 +29,6 @@ LONG_COPY = 9  # the length by the control byte's upper three bits that goes on 
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
-PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
-COLOR_NAMES = (*((name,) for name in PACKED_NAMES), *reader.COLOR_NAMES)
-SCALAR_TYPES = ("f4", "f8", "u1", "u2", "u4", "i1", "i2", "i4"), "numbers of 32 bits or float64"
-TYPES = {
-    **dict.fromkeys("xyz", (("f4", "f8"), "float32 or float64")),
-    **dict.fromkeys(PACKED_NAMES, (("f4", "u4", "i4"), "uint32, int32 or float32")),
-}
 
 
 @dataclass(frozen=True)
@@ -164,9 +155,9 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     """Return the points of a PCD file.
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,
-    in ASCII too; or r g b (red green blue) of uint8 0-255, uint16 0-65535 or float 0-1. Alpha and all other
-    fields are left out, but for `intensity` or `label` where one is asked for. The size of a binary file is
-    compared with the header before memory is reserved.
+    in ASCII too; or r g b (red green blue). Alpha and all other fields are left out, but for `intensity` or
+    `label` where one is asked for. The size of a binary file is compared with the header before memory is
+    reserved.
     """
     header = read_header(path)
     fields = _select_fields(header, options, channel)
@@ -177,27 +168,25 @@ def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         raise InputError(f"{path}: the header promises {counts}; {BROKEN}")
     read = {"ascii": _read_ascii, "binary": _read_binary, "binary_compressed": _read_compressed}
     read_columns = partial(read[header.encoding], header, fields)
-    is_packed = fields[-1].name in PACKED_NAMES
-    join = partial(_read_packed, header, fields[-1].type) if is_packed else reader.join_columns
-    types = [] if is_packed else [field.type for field in fields[3:]]
-    read_parts = partial(join, read_columns)
-    return reader.make_source(path, read_parts, channel, options.labels, header.num_points, types)
+    names = [field.name for field in fields]
+    types = [field.type for field in fields]
+    return reader.Table(path, read_columns, names, types, header.num_points).source(channel, options)
 
 
 def _select_fields(header: PcdHeader, options: CloudSettings, channel: Channel) -> tuple[PcdField, ...]:
     """Return the fields x y z and one or three of colours, or the intensity or label, or no others."""
     names = [field.name for field in header.fields]
     found = {field.name: field for field in header.fields if field.count == names.count(field.name) == 1}
-    chosen = reader.find_fields(found, channel, options.labels, COLOR_NAMES)
+    chosen = reader.find_fields(found, channel, options.labels)
     if not chosen:
         listed = " ".join(names[:12]) or "none"
         error = MissingChannelError if {*"xyz"} <= found.keys() else InputError
         wanted = "wanted x y z and label" if options.labels else WANTED
         raise error(f"{header.path}: the fields are {quote_line(listed.encode())}, {wanted}")
-    for name in chosen if len(chosen) <= 4 else "xyz":
-        types, kinds = TYPES.get(name, SCALAR_TYPES)
-        if found[name].type not in types:
-            raise InputError(f"{header.path}: '{name}' is of type {found[name].type}, wanted {kinds}")
+    for name in chosen:
+        if found[name].type == "f1" or (name in chosen[:3] and found[name].type[0] != "f"):
+            wanted = "wanted float32 or float64" if name in chosen[:3] else "wanted numbers"
+            raise InputError(f"{header.path}: '{name}' is of type {found[name].type}, {wanted}")
     return tuple(found[name] for name in chosen)
 
 
@@ -234,34 +223,3 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
     ends = np.cumsum([field.size * header.num_points for field in kept])
     parts = dict(zip(kept, np.split(np.frombuffer(table, np.uint8), ends[:-1]), strict=True))
     yield from reader.in_chunks([parts[field].view("<" + field.type) for field in fields])
-
-
-def _read_packed(
-    header: PcdHeader, type_: str, read_columns: Callable[[], Iterator[reader.Columns]]
-) -> Iterator[reader.Part]:
-    """Yield the points with colours 0xAARRGGBB, in numbers of a declared type, which ASCII has as text."""
-    num_before = 0
-    for columns in read_columns():
-        points_world = reader.points_of(columns)
-        values = columns[3]
-        if header.encoding == "ascii":
-            has_position = np.isfinite(points_world).all(axis=1)
-            bits, is_right = _bits_of_text(np.where(has_position, values, 0.0), type_)
-            if not is_right.all():
-                wrong = int(np.argmin(is_right))
-                place = reader.point_label(header.path, num_before + wrong)
-                raise InputError(f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {type_}")
-        else:
-            bits = np.ascontiguousarray(values).view(np.uint32)
-        num_before += len(bits)
-        yield points_world, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
-
-
-def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
-    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits."""
-    if type_ == "f4":
-        # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
-        is_right = np.abs(values) <= np.finfo(np.float32).max
-        return np.where(is_right, values, 0.0).astype(np.float32).view(np.uint32), is_right
-    is_right = (values >= -(2.0**31)) & (values < 2.0**32) & (values == np.floor(values))
-    return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right

@@ -9,7 +9,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from io import BytesIO
+from itertools import takewhile
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
@@ -28,6 +30,9 @@ ELEMENT_LINE = re.compile(rb"^(\s*element[ \t]+\S+[ \t]+)(\S+)[ \t]*$", re.MULTI
 WANTED = "wanted a PLY file whose vertices have x y z and red green blue"
 LABELS_WANTED = "wanted x y z and a label (label, class or classification, or these after scalar_)"
 MAX_COUNT_DIGITS = 15
+MAX_ROW_SIZE = 1 << 24  # [byte] of a vertex with its lists
+OPACITY = "opacity"
+MOST_STRAY = 20  # vertices to a face in a cloud that is no mesh
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,11 @@ class PlyHeader:
     index: int  # of the element of the vertices
 
     @property
+    def pairs(self) -> list[tuple[PlyElement, int]]:
+        """The elements with their counts."""
+        return list(zip(self.elements, self.counts, strict=True))
+
+    @property
     def vertices(self) -> PlyElement:
         """The element of the vertices."""
         return self.elements[self.index]
@@ -51,8 +61,8 @@ class PlyHeader:
 def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
-    Colours are uchar 0-255, ushort 0-65535, or float and double 0-1. Other properties and elements are left
-    out. The file's size is compared with the header's counts before memory is reserved.
+    Other properties and elements are left out. The file's size is compared with the header's counts before
+    memory is reserved.
     """
     header = read_header(path)
     if _has_faces(header):
@@ -60,35 +70,36 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
             raise InputError(f"{path}: found a mesh, wanted points with labels")
         return open_ply_mesh(path, options, channel)
     names = _property_names(header, options, channel)
-    if not header.is_ascii:
+    if not header.is_ascii and not _lists_before(header):
         place_of_vertices(header)
-    types = [header.vertices.ply_property(name).val_dtype for name in names[3:]]
-    read = partial(reader.join_columns, partial(read_columns, header, names))
-    return reader.make_source(path, read, channel, options.labels, header.counts[header.index], types)
+    types = [header.vertices.ply_property(name).val_dtype for name in names]
+    read = partial(read_columns, header, names)
+    source = reader.Table(path, read, names, types, header.counts[header.index]).source(channel, options)
+    stray = sum(count for element, count in header.pairs if element.name == "face")
+    return (
+        source._replace(warnings=(f"{path}: {stray} faces left out", *source.warnings)) if stray else source
+    )
 
 
 def _has_faces(header: PlyHeader) -> bool:
-    """Return True for a mesh; InputError if trimesh would get the range of its colours wrong."""
-    found = dict(zip((element.name for element in header.elements), header.counts, strict=True))
-    if not found.get("face"):
-        return False
-    for element in header.elements:
-        for prop in element.properties:
-            if prop.name in reader.COLOR_NAMES[0] and prop.val_dtype not in ("u1", "f4", "f8"):
-                wrong = f"'{prop.name}' is of type {prop.val_dtype}"
-                raise InputError(f"{header.path}: {wrong}, wanted uchar 0-255 or float 0-1 in a mesh")
-    return True
+    """Return True for a mesh, not for a cloud with a few stray faces."""
+    num_faces = sum(count for element, count in header.pairs if element.name == "face")
+    return num_faces * MOST_STRAY > header.counts[header.index]
 
 
 def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
     """Yield the named columns of up to raw.CHUNK vertices; those of an ASCII file are float64."""
     if not header.is_ascii:
+        if _lists_before(header):
+            yield from _read_among_lists(header, names)
+            return
         for rows in reader.read_records(header.path, *place_of_vertices(header)):
             yield [rows[name] for name in names]
         return
     properties = [prop.name for prop in header.vertices.properties]
     columns = tuple(properties.index(name) for name in names)
-    lines = NumberLines(header.path, LineLayout(columns, len(properties), header.size), WANTED)
+    num_columns = None if any(map(_is_list, header.vertices.properties)) else len(properties)
+    lines = NumberLines(header.path, LineLayout(columns, num_columns, header.size), WANTED)
     lines.skip(sum(header.counts[: header.index]))
     for rows in lines.read_rows(header.counts[header.index]):
         yield list(rows.T)
@@ -122,12 +133,8 @@ def read_header(path: Path) -> PlyHeader:
 
 
 def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
-    """Return the index of the vertices' element; InputError if it or one before it has lists."""
+    """Return the index of the vertices' element."""
     for index, element in enumerate(elements):
-        lists = [prop.name for prop in element.properties if isinstance(prop, PlyListProperty)]
-        if lists:
-            found = f"the element '{element.name}' has the list property '{lists[0]}'"
-            raise InputError(f"{path}: {found}, wanted vertices without lists, before those that have them")
         if element.name == "vertex":
             return index
     raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
@@ -135,15 +142,18 @@ def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
 
 def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel) -> tuple[str, ...]:
     """Return the vertices' properties for x, y, z and red, green, blue, or intensity, or label, or none."""
-    found = [prop.name for prop in header.vertices.properties]
+    properties = header.vertices.properties
+    if header.is_ascii:  # of a line with lists only what is before them has its place
+        properties = tuple(takewhile(lambda prop: not _is_list(prop), properties))
+    found = [prop.name for prop in properties if not _is_list(prop)]
     names = reader.find_fields(found, channel, options.labels)
     if not names:
-        kind = "Gaussian splats without red green blue, " if "f_dc_0" in found else ""
-        listed = " ".join(found[:9]) or "no properties"
+        listed = " ".join(found[:9]) or "no properties before a list"
         wanted = LABELS_WANTED if options.labels else WANTED
-        error = MissingChannelError if {*"xyz"} <= {*found} else InputError
-        raise error(f"{header.path}: {kind}the vertices have {listed}, {wanted}")
-    return names
+        error = MissingChannelError if reader.find_fields(found, "shape") else InputError
+        raise error(f"{header.path}: the vertices have {listed}, {wanted}")
+    is_splat = names[3:6] == reader.SPLAT_NAMES and OPACITY in found
+    return (*names, OPACITY) if is_splat else names
 
 
 def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
@@ -157,3 +167,58 @@ def place_of_vertices(header: PlyHeader) -> tuple[int, int, np.dtype[np.void]]:
         promised = f"promises {count} vertices of {dtype.itemsize} bytes, found {room} bytes"
         raise InputError(f"{header.path}: the header {promised}; the file is cut off or broken")
     return offset, count, dtype
+
+
+def _is_list(prop: object) -> bool:
+    return isinstance(prop, PlyListProperty)
+
+
+def _lists_before(header: PlyHeader) -> bool:
+    """Return True if the vertices, or elements before them, have lists, so that rows differ in length."""
+    return any(_is_list(prop) for some in header.elements[: header.index + 1] for prop in some.properties)
+
+
+def _read_among_lists(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
+    """Yield the named columns of the vertices of a binary file with lists in them or before them."""
+    with header.path.open("rb") as file:
+        file.seek(header.size)
+        rest = b""
+        for element, num_rows in header.pairs[: header.index + 1]:
+            count = num_rows
+            types = {p.name: np.dtype(header.byte_order + p.val_dtype) for p in element.properties}
+            while count > 0:
+                block = file.read(MAX_ROW_SIZE)
+                rest += block
+                starts, end = _walk(rest, min(count, reader.CHUNK), element, header.byte_order)
+                if not starts and (not block or len(rest) > MAX_ROW_SIZE):
+                    raise InputError(f"{header.path}: {count} rows of '{element.name}' are missing or broken")
+                if element is header.vertices and starts:
+                    data = np.frombuffer(rest, np.uint8)
+                    places = dict(zip(types, np.array(starts).T[:, :, None], strict=True))
+                    bits = {name: data[places[name] + np.arange(types[name].itemsize)] for name in names}
+                    yield [bits[name].view(types[name])[:, 0] for name in names]
+                rest = rest[end:]
+                count -= len(starts)
+
+
+def _walk(data: bytes, count: int, element: PlyElement, byte_order: str) -> tuple[list[list[int]], int]:
+    """Return where [byte] the properties of up to `count` whole rows begin, and where the last row ends."""
+    order: Literal["little", "big"] = "big" if byte_order == ">" else "little"
+    sizes = [
+        (np.dtype(prop.val_dtype).itemsize, np.dtype(prop.len_dtype).itemsize if _is_list(prop) else 0)
+        for prop in element.properties
+    ]
+    starts: list[list[int]] = []
+    end = 0
+    while len(starts) < count:
+        at = end
+        row = []
+        for size, count_size in sizes:
+            row.append(at)
+            num_items = int.from_bytes(data[at : at + count_size], order) if count_size else 1
+            at += count_size + size * num_items
+        if at > len(data) or at == end:
+            break
+        starts.append(row)
+        end = at
+    return starts, end

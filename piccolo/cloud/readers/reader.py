@@ -1,8 +1,8 @@
 """Parts of all readers: chunks of points as in a file, and points from columns of numbers.
 
 Columns are arrays (N,) of x, y, z and red, green, blue, or of x, y, z and a scalar. Colours of any type
-become 8 bits; their range follows from the declared type and is never guessed. Labels become colours in place
-of the file's own. Intensity becomes a gray. Its unit differs from scanner to scanner, and a few mirrors
+become 8 bits; `find_brightest` has the one rule for their range. Labels become colours in place of the file's
+own. Intensity becomes a gray. Its unit differs from scanner to scanner, and a few mirrors
 outshine everything: the 1st percentile of a file becomes black, its 99th white. These are percentiles of all
 points, in any order, for which the file is read once more.
 """
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...arrays import Array, Bytes, Floats, Mask
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
-from ..settings import Channel, UpAxis
+from ..settings import IN_METRES, RANGES, Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
 CHUNK = 1 << 20  # points of a chunk, at most
@@ -30,19 +30,31 @@ CUT = "the file was cut while it was read, wanted a whole file"
 # Points (N, 3) in the file's unit, float32 if stored as such; and colours (N, 3), or a number (N,) of each.
 Part = tuple[NDArray[np.floating[Any]], NDArray[Any]]
 PartReader = Callable[[], Iterator[Part]]  # each call from the start
-# The value that means full brightness, by the type of a field without its byte order.
-BRIGHTEST = {"u1": 255.0, "u2": 65535.0, "f4": 1.0, "f8": 1.0}
-TYPES_WANTED = "uint8 0-255, uint16 0-65535 or float 0-1, one for all three"
+# The usual value of full brightness, by the type of a field without its byte order; of others 255.
+USUAL = {"u2": 65535.0, "f2": 1.0, "f4": 1.0, "f8": 1.0}
+BYTE_RANGE = 255.0
+EXCESS = 1.001  # of full brightness, up to which a value is rounded to it
+STRAY = 4.0  # times full brightness is a wrong colour, which is refused, not one of a wider range
+PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
+SPLAT_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussian splats
+FRACTION_NAMES = ("rf", "gf", "bf")  # CloudCompare's for colours 0-1
 COLOR_NAMES = (
     ("red", "green", "blue"),
     ("r", "g", "b"),
     ("diffuse_red", "diffuse_green", "diffuse_blue"),
+    ("scalar_r", "scalar_g", "scalar_b"),
+    FRACTION_NAMES,
+    *((name,) for name in PACKED_NAMES),
+    SPLAT_NAMES,
 )
+POINT_NAMES = (("x", "y", "z"), *(("easting", "northing", up) for up in ("elevation", "height", "z")))
 Columns = Sequence[NDArray[Any]]
-INTENSITY_NAMES = frozenset({"intensity", "scalar_intensity", "reflectance", "scalar_reflectance"})
+INTENSITY_NAMES = ("intensity", "scalar_intensity", "reflectance", "scalar_reflectance")
 BLACK, WHITE = 0.01, 0.99  # fraction of the points that are darker
 LARGEST = float(np.finfo(np.float32).max)
 NUM_BINS = 1 << 16
+NUM_COLORED = 6  # columns x y z red green blue
+SPLAT_FACTOR = 0.28209479177387814  # of the constant spherical harmonic, 1 / (2 sqrt(pi))
 GRAY = 128  # of points of which only the shape counts
 # as in PLY files, in lower case; the first that is found counts. CloudCompare prefixes `scalar_`
 LABEL_NAMES = ("label", "scalar_label", "class", "scalar_class", "classification", "scalar_classification")
@@ -86,30 +98,49 @@ def point_label(path: Path, index: int) -> str:
     return f"{path}: point {index + 1}"
 
 
-def find_fields(
-    names: Collection[str],
-    channel: Channel,
-    labels: Labels | None = None,
-    color_names: Sequence[tuple[str, ...]] = COLOR_NAMES,
-) -> tuple[str, ...]:
-    """Return x y z and the colours, intensity or label among a file's names; empty if any is missing."""
-    by_lower = {name.lower(): name for name in names}
-    more: tuple[str, ...] = ()
-    if labels:
-        more = tuple(by_lower[name] for name in LABEL_NAMES if name in by_lower)[:1]
-    elif channel == "intensity":
-        more = tuple(name for name in names if name.lower() in INTENSITY_NAMES)[:1]
-    elif channel == "colors":
-        more = next((some for some in color_names if all(name in names for name in some)), ())
-    is_found = {*"xyz"} <= {*names} and (more or channel == "shape")
-    return (*"xyz", *more) if is_found else ()
+def find_fields(names: Collection[str], channel: Channel, labels: Labels | None = None) -> tuple[str, ...]:
+    """Return x y z and the colours, intensity or label among a file's names; empty if any is missing.
+
+    Capitals don't count.
+    """
+    by_lower = {name.lower(): name for name in reversed([*names])}
+    wanted: dict[Channel, Sequence[tuple[str, ...]]] = {
+        "colors": COLOR_NAMES,
+        "intensity": [(name,) for name in INTENSITY_NAMES],
+        "shape": [()],
+    }
+    kinds = [(name,) for name in LABEL_NAMES] if labels else wanted[channel]
+    places, more = (
+        next((some for some in choices if by_lower.keys() >= set(some)), None)
+        for choices in (POINT_NAMES, kinds)
+    )
+    return () if places is None or more is None else tuple(by_lower[name] for name in (*places, *more))
 
 
-def find_full_brightness(path: Path, types: Sequence[str]) -> float:
-    """Return the value of full brightness in colours of these types, such as "u1"."""
-    if len(set(types)) > 1 or types[0] not in BRIGHTEST:
-        raise InputError(f"{path}: the colours are of type {' '.join(types)}, wanted {TYPES_WANTED}")
-    return BRIGHTEST[types[0]]
+def find_brightest(
+    path: Path, parts: Iterable[Part], settings: CloudSettings, usual: float = BYTE_RANGE
+) -> tuple[float, tuple[str, ...]]:
+    """Return the value of full brightness of colours, and a warning if it is not the usual one.
+
+    It is the one of the settings, or else the least of 1, 255 and 65535 that no value exceeds by far. Parts
+    are looked at until one decides: for 16 bits by a value above 255, else by one above 1 or by a fraction.
+    """
+    if settings.color_range is not None:
+        return settings.color_range, ()
+    largest = 0.0
+    has_fractions = False
+    for points, values in parts:
+        seen = values[np.isfinite(points).all(axis=1)]
+        largest = max(largest, float(np.nanmax(seen, initial=0.0)))
+        has_fractions = has_fractions or bool(seen.dtype.kind == "f" and (seen % 1.0 > 0.0).any())
+        if largest > BYTE_RANGE or (usual != RANGES[-1] and (largest > 1.0 or has_fractions)):
+            break
+    most = [STRAY if has_fractions else EXCESS, STRAY * BYTE_RANGE, np.inf]
+    brightest = next(limit for limit, most_of_it in zip(RANGES, most, strict=True) if largest <= most_of_it)
+    if brightest == usual or largest == 0.0:
+        return usual, ()
+    found = f"colours are read as 0 to {brightest:g} instead of 0 to {usual:g} (largest value {largest:g})"
+    return brightest, (f"{path}: {found}; `color_range` overrules it",)
 
 
 def color_chunks(parts: Iterable[Part], brightest: float, locate: Callable[[int], str]) -> Iterator[RawCloud]:
@@ -119,18 +150,21 @@ def color_chunks(parts: Iterable[Part], brightest: float, locate: Callable[[int]
     """
     num_before = 0
     for points_world, values in parts:
-        if values.dtype == np.uint8 and brightest == BRIGHTEST["u1"]:
+        if values.dtype == np.uint8 and brightest == BYTE_RANGE:
             colors = np.array(values, dtype=np.uint8)
         else:  # a point without a finite position needs no colour: it becomes black
             is_finite: Mask = np.all(np.isfinite(points_world), axis=1)
-            numbers = np.where(is_finite[:, None], values, 0).astype(np.float64)
-            is_wrong = ~((numbers >= 0.0) & (numbers <= brightest)).all(axis=1)
+            numbers = np.where(is_finite[:, None], values, 0).astype(np.float64) * (BYTE_RANGE / brightest)
+            least = BYTE_RANGE * (1.0 - EXCESS)
+            is_wrong = ~((numbers >= least) & (numbers <= BYTE_RANGE * EXCESS)).all(axis=1)
             if is_wrong.any():
                 wrong = int(np.argmax(is_wrong))
                 color = " ".join(f"{value:g}" for value in values[wrong].tolist())
                 place = locate(num_before + wrong)
-                raise InputError(f"{place} has the colour {color}, wanted 0 to {brightest:g}")
-            colors = np.rint(numbers * (255.0 / brightest)).astype(np.uint8)
+                raise InputError(
+                    f"{place} has the colour {color}, wanted 0 to {brightest:g}, or `color_range`"
+                )
+            colors = np.rint(np.clip(numbers, 0.0, BYTE_RANGE)).astype(np.uint8)
         num_before += len(colors)
         yield RawCloud(points_world, colors)
 
@@ -169,20 +203,24 @@ def make_source(
     path: Path,
     read: PartReader,
     channel: Channel,
-    labels: Labels | None = None,
+    settings: CloudSettings = IN_METRES,
     num_points: int | None = None,
     types: Sequence[str] = (),
 ) -> PointSource:
     """Return the points that `read` yields with colours, or with a label, else an intensity.
 
-    Colours have 8 bits, unless they are of other `types`. If only the shape counts, the points are grey.
+    Colours are bytes, unless they are of other `types`. If only the shape counts, the points are grey.
     """
-    if labels:
-        return PointSource(path, partial(_read_labels, path, read, labels), num_points)
+    if settings.labels:
+        return PointSource(path, partial(_read_labels, path, read, settings.labels), num_points)
     if types and channel == "colors":
-        brightest = find_full_brightness(path, types)
+        brightest = settings.color_range or BYTE_RANGE
+        notes: tuple[str, ...] = ()
+        if {*types} != {"u1"}:
+            usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
+            brightest, notes = find_brightest(path, read(), settings, usual)
         locate = partial(point_label, path)
-        return PointSource(path, lambda: color_chunks(read(), brightest, locate), num_points)
+        return PointSource(path, lambda: color_chunks(read(), brightest, locate), num_points, notes)
     limits = functools.cache(lambda: _limits(read()))
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: (RawCloud(*part) for part in read()),
@@ -192,14 +230,73 @@ def make_source(
     return PointSource(path, readers[channel], num_points)
 
 
-def join_columns(read_columns: Callable[[], Iterator[Columns]]) -> Iterator[Part]:
-    """Yield points in columns x y z, with three colours, or with a scalar, or alone."""
-    for columns in read_columns():
-        is_colored = len(columns) == 6
-        yield (
-            points_of(columns),
-            np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64),
-        )
+class Table(NamedTuple):
+    """Columns of numbers in a file: x y z, and those of a channel."""
+
+    path: Path
+    read_columns: Callable[[], Iterator[Columns]]  # each call from the start
+    names: Sequence[str]
+    types: Sequence[str]  # as declared, without byte order
+    num_points: int | None = None
+
+    def source(self, channel: Channel, settings: CloudSettings) -> PointSource:
+        """Return the points with colours, packed or not, or of splats; or with a scalar; or alone."""
+        colors = tuple(name.lower() for name in self.names[3:6])
+        read, types = self._read_parts, self.types[3:]
+        if colors == SPLAT_NAMES:
+            read, types = self._read_splats, ()
+        elif len(colors) == 1 and colors[0] in PACKED_NAMES:
+            if types[0] not in ("f4", "u4", "i4"):
+                wrong = f"'{self.names[3]}' is of type {types[0]}"
+                raise InputError(f"{self.path}: {wrong}, wanted uint32, int32 or float32")
+            read, types = self._read_packed, ()
+        return make_source(self.path, read, channel, settings, self.num_points, types)
+
+    def _read_parts(self) -> Iterator[Part]:
+        for columns in self.read_columns():
+            is_colored = len(columns) == NUM_COLORED
+            more = np.stack(columns[3:], axis=1) if is_colored else columns[-1].astype(np.float64)
+            yield points_of(columns), more
+
+    def _read_splats(self) -> Iterator[Part]:
+        """Yield the opaque splats: those of opacity 1/2 or more, whose logit is not negative."""
+        for columns in self.read_columns():
+            is_opaque = (
+                columns[6] >= 0.0 if len(columns) > NUM_COLORED else np.ones(len(columns[0]), np.bool_)
+            )
+            levels = 0.5 + SPLAT_FACTOR * np.stack([column[is_opaque] for column in columns[3:6]], axis=1)
+            colors = np.rint(255.0 * np.clip(np.nan_to_num(levels), 0.0, 1.0)).astype(np.uint8)
+            yield points_of([column[is_opaque] for column in columns[:3]]), colors
+
+    def _read_packed(self) -> Iterator[Part]:
+        """Yield colours 0xAARRGGBB, in numbers of a declared type, which ASCII has as text."""
+        num_before = 0
+        for columns in self.read_columns():
+            points = points_of(columns)
+            values = columns[3]
+            if values.dtype.itemsize == np.dtype(self.types[3]).itemsize:
+                bits = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="))).view(np.uint32)
+            else:
+                values = np.where(np.isfinite(points).all(axis=1), values, 0.0)
+                bits, is_right = _bits_of_text(values, self.types[3])
+                if not is_right.all():
+                    wrong = int(np.argmin(is_right))
+                    place = point_label(self.path, num_before + wrong)
+                    raise InputError(
+                        f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {self.types[3]}"
+                    )
+            num_before += len(bits)
+            yield points, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
+
+
+def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
+    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits."""
+    if type_ == "f4":
+        # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
+        is_right = np.abs(values) <= LARGEST
+        return np.where(is_right, values, 0.0).astype(np.float32).view(np.uint32), is_right
+    is_right = (values >= -(2.0**31)) & (values < 2.0**32) & (values == np.floor(values))
+    return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:

@@ -20,27 +20,25 @@ from ...arrays import Array
 from ...errors import InputError
 from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
-from . import reader
-from .reader import MissingChannelError, PointSource, quote_line
+from . import reader, text_columns
+from .reader import MissingChannelError, PointSource, find_brightest, quote_line
+from .text_columns import COMMENT_MARKS, is_number, split, text_blocks
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
-COMMENT_MARKS = (b"#", b"//")
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
-NUM_COLUMNS: dict[Channel, int] = {"colors": 6, "intensity": NUM_WITH_INTENSITY, "shape": 3}
-HEAD_SIZE = 1 << 16  # bytes in which the header is looked for
-BYTE_ORDER_MARK = b"\xef\xbb\xbf"
-WANTED = "wanted lines of numbers x y z r g b, with decimal points, colours 0-255"
-# What is read of a line of PTS or PTX, by the number of its columns; those behind the seventh are left out.
-COLUMNS: dict[Channel, dict[int, tuple[int, ...]]] = {
-    "colors": {6: (0, 1, 2, 3, 4, 5), 7: (0, 1, 2, 4, 5, 6)},
-    "intensity": dict.fromkeys((NUM_WITH_INTENSITY, 7), (0, 1, 2, 3)),
-    "shape": dict.fromkeys(range(3, 8), (0, 1, 2)),
+NUM_POSITION = 3
+WANTED = "wanted lines of numbers x y z r g b (`columns` names others)"
+PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b"
+PTX_COLUMNS: dict[Channel, tuple[int, ...]] = {
+    "colors": (0, 1, 2, 4, 5, 6),
+    "intensity": (0, 1, 2, 3),
+    "shape": (0, 1, 2, 3),
 }
-PTS_WANTED = "wanted lines x y z intensity r g b or x y z r g b, colours 0-255"
 NUMBERS_A_LINE = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
 MAX_COUNT_DIGITS = 9
 AFFINE = (0.0, 0.0, 0.0, 1.0)  # the matrix' last column
-PTX_WANTED = "wanted a PTX file with lines x y z intensity r g b, colours 0-255"
+ROUNDED = 1e-6  # by which it may differ
+PTX_WANTED = "wanted a PTX file with lines x y z intensity r g b"
 
 
 class LineLayout(NamedTuple):
@@ -50,26 +48,22 @@ class LineLayout(NamedTuple):
     num_columns: int | None = None  # of each line; None: there may be any more than those read
     start: int = 0  # [byte] of the first line
     delimiter: str | None = None  # None: blanks and tabs
+    has_decimal_commas: bool = False
     has_counts: bool = False  # a lone whole number counts the lines that follow, and is skipped
 
 
 def line_blocks(path: Path, start: int) -> Iterator[list[bytes]]:
     """Yield the lines from byte `start` on, some at a time, without their ends (LF, CR LF or CR)."""
     rest = b""
-    with path.open("rb") as file:
-        size = os.fstat(file.fileno()).st_size
-        file.seek(start)
-        while block := file.read(BLOCK):
-            data = rest + block
-            # A return at the end may be half of a line end: it waits for the next block.
-            is_split = data.endswith(b"\r")
-            end = 1 + max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - is_split))
-            rest = data[end:]
-            if len(rest) > BLOCK:
-                raise InputError(f"{path}: a line of more than {BLOCK} bytes, wanted lines of a few numbers")
-            yield data[:end].splitlines()
-        if file.tell() < size:
-            raise InputError(f"{path}: {reader.CUT}")
+    for block in text_blocks(path, BLOCK, start):
+        data = rest + block
+        # A return at the end may be half of a line end: it waits for the next block.
+        is_split = data.endswith(b"\r")
+        end = 1 + max(data.rfind(b"\n"), data.rfind(b"\r", 0, len(data) - is_split))
+        rest = data[end:]
+        if len(rest) > 2 * BLOCK:
+            raise InputError(f"{path}: a line of more than {BLOCK} bytes, wanted lines of a few numbers")
+        yield data[:end].splitlines()
     if rest:
         yield rest.splitlines()
 
@@ -83,7 +77,7 @@ class NumberLines:
         self.wanted = wanted
         self.num_taken = 0
         # not a method, by which lines would hold each other, and the file open
-        self._kept = partial(_strip_blanks, has_counts=layout.has_counts)
+        self._kept = partial(_strip_blanks, layout=layout)
         self._lines = chain.from_iterable(map(self._kept, line_blocks(path, layout.start)))
 
     def peek(self) -> bytes | None:
@@ -139,15 +133,11 @@ class NumberLines:
     def read_points(self, count: int | None = None) -> Iterator[reader.Part]:
         """Yield the points (N, 3) of the lines that `read_rows` would read, with the other columns.
 
-        These are colours (N, 3), checked to be 0-255, if six columns are read, else the last column (N,).
+        These are colours (N, 3) if six columns are read, else the last column (N,).
         """
-        first = self.num_taken
-        is_colored = len(self.layout.columns) == NUM_COLUMNS["colors"]
+        is_colored = len(self.layout.columns) == reader.NUM_COLORED
         rows = self.read_rows(count)
-        parts = ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
-        if not is_colored:
-            return parts
-        return reader.color_chunks(parts, reader.BRIGHTEST["u1"], lambda index: self.locate(first + index))
+        return ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
 
     def locate(self, index: int) -> str:
         """Return the file, and the number in it of the line that follows `index` lines of numbers."""
@@ -157,8 +147,8 @@ class NumberLines:
 
     def _number_lines(self) -> Iterator[tuple[int, bytes]]:
         """Read the file again: yield the number in the file and the text of each line of numbers."""
-        with self.path.open("rb") as file:
-            number = len((file.read(self.layout.start) + b".").splitlines()) - 1
+        head = next(text_blocks(self.path, text_columns.HEAD_SIZE), b"")
+        number = len((head[: self.layout.start] + b".").splitlines()) - 1
         for lines in line_blocks(self.path, self.layout.start):
             for line in lines:
                 number += 1
@@ -173,7 +163,7 @@ class NumberLines:
 
     def _fault(self, line: bytes) -> str:
         """Describe the fault of a line; empty if it has none."""
-        fields = line.decode("latin-1").split(self.layout.delimiter)
+        fields = split(line, self.layout.delimiter)
         exact = self.layout.num_columns
         columns = self.layout.columns
         num_wanted = max(columns) + 1 if exact is None else exact
@@ -184,105 +174,98 @@ class NumberLines:
         return "" if broken is None else f"{quote_line(broken.encode('latin-1'))} is not a number"
 
 
-def _strip_blanks(lines: list[bytes], has_counts: bool) -> list[bytes]:
+def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
     """Strip lines of blanks; return the lines of numbers."""
     return [
-        line
+        line.replace(b",", b".") if layout.has_decimal_commas else line
         for line in filter(None, map(bytes.strip, lines))
-        if not line.startswith(COMMENT_MARKS) and not (has_counts and line.isdigit())
+        if not line.startswith(COMMENT_MARKS) and not (layout.has_counts and line.isdigit())
     ]
 
 
-def is_number(field: str) -> bool:
-    """Return True if np.loadtxt reads a field as a number."""
-    try:
-        float(field)
-    except ValueError:
-        return False
-    return "_" not in field  # which Python takes and np.loadtxt does not
-
-
-def line_source(path: Path, layout: LineLayout, channel: Channel, wanted: str) -> PointSource:
-    """Return points of lines x y z r g b, colours 0-255, or of x y z intensity, or of x y z."""
-    return reader.make_source(path, lambda: NumberLines(path, layout, wanted).read_points(), channel)
-
-
 def open_text(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
-    """Return the points of a text file: whitespace, comma or semicolon between numbers, colours 0-255.
+    """Return the points of a text file: whitespace, comma or semicolon between numbers.
 
-    A header line is skipped. It determines the columns if it names x y z and r g b (or red green blue), or an
-    intensity; it names all columns or none. Without one the first six columns are read; four are x y z and
-    intensity.
+    The columns are those of the options, or of a header line with names (x y z, r g b or red green blue, an
+    intensity), or else follow from the values of all columns: with a warning, unless they are x y z r g b.
     """
-    with path.open("rb") as file:
-        layout = _layout(path, file.read(HEAD_SIZE), channel)
-    return line_source(path, layout, channel, WANTED)
-
-
-def _layout(path: Path, head: bytes, channel: Channel) -> LineLayout:
-    """Return the layout of a file, from its first lines."""
-    if b"\0" in head:
-        raise InputError(f"{path}: holds bytes that are no text, {WANTED}")
-    start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
-    named: tuple[int, ...] = ()
-    header = ""
-    num_names = 0
-    num_lines = 0
-    for line in head[start:].splitlines(keepends=True):
-        text = line.decode("latin-1").strip()
-        delimiter = next((mark for mark in ";," if mark in text), None)
-        fields = text.split(delimiter)
-        is_count = len(fields) == 1 and line.strip().isdigit()
-        if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
-            break
-        names = [name.strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter)]
-        once = [name for name in names if names.count(name) == 1]
-        named = tuple(map(names.index, reader.find_fields(once, channel))) or named
-        if {*"xyz"} <= {*names}:
-            header = text
-            num_names = len(names)
-        start += len(line)
-        num_lines += 1
-    else:
-        raise InputError(f"{path}: no line of numbers at its beginning, {WANTED}")
-    if not named and num_names == len(fields):
-        raise MissingChannelError(f"{path}: the columns are {quote_line(header.encode())}, {WANTED}")
-    has_intensity = len(fields) == NUM_WITH_INTENSITY and all(map(is_number, fields))
-    if not named and channel == "intensity" and not has_intensity:
-        raise MissingChannelError(f"{path}: line {num_lines + 1} has {len(fields)} columns and no intensity")
-    columns = named or tuple(range(NUM_COLUMNS[channel]))
-    if len(fields) <= max(columns):
-        found = f"line {num_lines + 1} has {len(fields)} columns (no colours?): {quote_line(line)}"
-        error = MissingChannelError if len(fields) >= NUM_COLUMNS["shape"] else InputError
-        raise error(f"{path}: {found}, {WANTED}")
-    return LineLayout(columns, start=start, delimiter=delimiter)
+    return _open_lines(path, options, channel, has_counts=False)
 
 
 def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
-    """Return the points of all scans of a PTS file.
+    """Return the points of all scans of a PTS file: lines x y z intensity r g b, or others as in a text file.
 
-    All lines must have as many columns as the first one: six are x y z r g b, more are x y z intensity r g b
-    and others. The intensity may have any range. A lone count may precede any line; it is not compared with
-    the number of lines, as many programs write a wrong one.
+    All lines must have as many columns as the first one. A lone count may precede any line; it is not
+    compared with the number of lines, as many programs write a wrong one.
     """
-    lines = NumberLines(path, LineLayout(has_counts=True), PTS_WANTED)
-    line = lines.peek()
-    if line is None:
-        raise InputError(f"{path}: no line of numbers, {PTS_WANTED}")
-    num_columns = len(line.split())
-    columns = COLUMNS[channel].get(min(num_columns, 7))
-    if columns is None:
-        lacking = "colours" if channel == "colors" else channel
-        found = f"{num_columns} columns, no {lacking}: {quote_line(line)}"
-        error = MissingChannelError if min(num_columns, 7) in COLUMNS["shape"] else InputError
-        raise error(f"{lines.locate(0)} has {found}, {PTS_WANTED}")
-    return line_source(path, LineLayout(columns, num_columns, has_counts=True), channel, PTS_WANTED)
+    return _open_lines(path, options, channel, has_counts=True)
+
+
+def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_counts: bool) -> PointSource:
+    wanted = PTS_WANTED if has_counts else WANTED
+    fields = text_columns.read_fields(path, wanted)
+    first = fields.first.replace(b",", b".") if fields.has_decimal_commas else fields.first
+    num_columns = len(split(first, fields.delimiter))
+    rows = text_columns.read_samples(path, fields, num_columns)
+    header = fields.names if channel == "shape" or len(fields.names) == num_columns else ()
+    header = header or (fields.names if reader.find_fields(fields.names, channel) else ())
+    names = text_columns.names_of_user(path, settings, num_columns) or header
+    note = ""
+    if not names:
+        names = text_columns.name_columns(rows)
+        note = text_columns.note_names(path, names, quote_line(fields.first), has_counts)
+    chosen = reader.find_fields([name for name in names if names.count(name) == 1], channel)
+    if not chosen or num_columns < NUM_POSITION:
+        line = quote_line(fields.first)
+        found = f"line {fields.num_lines + 1} has {num_columns} columns (no {channel}?): {line}"
+        if fields.names:
+            found = f"the columns are {quote_line(fields.header.encode())}"
+        error = MissingChannelError if num_columns >= NUM_POSITION else InputError
+        raise error(f"{path}: {found}, {wanted}")
+    exact = num_columns if has_counts else None
+    columns = tuple(names.index(name) for name in chosen)
+    layout = LineLayout(columns, exact, fields.start, fields.delimiter, fields.has_decimal_commas, has_counts)
+    is_fraction = path.suffix.lower() == ".xyzrgb" or text_columns.has_names_of_fractions(chosen)
+    if len(columns) == NUM_WITH_INTENSITY and channel == "colors":  # packed
+
+        def read_columns() -> Iterator[reader.Columns]:
+            return (list(some.T) for some in NumberLines(path, layout, wanted).read_rows())
+
+        source = reader.Table(path, read_columns, chosen, ["f8", "f8", "f8", "u4"]).source(channel, settings)
+    else:
+        known = rows[:, columns] if max(columns) < rows.shape[1] else rows[:0, :6]
+        usual = 1.0 if is_fraction else reader.BYTE_RANGE
+        source = line_source(path, layout, channel, wanted, settings, known, usual)
+    return source._replace(warnings=(*filter(None, [note]), *source.warnings))
+
+
+def line_source(
+    path: Path,
+    layout: LineLayout,
+    channel: Channel,
+    wanted: str,
+    settings: CloudSettings,
+    samples: Array,
+    usual: float,
+) -> PointSource:
+    """Return points of lines x y z r g b, whose usual range is given; or of x y z intensity, or of x y z."""
+
+    def read() -> Iterator[reader.Part]:
+        return NumberLines(path, layout, wanted).read_points()
+
+    if channel != "colors":
+        return reader.make_source(path, read, channel, settings)
+    parts = chain([(samples[:, :3], samples[:, 3:])], read())
+    brightest, notes = find_brightest(path, parts, settings, usual)
+    lines = NumberLines(path, layout, wanted)
+    return PointSource(path, lambda: reader.color_chunks(read(), brightest, lines.locate), warnings=notes)
 
 
 class PtxScan(NamedTuple):
-    """A scan's number of points and its transform to the world."""
+    """A scan's number of points and columns, and its transform to the world."""
 
     num_points: int  # lines in the file, with or without a return
+    num_columns: int  # of its first line
     T_world_from_scanner: Array  # (4, 4)
 
 
@@ -290,15 +273,14 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     """Return the points of all scans of a PTX file, in the world.
 
     0 0 0 means that no beam came back, and is left out. A last scan with fewer lines than its header promises
-    is read up to its end, with a warning; a last line without a line end is then left out as cut off.
+    is read up to its end, with a warning; a last line without a line end is then left out as cut off. Scans
+    without the channel are left out, with a warning.
     """
     lines = NumberLines(path, LineLayout(), PTX_WANTED)
     scans: list[PtxScan] = []
     warnings: list[str] = []
     while (scan := _take_header(lines)) is not None:
         last_of_header = lines.num_taken - 1
-        if not scans and len((lines.peek() or b"").split()) == NUM_WITH_INTENSITY and channel == "colors":
-            raise MissingChannelError(f"{path}: has intensity and no colours, {PTX_WANTED}")
         found = lines.skip(scan.num_points)
         if found < scan.num_points:
             found -= bool(found) and not _ends_with_a_line_end(path)
@@ -307,10 +289,19 @@ def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
         scans.append(scan._replace(num_points=found))
     if not scans:
         raise InputError(f"{path}: no line of numbers, {PTX_WANTED}")
-    layout = LineLayout(COLUMNS["colors" if channel == "colors" else "intensity"][7])
-    read = partial(_read_scans, path, layout, scans)
-    source = reader.make_source(path, read, channel, num_points=sum(scan.num_points for scan in scans))
-    poses = [scan.T_world_from_scanner for scan in scans]
+    kept = [scan for scan in scans if scan.num_columns != NUM_WITH_INTENSITY or channel != "colors"]
+    if not kept:
+        raise MissingChannelError(f"{path}: has intensity and no colours, {PTX_WANTED}")
+    if len(kept) < len(scans):
+        warnings.append(f"{path}: {len(scans) - len(kept)} of {len(scans)} scans without colours left out")
+    layout = LineLayout(PTX_COLUMNS[channel])
+    brightest = None
+    if channel == "colors":
+        brightest, notes = find_brightest(path, _read_scans(path, layout, scans, None), options)
+        warnings += notes
+    read = partial(_read_scans, path, layout, scans, brightest)
+    source = reader.make_source(path, read, channel, options, sum(scan.num_points for scan in kept))
+    poses = [scan.T_world_from_scanner for scan in kept]
     axes = [T[:3, 2] for T in poses if not np.array_equal(T, np.eye(4)) and np.linalg.norm(T[:3, 2]) > 0.0]
     station_axes = tuple(z / float(np.linalg.norm(z)) for z in axes)
     return source._replace(warnings=tuple(warnings), station_axes=station_axes)
@@ -336,11 +327,13 @@ def _take_header(lines: NumberLines) -> PtxScan | None:
             raise InputError(f"{place}, wanted {wanted} of a scan's header, {PTX_WANTED}")
         numbers.append(found)
     matrix = np.array(numbers[-4:])
-    if tuple(matrix[:, 3]) != AFFINE:
+    if not np.allclose(matrix[:, 3], AFFINE, rtol=0.0, atol=ROUNDED):
         column = " ".join(f"{value:g}" for value in matrix[:, 3])
         place = f"{lines.locate(lines.num_taken - 1)} ends a matrix with the last column"
         raise InputError(f"{place} {column}, wanted 0 0 0 1")
-    return PtxScan(int(numbers[0][0]) * int(numbers[1][0]), matrix.T)
+    matrix[:, 3] = AFFINE
+    num_columns = len((lines.peek() or b"").split())
+    return PtxScan(int(numbers[0][0]) * int(numbers[1][0]), num_columns, matrix.T)
 
 
 def _numbers(line: bytes, num_wanted: int) -> list[float] | None:
@@ -361,13 +354,28 @@ def _ends_with_a_line_end(path: Path) -> bool:
         return file.read() in (b"\r", b"\n")
 
 
-def _read_scans(path: Path, layout: LineLayout, scans: list[PtxScan]) -> Iterator[reader.Part]:
-    """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,)."""
+def _read_scans(
+    path: Path, layout: LineLayout, scans: list[PtxScan], brightest: float | None
+) -> Iterator[reader.Part]:
+    """Yield points (N, 3) whose beam came back, in the world, and their colours (N, 3) or intensity (N,).
+
+    Colours become bytes if their full brightness is known.
+    """
     lines = NumberLines(path, layout, PTX_WANTED)
+    is_colored = len(layout.columns) == reader.NUM_COLORED
     for scan in scans:
         lines.skip(len(NUMBERS_A_LINE))
-        for points, values in lines.read_points(scan.num_points):
+        if is_colored and scan.num_columns == NUM_WITH_INTENSITY:
+            lines.skip(scan.num_points)
+            continue
+        locate = partial(_locate_after, lines, lines.num_taken)
+        parts: Iterator[reader.Part] = lines.read_points(scan.num_points)
+        for points, values in reader.color_chunks(parts, brightest, locate) if brightest else parts:
             is_return = np.any(points != 0.0, axis=1)
             returned: Array = points[is_return].astype(np.float64, copy=False)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
                 yield transform_points(returned, scan.T_world_from_scanner), values[is_return]
+
+
+def _locate_after(lines: NumberLines, num_before: int, index: int) -> str:
+    return lines.locate(num_before + index)

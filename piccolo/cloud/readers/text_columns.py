@@ -1,0 +1,227 @@
+"""The columns of lines of numbers: by the user, by a header, or else by the values of all columns."""
+
+import codecs
+import os
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Array
+from ...errors import InputError
+from ..settings import COLUMNS, CloudSettings
+from .reader import COLOR_NAMES, CUT, FRACTION_NAMES, POINT_NAMES
+
+COMMENT_MARKS = (b"#", b"//")
+HEAD_SIZE = 1 << 16  # [byte] in which the header is looked for
+NUM_SAMPLES = 16  # places in the file whose lines are looked at
+SAMPLE_SIZE = 1 << 13  # [byte]
+MAX_COLUMNS = 64
+BYTE_ORDER_MARK = b"\xef\xbb\xbf"
+UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+UNIT = re.compile(r"[\[(].*")  # behind a name
+DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
+SKIP = "-"
+POSITION = ("x", "y", "z")
+RGB = ("red", "green", "blue")
+NORMAL = ("nx", "ny", "nz")
+UNIT_LENGTH = 0.01  # by which the length of a normal may differ from 1
+FEW = 0.1  # of the rows have no number in a column of numbers
+MOST_ROWS = 0.95  # of them are normals
+FAR = 4.0  # times as far from each other are an intensity and two colours as three colours
+MAX_BYTE = 255.0
+MAX_VALUE = 65535.0
+BEFORE = 2  # columns that FARO writes in front: row, column
+BARE = (*POSITION, "intensity")
+USUAL = (POSITION, BARE, (*POSITION, *RGB))
+USUAL_OF_PTS = ((*BARE, *RGB),)
+
+
+class Fields(NamedTuple):
+    """The fields of the lines of numbers, and what is known of them."""
+
+    start: int  # [byte] of the first line of numbers
+    num_lines: int  # before it
+    first: bytes  # that line
+    delimiter: str | None  # None: blanks and tabs
+    has_decimal_commas: bool
+    names: tuple[str, ...]  # of all, in lower case; empty without a header
+    header: str
+
+
+def text_blocks(path: Path, size: int, start: int = 0) -> Iterator[bytes]:
+    """Yield the bytes of a text from `start` on, `size` read at once; those of UTF-16 as UTF-8."""
+    with path.open("rb") as file:
+        num_bytes = os.fstat(file.fileno()).st_size
+        is_wide = file.peek(2)[:2] in UTF_16
+        decoder = codecs.getincrementaldecoder("utf-16")("replace")
+        if not is_wide:
+            file.seek(start)
+            start = 0
+        while block := file.read(size):
+            text = decoder.decode(block).encode() if is_wide else block
+            yield text[start:]
+            start = max(start - len(text), 0)
+        if file.tell() < num_bytes:
+            raise InputError(f"{path}: {CUT}")
+
+
+def split(line: bytes, delimiter: str | None) -> list[str]:
+    """Split a line into its fields; an empty one at its end counts for none."""
+    fields = [field.strip() for field in line.decode("latin-1").strip().split(delimiter)]
+    return fields[:-1] if fields and fields[-1] == "" else fields
+
+
+def read_fields(path: Path, wanted: str) -> Fields:
+    """Return the fields of a file of lines, from its first lines."""
+    head = next(text_blocks(path, HEAD_SIZE), b"")
+    if b"\0" in head:
+        raise InputError(f"{path}: holds bytes that are no text, {wanted}")
+    start = len(BYTE_ORDER_MARK) if head.startswith(BYTE_ORDER_MARK) else 0
+    names: tuple[str, ...] = ()
+    header = ""
+    for num_lines, line in enumerate(head[start:].splitlines(keepends=True)):
+        text = line.decode("latin-1").strip()
+        delimiter = next((mark for mark in ";," if mark in text), None)
+        has_commas = _has_decimal_commas(text, delimiter)
+        delimiter = None if has_commas and delimiter == "," else delimiter
+        fields = split(line.replace(b",", b".") if has_commas else line, delimiter)
+        is_count = len(fields) == 1 and text.isdecimal()
+        if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
+            return Fields(start, num_lines, line, delimiter, has_commas, names, header)
+        found = tuple(
+            UNIT.sub("", name).strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter) if name
+        )
+        if any({*some} <= {*found} for some in POINT_NAMES):
+            names = found
+            header = text
+        start += len(line)
+    raise InputError(f"{path}: no line of numbers at its beginning, {wanted}")
+
+
+def is_number(field: str) -> bool:
+    """Return True if np.loadtxt reads a field as a number."""
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return "_" not in field  # which Python takes and np.loadtxt does not
+
+
+def _has_decimal_commas(text: str, delimiter: str | None) -> bool:
+    """Return True if a line's fields are divided by semicolons or blanks, and some have a decimal comma."""
+    fields = text.split(";" if delimiter == ";" else None)
+    is_decimal = [DECIMAL_COMMA.fullmatch(field.strip()) is not None for field in fields]
+    others = [field for field, is_right in zip(fields, is_decimal, strict=True) if not is_right]
+    return len(fields) >= len(POSITION) and any(is_decimal) and all("," not in field for field in others)
+
+
+def read_samples(path: Path, fields: Fields, num_columns: int) -> Array:
+    """Return the numbers (R, C) of lines at places all over a file; NaN for what is no number."""
+    blocks = []
+    with path.open("rb") as file:
+        size = file.seek(0, 2)
+        is_plain = file.seek(0) == 0 and file.peek(2)[:2] not in UTF_16
+        for begin in np.linspace(fields.start, size, NUM_SAMPLES, endpoint=False).astype(np.int64).tolist():
+            file.seek(begin)
+            lines = file.read(SAMPLE_SIZE).splitlines()
+            blocks.append(lines[begin > fields.start : -1] or lines[:1])
+    if not is_plain:
+        blocks = [next(text_blocks(path, HEAD_SIZE), b"")[fields.start :].splitlines()[:-1]]
+    rows = []
+    for line in (line for block in blocks for line in block):
+        numbers = split(line.replace(b",", b".") if fields.has_decimal_commas else line, fields.delimiter)
+        if len(numbers) == num_columns and not line.strip().startswith(COMMENT_MARKS):
+            rows.append([float(field) if is_number(field) else np.nan for field in numbers[:MAX_COLUMNS]])
+    found = np.array(rows, np.float64).reshape(-1, min(num_columns, MAX_COLUMNS))
+    is_broken = np.isnan(found)
+    return found[~is_broken[:, np.mean(is_broken, axis=0) < FEW].any(axis=1)] if rows else found
+
+
+def names_of_user(path: Path, settings: CloudSettings, num_columns: int) -> tuple[str, ...]:
+    """Return the names that the user gave to columns, in full; empty if there are none."""
+    names = tuple(COLUMNS.get(name.lower(), name.lower()) for name in settings.columns)
+    if len(names) > num_columns:
+        found = f"{len(names)} names, but {num_columns} columns"
+        raise InputError(f"{path}: `columns`: found {found}, wanted one name for each, {SKIP} for others")
+    return names
+
+
+def name_columns(rows: Array) -> tuple[str, ...]:
+    """Return the names of columns by their values (R, C): x y z, colours, intensity, normals; - of others."""
+    num_columns = rows.shape[1]
+    names = [SKIP] * num_columns
+    with np.errstate(invalid="ignore"):
+        first = BEFORE if num_columns >= BEFORE + 6 and _are_grid_indices(rows) else 0
+        names[first : first + 3] = POSITION
+        free = [*range(first + 3, num_columns)]
+        normals = next((k for k in free[:-2] if _are_normals(rows[:, k : k + 3], len(free))), None)
+        if normals is not None:
+            names[normals : normals + 3] = NORMAL
+            free = [k for k in free if not normals <= k < normals + 3]
+        offset = _find_colors(rows[:, free])
+    if offset is not None:
+        for name, column in zip(RGB, free[offset : offset + 3], strict=True):
+            names[column] = name
+        free = free[:offset] + free[offset + 3 :]
+    if free and (offset is not None or len(free) == 1):
+        is_packed = offset is None and bool(np.all(rows[:, free[0]] % 1.0 == 0.0))
+        is_packed = is_packed and float(np.max(rows[:, free[0]], initial=0.0)) > MAX_VALUE
+        names[free[0]] = "rgb" if is_packed else "intensity"
+    return tuple(names)
+
+
+def _are_grid_indices(rows: Array) -> bool:
+    """Return True if the first two columns are whole numbers, and the three behind them are not."""
+    is_whole = np.all(rows % 1.0 == 0.0, axis=0)
+    has_index = bool(is_whole[:BEFORE].all()) and bool((rows[:, :BEFORE] >= 0.0).all())
+    return len(rows) > 0 and has_index and not is_whole[BEFORE : BEFORE + 3].any()
+
+
+def _are_normals(rows: Array, num_free: int) -> bool:
+    """Return True if vectors (R, 3) are normals: of length 1, and no saturated colours."""
+    lengths = np.linalg.norm(rows, axis=1)
+    is_right = (np.abs(lengths - 1.0) < UNIT_LENGTH) | (lengths == 0.0)
+    can_be = num_free > len(NORMAL) or bool((rows < 0.0).any()) or bool((rows % 1.0 != 0.0).any())
+    return can_be and bool(lengths.any()) and float(np.mean(is_right)) >= MOST_ROWS
+
+
+def _find_colors(rows: Array) -> int | None:
+    """Return the first of three columns of colours among the free ones (R, C); None if there are none.
+
+    Of four columns the first is usually an intensity. Three colours are nearer to each other than an
+    intensity or a class is to two of them, and none is the same in all points.
+    """
+    found = [k for k in range(rows.shape[1] - 2) if _are_colors(rows[:, k : k + 3])]
+    is_constant = np.ptp(rows, axis=0) == 0.0 if len(rows) else np.zeros(rows.shape[1], np.bool_)
+    found = [k for k in found if not is_constant[k : k + 3].any()] or found
+    if not found:
+        return None
+    spreads = {k: float(np.mean(np.ptp(rows[:, k : k + 3], axis=1))) if len(rows) else 0.0 for k in found}
+    if rows.shape[1] == len(BARE) and 1 in found:
+        return 0 if spreads.get(0, np.inf) * FAR < spreads[1] else 1
+    return min(found, key=lambda k: spreads[k])
+
+
+def _are_colors(rows: Array) -> bool:
+    """Return True if columns (R, 3) can be colours of one range."""
+    if not bool(np.all((rows >= 0.0) & (rows <= MAX_VALUE))):
+        return False
+    is_whole = np.all(rows % 1.0 == 0.0, axis=0)
+    largest = float(np.max(rows, initial=0.0))
+    return largest <= 1.0 or bool(is_whole.all()) or (not is_whole.any() and largest <= MAX_BYTE)
+
+
+def has_names_of_fractions(names: Sequence[str]) -> bool:
+    """Return True if a header says that colours are 0 to 1."""
+    return {*FRACTION_NAMES} <= {*names}
+
+
+def note_names(path: Path, names: tuple[str, ...], line: str, is_pts: bool = False) -> str:
+    """Return a warning of the columns that a file without a header is taken to have, unless it is usual."""
+    if names in (*USUAL, *USUAL_OF_PTS[:is_pts]) or not any({*some} <= {*names} for some in COLOR_NAMES):
+        return ""
+    guess = f"no header, columns read as {','.join(names)} by their values"
+    return f"{path}: {guess}{line and f' ({line})'}; `columns` overrules it"
