@@ -36,7 +36,7 @@ from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .attempts import FIRST_BEAM
-from .beam import brief_query, descend_briefly, refine_matches, refine_starts, score_near
+from .beam import brief_query, descend_briefly, refine_matches, refine_starts, score_briefly, score_near
 from .comparison import compare
 from .covariance import Errors, estimate_covariance
 from .focal_length import FocalFit, fit_focal
@@ -44,11 +44,13 @@ from .ladder import settle
 from .photo import ACROSS
 from .prior import contradictions
 from .query import Query
+from .search import search_poses
 from .selection import Selection, assess_poses
 from .verification import count_agreeing, count_each, find_copies, list_rivals
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
+FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found
 MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo; in symmetric scenes it is about 1
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
@@ -302,14 +304,18 @@ def search_mirrored(query: Query, mirrored: Query, pose: Pose) -> list[Hypothesi
     """Return poses of the mirrored photo, best first, by what found the photo's own: features, or views.
 
     A wall or a ceiling seen from behind fits the mirrored photo: its tilt is that of the pose found, or that
-    upside down.
+    upside down. The search is brief if a brief one finds the photo's own pose.
     """
     if query.features:
         matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
         return refine_matches(mirrored, [f.pose for f in propose_poses(matches, None, 1, query.workers)])
     yaws = uniform_yaws(query.settings.num_yaws)
     tilt = ACROSS @ pose.R_cam_from_world @ ACROSS
-    turned = brief_query(mirrored.with_rotations(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws])))
-    ends = descend_briefly(turned)
-    is_worse = ends.best_score <= score_near(query, pose)
-    return [] if is_worse else refine_starts(turned, ends.poses, FIRST_BEAM)
+    asked = mirrored.with_rotations(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
+    own = brief_query(query.with_rotations(pose.R_cam_from_world @ yaws))
+    own_score = score_near(query, pose)
+    if score_briefly(own) < FOUND_AGAIN * own_score:
+        return refine_starts(asked, search_poses(asked, "known"), query.method.beam)
+    asked = brief_query(asked)
+    ends = descend_briefly(asked)
+    return refine_starts(asked, ends.poses, FIRST_BEAM) if ends.best_score > own_score else []
