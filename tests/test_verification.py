@@ -19,7 +19,6 @@ from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.photo import Seen
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
 from research.synthetic.photos import mask_outside_field
@@ -255,15 +254,15 @@ def test_the_scan_is_drawn_for_whole_photos_too_but_not_for_whole_views_alone(mo
 
 
 @pytest.mark.parametrize(
-    ("count", "num_views", "expected"), [(12, 1, 2), (11, 1, 6), (11, 4, 4), (11, 20, 0), (12, 4, 2)]
+    ("count", "valid_share", "expected"), [(12, 0.5, 2), (11, 0.5, 6), (11, 1.0, 4), (12, 1.0, 2)]
 )
 def test_a_pose_that_explains_less_than_half_of_a_sure_one_is_not_drawn(
-    monkeypatch, count, num_views, expected
+    monkeypatch, count, valid_share, expected
 ):
-    """And no more than sixteen pictures are."""
+    """And of a whole photo no more than four are."""
     monkeypatch.setattr(verification, "count_agreeing", lambda query, pose: count)
     asked = _query()
-    photo = replace(asked.photo, seen=lambda: Seen(num_views * asked.photo.seen().views, None))
+    photo = replace(asked.photo, small=asked.photo.small._replace(valid_share=valid_share))
     best, *others = (Hypothesis(_true_pose(), score) for score in (0.8, 0.5, 0.4, 0.39, 0.3, 0.2, 0.1))
     assert verification.list_rivals(replace(asked, photo=photo), best, others) == others[:expected]
     assert verification.list_rivals(asked.by_views(), best, others) == []

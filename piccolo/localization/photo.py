@@ -13,7 +13,7 @@ from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import Keypoints, find_keypoints
-from ..local_features.perspective_view import PerspectiveView, list_sides, view_around
+from ..local_features.perspective_view import PerspectiveView, cover_sphere, list_sides, view_around
 from ..panorama import Panorama
 from ..panorama.edges import soften
 from ..panorama.local_normalization import normalize_panorama
@@ -134,10 +134,11 @@ def mirror_image(image: Once[Texels]) -> Texels:
 
 
 def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
-    """Find keypoints in one view around what a photo shows, or in views to the sides that show some of it."""
+    """Find keypoints in one view around what a photo shows, or in several; of a whole photo to its sides."""
     width = panorama.rgb.shape[1]
     around = view_around(find_valid(small), width / math.tau, width)
-    views = [around] if around else list_sides(width)
+    several = list_sides(width) if small.valid_share >= WHOLE else cover_sphere(width)
+    views = [around] if around else several
     views = [view for view in views if view.cut_mask(panorama.is_valid).any()]
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     return Seen(views, find_keypoints(gray, panorama.is_valid, views, workers))

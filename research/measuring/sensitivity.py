@@ -59,7 +59,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.verification": (
         "COS_AGREE",
         "DISTINCT_RATIO",
-        "MOST_PICTURES",
+        "MOST_RIVALS",
         "RIVAL_SCORE",
         "SURE_MATCHES",
     ),
