@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from batches import run
+from poses import result, write_results
 from refusals import assert_input_error
 
 from piccolo.cli.command import UsageError, check_distinct, check_outputs, check_suffix, command
@@ -17,7 +18,6 @@ from piccolo.errors import InputError
 from piccolo.files import atomic
 from piccolo.files.line_file import open_locked, whole_lines, whole_size
 from piccolo.geometry.pose import Pose
-from research.scene import Query, write_queries
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -151,15 +151,14 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, why):
     """A limit to the size of files stands for the disk, /dev/full for stdout."""
     (tmp_path / "p.csv").write_bytes(b"old")
     (tmp_path / "link.csv").symlink_to("p.csv")
-    (tmp_path / "r").mkdir()
-    write_queries(tmp_path / "r", [Query(tmp_path / "r" / "a.jpg", "v", Pose(np.eye(3), np.zeros(3)))])
-    tool = f'"{sys.executable}" "{ROOT}/tools/export_poses.py" --scenes r --format csv'
+    write_results(tmp_path / "r.jsonl", [result("a.jpg", Pose(np.eye(3), np.zeros(3)))])
+    tool = f'"{sys.executable}" "{ROOT}/tools/export_poses.py" --results r.jsonl --format csv'
     command = f"(ulimit -f {1 if out == '-' else 0}; {tool} --out {out} > /dev/full)"
     done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
     line = f"export_poses.py: {out}: cannot be used ({why})\n"
     assert (done.returncode, done.stderr) == (3, line)
     assert (tmp_path / "p.csv").read_bytes() == b"old"
-    assert names(tmp_path) == ["link.csv", "p.csv", "r"]
+    assert names(tmp_path) == ["link.csv", "p.csv", "r.jsonl"]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])

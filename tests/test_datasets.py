@@ -177,7 +177,7 @@ def test_refused_lists_and_clouds(folder, tmp_path, capsys):
     code, (line,), _ = made.run(capsys, "generic", folder, out, "--cloud", folder / "scan.xyz")
     assert (code, line["queries"]) == (0, 6)
     for name, content, message in (
-        ("a.csv", b"\xff\xfe", "bytes that are no text"),
+        ("a.csv", b"\xff\xff", "bytes that are no text"),
         ("b.csv", b"image,tx\n", "found no row with a picture"),
         ("c.json", b"{}", "found no list of objects"),
     ):

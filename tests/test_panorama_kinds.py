@@ -7,7 +7,6 @@ import cv2
 import numpy as np
 import pytest
 from pictures import crop_fields, encoded, saved, tiff, with_metadata, write, xmp_packet
-from PIL import features
 from refusals import assert_refused
 
 from piccolo.errors import InputError
@@ -88,7 +87,6 @@ def _exif_of_film(millimetres):
     return head + struct.pack("<HHHIHHI", 1, 0xA405, 3, 1, millimetres, 0, 0)
 
 
-@pytest.mark.skipif(not features.check("avif"), reason="Pillow 11.3 and newer read AVIF")
 def test_avif_is_read(tmp_path):
     path = write(tmp_path / "a.avif", saved(textured(), "AVIF", quality=90))
     assert np.abs(read_panorama(path).rgb.astype(int) - textured()).mean() < 8

@@ -20,7 +20,7 @@ from ...files.array_archive import MAX_HEAD_SIZE, read_header
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
-from .text_columns import MAX_COLUMNS, name_columns, names_of_user, note_names
+from .text_columns import MAX_COLUMNS, drop_broken, name_columns, names_of_user, note_names
 
 NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
@@ -71,7 +71,7 @@ def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     note = ""
     if not names:
         rows = next(array.read_rows(), np.empty((0, num_columns)))
-        names = name_columns(rows[:: 1 + len(rows) // NUM_SAMPLES].astype(np.float64))
+        names = name_columns(drop_broken(rows[:: 1 + len(rows) // NUM_SAMPLES].astype(np.float64)))
         note = note_names(path, names, "")
     chosen = reader.find_fields([name for name in names if names.count(name) == 1], channel)
     if not chosen:

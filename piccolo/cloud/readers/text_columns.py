@@ -136,8 +136,13 @@ def read_samples(path: Path, fields: Fields, num_columns: int) -> Array:
         if len(numbers) == num_columns and not line.strip().startswith(COMMENT_MARKS):
             rows.append([float(field) if is_number(field) else np.nan for field in numbers[:MAX_COLUMNS]])
     found = np.array(rows, np.float64).reshape(-1, min(num_columns, MAX_COLUMNS))
-    is_broken = np.isnan(found)
-    return found[~is_broken[:, np.mean(is_broken, axis=0) < FEW].any(axis=1)] if rows else found
+    return drop_broken(found)
+
+
+def drop_broken(rows: Array) -> Array:
+    """Return rows (R, C) without those in which a number is missing that few others miss."""
+    is_broken = ~np.isfinite(rows)
+    return rows[~is_broken[:, np.mean(is_broken, axis=0) < FEW].any(axis=1)] if len(rows) else rows
 
 
 def names_of_user(path: Path, settings: CloudSettings, num_columns: int) -> tuple[str, ...]:
@@ -153,7 +158,7 @@ def name_columns(rows: Array) -> tuple[str, ...]:
     """Return the names of columns by their values (R, C): x y z, colours, intensity, normals; - of others."""
     num_columns = rows.shape[1]
     names = [SKIP] * num_columns
-    with np.errstate(invalid="ignore"):
+    with np.errstate(invalid="ignore", over="ignore"):
         first = BEFORE if num_columns >= BEFORE + 6 and _are_grid_indices(rows) else 0
         names[first : first + 3] = POSITION
         free = [*range(first + 3, num_columns)]
