@@ -19,7 +19,7 @@ import numpy as np
 from ..arrays import Array, Array32, Mask
 from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
-from ..confidence.focal_length import MOST_CONFLICT, WRONG_SHARE, Opinion
+from ..confidence.focal_length import WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.sphere import compute_indices
@@ -166,12 +166,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         # of the prior's variance, as by DerSimonian and Laird (1986)
         excess = 0.0 if prior.is_measured else max(opinion.off**2 - spread, 0.0)
         wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
-    if conflict > MOST_CONFLICT:
-        precision = wide  # the picture alone says where to look next
-    goal = crest.information @ crest.change + precision @ expected
-    change = np.linalg.inv(crest.information + precision) @ goal
-    total = np.linalg.inv(crest.information + wide)
-    return FocalFit(change, np.asarray(total), crest.motion, opinion, conflict, doubt)
+    total = np.asarray(np.linalg.inv(crest.information + wide))
+    change = total @ (crest.information @ crest.change + wide @ expected)
+    return FocalFit(change, total, crest.motion, opinion, conflict, doubt)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
