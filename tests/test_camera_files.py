@@ -234,7 +234,7 @@ def test_any_camera_that_is_taken_can_be_resampled(data):
     assert np.abs(back - pixels)[is_seen & is_in].max(initial=0.0) < 1e-3
 
 
-MATRIX = [60.0, 0.0, 32.0, 0.0, 61.0, 24.0, 0.0, 0.0, 1.0]
+MATRIX = [60.0, 0.0, 31.5, 0.0, 61.0, 23.5, 0.0, 0.0, 1.0]
 FOREIGN = {
     "transforms.json": {
         "fl_x": 60,
@@ -258,7 +258,7 @@ FOREIGN = {
     "opencv.yml": f"%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\ncamera_matrix: !!opencv-matrix\n"
     f"   rows: 3\n   cols: 3\n   dt: d\n   data: {MATRIX}\n",
     "kalibr.yaml": "cam0:\n  camera_model: pinhole\n  distortion_model: equidistant\n"
-    "  distortion_coeffs: [0.1, 0, 0, 0]\n  intrinsics: [60, 61, 32, 24]\n  resolution: [64, 48]\n",
+    "  distortion_coeffs: [0.1, 0, 0, 0]\n  intrinsics: [60, 61, 31.5, 23.5]\n  resolution: [64, 48]\n",
     "opencv.xml": "<?xml version='1.0'?><opencv_storage><image_width>64</image_width>"
     "<image_height>48</image_height><camera_matrix type_id='opencv-matrix'>"
     f"<data>{' '.join(map(str, MATRIX))}</data></camera_matrix></opencv_storage>",

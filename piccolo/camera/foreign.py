@@ -27,6 +27,7 @@ HEIGHTS = ("image_height", "height", "h")
 SIZES = ("resolution", "image_size", "imagesize")
 LENS = ("distortion_model", "camera_model", "fisheye_model")
 FISHEYES = ("equidistant", "fisheye", "opencv_fisheye", "kannalabrandt4", "kannala_brandt")
+CORNER = 0.5  # [px] to a picture's corner from the middle of its first pixel, the origin of OpenCV and ROS
 SAME_FOCAL = 0.02  # of frames of one camera that has an autofocus
 MAX_DEPTH = 8
 
@@ -154,11 +155,11 @@ def _matrix_of(entry: Mapping[str, Any], width: int, height: int) -> tuple[float
     """Return the focal lengths and the centre [px]; None if there are none."""
     values = _numbers(_first(entry, MATRIX))
     if len(values) == 9:
-        column = 2 if values[2] or values[5] else 6  # Record3D's matrix goes column after column
-        center = (values[2], values[5]) if column == 2 else (values[6], values[7])
-        return values[0], values[4], *center
+        if not (values[2] or values[5]):  # Record3D's matrix goes column after column
+            return values[0], values[4], values[6], values[7]
+        return values[0], values[4], values[2] + CORNER, values[5] + CORNER
     if len(values) == 4:
-        return values[0], values[1], values[2], values[3]
+        return values[0], values[1], values[2] + CORNER, values[3] + CORNER
     if "f" in entry:  # Metashape's, with the centre from the middle
         focal = float(entry["f"])
         x, y = (float(entry.get(name, 0.0)) for name in ("cx", "cy"))
