@@ -61,7 +61,6 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
         write(photos / f"{name}.png", encoded(render_picture(camera, room, at, Workers(2)), ".png"))
         write(cameras / f"{name}.camera.json", json.dumps(document_of((camera,))).encode())
     words = ["--cloud", str(rooms.map_path(SEED)), "--camera", str(cameras), "--quiet"]
-    words += ["--min-confidence", "0.97"]
     assert localize.main([*words, "--pano", str(photos / "narrow.png"), "--out", str(out)]) == 1
     (before,) = read_results([out])
     assert localize.main([*words, "--pano", str(photos), "--out", str(out)]) == 0

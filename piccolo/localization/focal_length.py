@@ -54,6 +54,7 @@ STEP = 1e-4  # [rad, m] with which that is differentiated
 AGREES = 0.25  # least weight of a match that agrees
 ENOUGH_AGREEING = 12  # fewer tell nothing
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
+DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
 CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
@@ -166,9 +167,12 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         # of the prior's variance, as by DerSimonian and Laird (1986)
         excess = 0.0 if prior.is_measured else max(opinion.off**2 - spread, 0.0)
         wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
-    total = np.asarray(np.linalg.inv(crest.information + wide))
-    change = total @ (crest.information @ crest.change + wide @ expected)
-    return FocalFit(change, total, crest.motion, opinion, conflict, doubt)
+    if conflict > DISAGREE:
+        precision = wide  # the picture says where to look next
+    goal = crest.information @ crest.change + precision @ expected
+    change = np.linalg.inv(crest.information + precision) @ goal
+    total = np.linalg.inv(crest.information + wide)
+    return FocalFit(change, np.asarray(total), crest.motion, opinion, conflict, doubt)
 
 
 def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
