@@ -31,7 +31,8 @@ def _write_pcd(path, colors):
     rows = np.empty(len(colors), fields)
     rows["xyz"] = RAW.points_world
     rows["rgb"] = colors
-    size, kind = colors.itemsize, {"f": "F", "u": "U", "i": "I"}[colors.dtype.kind]
+    size = colors.itemsize
+    kind = colors.dtype.kind.upper()
     header = f"VERSION 0.7\nFIELDS x y z r g b\nSIZE 8 8 8 {size} {size} {size}\n"
     header += f"TYPE F F F {kind} {kind} {kind}\nCOUNT 1 1 1 1 1 1\nPOINTS {len(rows)}\nDATA binary\n"
     path.write_bytes(header.encode() + rows.tobytes())

@@ -208,7 +208,8 @@ def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(monke
 @pytest.mark.parametrize(("score", "is_brief"), [(0.37, True), (0.35, False)])
 def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs(monkeypatch, score, is_brief):
     """Briefly, if a brief search finds nine tenths of the score at the photo's own pose."""
-    query, asked = _query(rooms.query(1).rgb[:, ::-1].copy()).without_features(), []
+    query = _query(rooms.query(1).rgb[:, ::-1].copy()).without_features()
+    asked = []
     monkeypatch.setattr(judging, "score_near", lambda *_: 0.4)
     monkeypatch.setattr(judging, "score_briefly", lambda _: score)
     monkeypatch.setattr(judging, "refine_starts", lambda by, starts, beam: asked.append((by, beam)) or [])

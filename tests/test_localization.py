@@ -138,7 +138,8 @@ def test_a_prior_that_allows_nothing_says_what_was_left_out():
 
 
 def test_a_scan_too_large_is_refused_or_prepared_where_the_prior_says(monkeypatch):
-    cloud, whole = rooms.stream(room(1)[1]), scan_map(1)
+    cloud = rooms.stream(room(1)[1])
+    whole = scan_map(1)
     center = whole.centers[0]
     is_near = np.linalg.norm(whole.centers - center, axis=1) <= 1.0
     num = len(find_supported_cells(top_surfaces(whole.octree)))

@@ -271,7 +271,8 @@ def test_the_cache_keeps_them_for_the_next_process(opened, finding):
 
 
 def test_looking_for_them_is_told_and_is_no_work_on_the_photo(opened, finding, caplog):
-    first, watch = opened(), Stopwatch()
+    first = opened()
+    watch = Stopwatch()
     query = rooms.ask(rooms.scene(1)[1], first)
     with caplog.at_level("INFO", "piccolo"):
         poses = match_poses(query, watch)

@@ -59,7 +59,8 @@ def test_truth_is_found_and_every_pose_sees_the_points():
 def test_poses_are_those_of_poselib_where_all_points_are_in_front():
     rng, num_compared = np.random.default_rng(2), 0
     for _ in range(500):
-        R, center = rotation_from_quaternion_wxyz(rng.normal(size=4)), RESTS + rng.normal(size=3)
+        R = rotation_from_quaternion_wxyz(rng.normal(size=4))
+        center = RESTS + rng.normal(size=3)
         points = rng.uniform([-1.0, -1.0, 2.0], [1.0, 1.0, 4.0], size=(3, 3)) @ R + center
         bearings = _rays(points, R, center)
         _, ours = _three(bearings, points)

@@ -80,7 +80,8 @@ def test_poses_are_those_of_a_map_of_both():
     a, b = rooms.room(1)[1], _shifted(rooms.room(2)[1], BESIDE)
     points = np.concatenate([a.points + a.origin_world, b.points + b.origin_world])
     both = Cloud(points, np.concatenate([a.colors, b.colors]), np.zeros(3))
-    whole, scan_map = prepare_map(rooms.stream(both), WORKERS), of_two_rooms()
+    whole = prepare_map(rooms.stream(both), WORKERS)
+    scan_map = of_two_rooms()
     assert abs(len(scan_map.centers) / len(whole.centers) - 1.0) < 0.05
     for seed, name, shift in ((1, "A", np.zeros(3)), (2, "B", BESIDE)):
         found, expected = _localized(scan_map, seed), _localized(whole, seed)

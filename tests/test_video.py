@@ -49,7 +49,8 @@ def test_two_lenses_in_one_video_are_refused(tmp_path):
     with av.open(str(path), "w") as container:
         streams = [container.add_stream("libx264", 4) for _ in range(2)]
         for stream in streams:
-            stream.width, stream.height, stream.pix_fmt = 160, 160, "yuv420p"
+            stream.width = stream.height = 160
+            stream.pix_fmt = "yuv420p"
         for stream in streams:
             for _ in range(4):
                 frame = av.VideoFrame.from_ndarray(np.full((160, 160, 3), 90, np.uint8), format="rgb24")

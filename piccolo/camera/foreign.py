@@ -133,7 +133,8 @@ def _camera_of(entry: Mapping[str, Any]) -> Camera | None:
     sizes = _numbers(_first(entry, SIZES))
     if isinstance(entry.get("resolution"), Mapping):
         sizes = [float(_first(entry["resolution"], names)) for names in (WIDTHS, HEIGHTS)]
-    width, height = _first(entry, WIDTHS) or sizes[0:1], _first(entry, HEIGHTS) or sizes[1:2]
+    width = _first(entry, WIDTHS) or sizes[0:1]
+    height = _first(entry, HEIGHTS) or sizes[1:2]
     if not (width and height) or isinstance(width, Mapping):
         return None
     width = round(float(np.ravel(width)[0]))

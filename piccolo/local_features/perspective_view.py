@@ -17,6 +17,7 @@ MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross th
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
 NUM_SIDES = 4
+# of the faces of a cube; nothing is seen in those at the poles, which bound the sides
 FACES_DEG = [*((90.0 * k, 0.0) for k in range(NUM_SIDES)), (0.0, 90.0), (0.0, -90.0)]
 HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
 STRETCH = 1.2  # tangent of the angle between the middle of a view around a photo and its edge, at most

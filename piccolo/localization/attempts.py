@@ -51,27 +51,26 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
     "known" searches about level.
     """
     method = query.method
-    attempts: list[tuple[Query, Attempt]] = []
     looks_first = method.uses_features and method.uses_search and is_whole(query)
+    first: list[tuple[Query, Attempt]] = []
     if looks_first:
-        attempts = [(query.by_views(), look_first), (query.without_features(), draw_found)]
+        first = [(query.by_views(), look_first), (query.without_features(), draw_found)]
     if query.rotations is not None:
-        attempts.append((query, look_along_walls))
+        first.append((query, look_along_walls))
     by_features: list[tuple[Query, Attempt]] = []
     if method.uses_features:
         parts = (query.features[:k] for k in range(1, len(query.features)))
         by_features = [(replace(query, features=part), search_part) for part in parts]
         by_features.append((query, search_matches))
-    if not looks_first:
-        attempts += by_features
+    by_views: list[tuple[Query, Attempt]] = []
     asked = query.without_features() if looks_first else query
     is_partial = query.photo.is_partial
     if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
         upright: Tilts = "level" if is_partial and not query.photo.has_tilt else "known"
-        attempts.append((asked, partial(search_views, tilts=upright)))
+        by_views.append((asked, partial(search_views, tilts=upright)))
     if method.uses_search and query.settings.gravity != "known":
-        attempts.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
-    return attempts + by_features if looks_first else attempts
+        by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
+    return [*first, *by_views, *by_features] if looks_first else [*first, *by_features, *by_views]
 
 
 def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:

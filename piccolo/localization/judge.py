@@ -232,10 +232,12 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
 
 def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:
     """Return True for the best pose and for copies of its place; of a photo without matches there False."""
+    if not query.uses_matches:
+        return [False] * (1 + len(others))
     rivals = [h.pose for h in list_rivals(query, best, others)]
     copies = compress(rivals, find_copies(query, best.pose, rivals))
     keys = {pose.key for pose in (best.pose, *copies)}
-    return [query.uses_matches and h.pose.key in keys for h in (best, *others)]
+    return [h.pose.key in keys for h in (best, *others)]
 
 
 def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:

@@ -13,7 +13,7 @@ import PIL.Image
 from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
 from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
-from piccolo.cli.options import add_cloud_options, cloud_settings_from
+from piccolo.cli.options import cloud_settings_from
 from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import PackedPoints
 from piccolo.files.atomic import write_atomically
@@ -29,7 +29,7 @@ from piccolo.scan_map.open_map import open_points
 from piccolo.views.pictures import checkerboard, fill_holes, resize_rgb
 from piccolo.views.surfels import make_surfels, render_surfels, visible_indices
 
-from .loss_surface import read_known_poses
+from .loss_surface import add_photo_options, read_known_poses
 
 EPILOG = """\
 example:
@@ -122,10 +122,7 @@ def encode_gif(frames: Sequence[Bytes]) -> bytes:
 
 def add_arguments(parser: ArgumentParser) -> None:
     """All options."""
-    add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
-    option(parser, "--pano FILE", "the panorama", required=True)
-    option(parser, "--result FILE", "result of localize.py with the estimated pose")
-    option(parser, "--truth FILE", "queries.json with the true pose")
+    add_photo_options(parser)
     option(parser, "--out FILE", "write the animation here, .gif or .mp4 (extra video)", required=True)
 
 

@@ -242,14 +242,17 @@ class Table(NamedTuple):
     def source(self, channel: Channel, settings: CloudSettings) -> PointSource:
         """Return the points with colours, packed or not, or of splats; or with a scalar; or alone."""
         colors = tuple(name.lower() for name in self.names[3:6])
-        read, types = self._read_parts, self.types[3:]
+        types = self.types[3:]
+        read = self._read_parts
         if colors == SPLAT_NAMES:
-            read, types = self._read_splats, ()
+            types = ()
+            read = self._read_splats
         elif len(colors) == 1 and colors[0] in PACKED_NAMES:
             if types[0] not in ("f4", "u4", "i4"):
                 wrong = f"'{self.names[3]}' is of type {types[0]}"
                 raise InputError(f"{self.path}: {wrong}, wanted uint32, int32 or float32")
-            read, types = self._read_packed, ()
+            types = ()
+            read = self._read_packed
         return make_source(self.path, read, channel, settings, self.num_points, types)
 
     def _read_parts(self) -> Iterator[Part]:
