@@ -12,6 +12,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..camera.foreign import read_binary_images
+from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
 from ..files.json_file import DAMAGE, MAX_SIZE, describe, read_bytes, read_json, read_text
 from ..geometry.pose import (
@@ -168,7 +169,7 @@ def read_lines(path: Path) -> list[NamedPose]:
             return [read_colmap_row(row) for row in rows]
         rows = _rows(path)
         if _are_colmap(rows):
-            return [read_colmap_row(row) for row in rows if not all(map(_is_number, row))]  # else points
+            return [read_colmap_row(row) for row in rows if not all(map(is_number, row))]  # else points
         if _are_hloc(rows):
             return [read_colmap_row(["", *row[1:], "", row[0]]) for row in rows]
         return [read_tum_row(row) for row in rows]
@@ -188,7 +189,7 @@ def _rows(path: Path) -> list[list[str]]:
     if all(column is not None for column in columns):
         rows = rows[not lines[0].startswith("#") :]
         return [[row[k] for k in columns if k is not None and k < len(row)] for row in rows]
-    if rows and all(len(row) == NUM_TUM + 1 and all(map(_is_number, row[1:])) for row in rows):
+    if rows and all(len(row) == NUM_TUM + 1 and all(map(is_number, row[1:])) for row in rows):
         return [row[:NUM_TUM] for row in rows]
     return rows
 
@@ -196,25 +197,17 @@ def _rows(path: Path) -> list[list[str]]:
 def _split(line: str) -> list[str]:
     """Split a row at blanks, or at commas; a name at the end of COLMAP's may have blanks."""
     words = line.split(",") if line.count(",") >= NUM_TUM - 1 else line.split()
-    is_named = len(words) > NUM_COLMAP and not all(map(_is_number, words))
+    is_named = len(words) > NUM_COLMAP and not all(map(is_number, words))
     return line.split(None, NUM_COLMAP - 1) if is_named else [word.strip() for word in words]
 
 
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
-
-
 def _are_colmap(rows: Sequence[Sequence[str]]) -> bool:
-    return any(len(row) == NUM_COLMAP and not _is_number(row[-1]) for row in rows[:2])
+    return any(len(row) == NUM_COLMAP and not is_number(row[-1]) for row in rows[:2])
 
 
 def _are_hloc(rows: Sequence[Sequence[str]]) -> bool:
     """Return True for rows of a name, a quaternion w x y z, a position; TUM has the position first."""
-    if not rows or not all(len(row) == NUM_TUM and all(map(_is_number, row[1:])) for row in rows):
+    if not rows or not all(len(row) == NUM_TUM and all(map(is_number, row[1:])) for row in rows):
         return False
     values = np.array([row[1:] for row in rows], float)
     with np.errstate(over="ignore"):
@@ -236,7 +229,7 @@ def read_tum_row(row: Sequence[str]) -> NamedPose:
     """Return the time and the pose of a row: T_world_from_cam, camera axes right, down, forward."""
     if len(row) != NUM_TUM:
         raise ValueError(f"{len(row)} columns")
-    if wrong := [word for word in row[1:] if not _is_number(word)]:
+    if wrong := [word for word in row[1:] if not is_number(word)]:
         raise ValueError(f"{wrong[0][:40]!r}, which is no number")
     values = np.array(row[1:], float)
     T = np.column_stack([read_quaternion(np.roll(values[3:], 1)), values[:3]])
