@@ -135,7 +135,7 @@ USAGE = [
     ("--preset odd", "--preset: found 'odd', wanted default or paper"),
     ("--preset paper num_translations=0", "num_translations: found 0"),
     ("--preset default num_translations=9", "found 'num_translations=9', wanted NAME"),
-    ("--preset paper loss=both", "found 'loss=both', wanted one of sampling, photometric"),
+    ("--preset paper solver=both", "found 'solver=both', wanted one of gauss-newton, lbfgs, adam"),
     ("--preset paper use_visibility=no", "found 'use_visibility=no', wanted one of true, fal"),
     ("--preset paper max_points=many", "found 'max_points=many', wanted int"),
     ("--preset paper --near 0 0 0 1", "--near: not an option of the preset paper"),

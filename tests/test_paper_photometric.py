@@ -16,17 +16,15 @@ from piccolo.geometry.sphere import pixel_rays
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.optimize.refine import refine
 from piccolo.panorama.model import shrink
-from piccolo.paper.localize import (
-    PaperSettings,
-    localize,
-    make_loss,
+from piccolo.paper.localize import localize, prepare
+from piccolo.views.zbuffer import View, render_view
+from research.experiments.photometric import (
+    PhotometricSettings,
     photometric_equations,
     photometric_loss,
     pixel_motion,
-    prepare,
     view_gradient,
 )
-from piccolo.views.zbuffer import View, render_view
 
 HALF_SIZE = np.array([2.5, 2.0, 1.3])
 WIDTH = 128
@@ -126,9 +124,9 @@ def test_view_gradient_beside_holes_at_the_seam_and_at_the_poles():
 @pytest.mark.parametrize("solver", ["adam", "lbfgs", "gauss-newton"])
 def test_descent_recovers_the_true_pose(solver):
     points, panorama, true_pose = rooms.scene(1)
-    settings = dataclasses.replace(PaperSettings(), loss="photometric", photometric_width=128, solver=solver)
+    settings = PhotometricSettings(photometric_width=128, solver=solver)
     start = step(true_pose, np.array([0.06, -0.04, 0.08, 0.1, -0.12, 0.05]))
-    refined = refine(points, make_loss(panorama, settings), start, settings)
+    refined = refine(points, settings.make_loss(panorama), start, settings)
     rooms.assert_near(refined.pose, true_pose, 0.03, 0.5)
     assert refined.loss < photometric_loss(points, shrink(panorama, settings.photometric_width), start)
 
@@ -136,8 +134,7 @@ def test_descent_recovers_the_true_pose(solver):
 @pytest.mark.parametrize("initialization", ["two-stage", "loss-only"])
 def test_camera_is_found_with_the_same_bits_for_any_number_of_threads(initialization):
     quick = {"num_translations": 20, "max_points": 30_000, "num_iterations": 40, "num_by_histogram": 3}
-    how = {"loss": "photometric", "photometric_width": 128, "initialization": initialization}
-    settings = PaperSettings(**how, **quick)
+    settings = PhotometricSettings(photometric_width=128, initialization=initialization, **quick)
     paper_map, panorama = prepare(room(1)[1], settings), as_panorama(query(1).rgb)
     one, two = (localize(paper_map, panorama, settings, Workers(n), Stopwatch()) for n in (1, 2))
     assert errors(one.pose, query(1).pose)[0] < 0.1
@@ -162,4 +159,4 @@ def test_masked_or_empty_views_have_no_loss():
 def test_width_that_means_nothing_is_refused():
     for width in (0, 31, 129, 8192):
         with pytest.raises(InputError, match=f"photometric_width: found {width}, wanted an even number of"):
-            PaperSettings(photometric_width=width)
+            PhotometricSettings(photometric_width=width)

@@ -110,16 +110,6 @@ def compute_indices(rays: Floats, width: int) -> tuple[Int64s, Int64s]:
     return np.minimum(v.astype(np.int64), width // 2 - 1), u.astype(np.int64) % width
 
 
-def ray_jacobian(rays: Array) -> tuple[Array, Array]:
-    """Return the gradients (H, W, 3) of u and of v in camera coordinates, at `pixel_rays`, 1 m away."""
-    x, y, z = np.moveaxis(rays, -1, 0)
-    rho = np.hypot(x, y)
-    scale = rays.shape[1] / (2.0 * math.pi)
-    by_u = np.stack([y, -x, np.zeros_like(x)], axis=-1) / rho[..., None] ** 2
-    by_v = np.stack([x * z, y * z, -(rho**2)], axis=-1) / rho[..., None]
-    return scale * by_u, scale * by_v
-
-
 def solid_angles(width: int) -> Array:
     """Return the solid angle [sr] of a pixel of each row (width / 2,); exact: all pixels' sum to 4 pi."""
     edges = np.sin((0.5 - np.arange(width // 2 + 1) / (width // 2)) * np.pi)

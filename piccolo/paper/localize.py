@@ -1,15 +1,5 @@
-"""The paper's method: poses on a grid in free space are scored, the diverse best refined, one selected.
+"""The paper's method: poses on a grid in free space are scored, the diverse best refined, one selected."""
 
-Beside the sampling loss there is the paper's comparison: the cloud is rendered, and pixels are compared.
-
-    L(R, t) = (1 / N') sum_u || V(u) - I(u) ||_2
-
-over the N' pixels u in which the view V, z-buffered at the pose, shows points, and the panorama I counts. A
-pixel's depth says which point p it shows. A step (w, d) moves it by dp = w x p - d and in the image by
-du = J dp, so at a fixed pixel V changes by -grad V . J dp. Rasterisation and occlusions have no derivative.
-"""
-
-import functools
 import math
 from dataclasses import asdict, dataclass, replace
 from typing import Literal
@@ -34,13 +24,13 @@ from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..errors import InputError
 from ..geometry.nearness import Nearness
 from ..geometry.pose import Gravity, Pose, uniform_rotations, uniform_yaws
-from ..geometry.sphere import pixel_rays, ray_jacobian, solid_angles
+from ..geometry.sphere import solid_angles
 from ..jobs.threads import Stopwatch, Workers
-from ..optimize.refine import DescentSettings, Equations, Loss, Refined, make_sampling_loss, refine
+from ..optimize.refine import DescentSettings, Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink
 from ..panorama.texels import pack_texels
-from ..views.zbuffer import MAX_VIEW_WIDTH, MIN_VIEW_WIDTH, View, is_free_space, render_view, visible_points
+from ..views.zbuffer import is_free_space, render_view, visible_points
 
 # No covariance is known here, and too few alternatives to tell places that repeat: a rough guide, by margin
 # and log of the agreement, learnt without such places.
@@ -48,11 +38,6 @@ PAPER_BIAS = -0.20
 PAPER_WEIGHTS = (6.37, 2.51)
 MIN_CLEARANCE = 0.25  # a camera is not nearer to a surface than this [m]
 PROBE_WIDTH = 48  # cells of 7.5 degrees for the two tests
-MIN_SHOWN_SHARE = 0.5  # of what is rendered, as of the sampling loss: masked pixels may not hide more
-MIN_FILLED_SHARE = 0.1  # of the pixels that the points could fill: fewer are seen from outside of a scan
-LEAST_DEPTH = 1e-3  # [m]
-LEAST_NORM = 0.5 / 255.0  # a residual below half an 8-bit level has the weight of half a level
-PoseLoss = Literal["sampling", "photometric"]
 Initialization = Literal["two-stage", "loss-only"]
 
 
@@ -63,13 +48,11 @@ class PaperSettings(DescentSettings):
     gravity: Gravity = "known"  # known: the camera is upright, only its yaw is searched
     num_translations: int = 50  # [N_t] positions on a uniform grid over the cloud's box, all in free space
     num_rotations: int = 0  # [N_r] 0 for the paper's: 8 yaws if gravity is known, else 32 rotations of SO(3)
-    loss: PoseLoss = "sampling"  # photometric: of the rendered cloud, pixel by pixel
     initialization: Initialization = "two-stage"  # loss-only: K2 poses by the loss, without histograms
     num_by_loss: int = 50  # [K1] poses kept by the loss
     num_by_histogram: int = 6  # [K2] poses kept by the colour histograms, and refined
     grid_margin: float = 0.0  # share of the box left out of the grid on each side
     histogram_bins: int = 8  # a channel
-    photometric_width: int = 256  # [px] at most, of the views and of the panorama for the photometric loss
     histogram_width: int = 256  # [px] of the views and of the panorama that are compared
     min_distance: float = 0.3  # poses closer than this [m] and `min_angle_deg` are one: the better is kept
     min_angle_deg: float = 15.0
@@ -93,9 +76,6 @@ class PaperSettings(DescentSettings):
         check_confidence(self.min_confidence)
         if not 2 <= self.histogram_bins <= 64:
             raise InputError(f"histogram_bins: found {self.histogram_bins}, wanted 2 to 64")
-        if not MIN_VIEW_WIDTH <= self.photometric_width <= MAX_VIEW_WIDTH or self.photometric_width % 2:
-            wanted = f"wanted an even number of {MIN_VIEW_WIDTH} to {MAX_VIEW_WIDTH}"
-            raise InputError(f"photometric_width: found {self.photometric_width}, {wanted}")
 
     @property
     def effective_num_rotations(self) -> int:
@@ -106,77 +86,9 @@ class PaperSettings(DescentSettings):
         """Return the settings as they took effect."""
         return {"preset": "paper", **asdict(self), "num_rotations": self.effective_num_rotations}
 
-
-def photometric_loss(points: PackedPoints, panorama: Panorama, pose: Pose) -> float:
-    """Return the loss in [0, sqrt(3)] at `pose`, over the panorama's own pixels; inf if too few are shown."""
-    found = _compare(points, panorama, pose)
-    return math.inf if found is None else float(np.linalg.norm(found[1], axis=-1).mean(dtype=np.float64))
-
-
-def photometric_equations(points: PackedPoints, panorama: Panorama, pose: Pose) -> Equations:
-    """Return the loss at `pose`, its gradient (6,) and the matrix (6, 6) of reweighted least squares."""
-    found = _compare(points, panorama, pose)
-    if found is None:
-        return math.inf, np.zeros(6), np.eye(6)
-    view, residuals, counts = found
-    norms = np.linalg.norm(residuals, axis=-1)
-    by_u, by_v = (gradient[counts] for gradient in view_gradient(view))
-    rows_u, rows_v = pixel_motion(view.depth, counts)
-    weights = 1.0 / np.maximum(norms, LEAST_NORM)
-    e_u, e_v = (weights * (by * residuals).sum(axis=1) for by in (by_u, by_v))
-    gradient = -(e_u @ rows_u + e_v @ rows_v)
-    a_uu, a_uv, a_vv = (weights * (a * b).sum(axis=1) for a, b in ((by_u, by_u), (by_u, by_v), (by_v, by_v)))
-    cross = (rows_u * a_uv[:, None]).T @ rows_v
-    matrix = (rows_u * a_uu[:, None]).T @ rows_u + (rows_v * a_vv[:, None]).T @ rows_v + cross + cross.T
-    count = len(norms)
-    return float(norms.mean(dtype=np.float64)), gradient / count, matrix / count
-
-
-def _compare(points: PackedPoints, panorama: Panorama, pose: Pose) -> tuple[View, Array32, Mask] | None:
-    """Render the view at `pose`; return it, its differences (N, 3) in [-1, 1], and their mask (H, W).
-
-    None where masked pixels hide too much of the view, or it is nearly empty, as from outside a scan.
-    """
-    view = render_view(points, pose, panorama.rgb.shape[1])
-    counts = view.is_seen & panorama.is_valid
-    num_seen = int(view.is_seen.sum())
-    least_shown = MIN_SHOWN_SHARE * float(panorama.is_valid.mean()) ** 2 * num_seen
-    least_seen = MIN_FILLED_SHARE * min(view.is_seen.size, len(points))
-    if num_seen <= least_seen or int(counts.sum()) <= least_shown:
-        return None
-    return view, view.rgb[counts] - panorama.rgb[counts].astype(np.float32) / np.float32(255.0), counts
-
-
-def view_gradient(view: View) -> tuple[Array32, Array32]:
-    """Return derivatives (H, W, 3) by u and v [1/px]: central, one-sided at a hole, 0 between two."""
-    seen = view.is_seen[..., None].astype(np.float32)
-    gradients = []
-    for axis in (1, 0):
-        ahead, behind = (np.roll(view.rgb, -step, axis=axis) for step in (1, -1))
-        has_ahead, has_behind = (np.roll(seen, -step, axis=axis) for step in (1, -1))
-        if axis == 0:  # rows do not wrap
-            has_ahead[-1] = 0.0
-            has_behind[0] = 0.0
-        total = (ahead - view.rgb) * has_ahead + (view.rgb - behind) * has_behind
-        gradients.append(total / np.maximum(has_ahead + has_behind, 1.0))
-    return gradients[0], gradients[1]
-
-
-@functools.lru_cache(maxsize=2)
-def _unit_motion(width: int) -> tuple[Array, Array]:
-    """Return derivatives (H, W, 6) of u and v by a step, for points at 1 m in each pixel's centre."""
-    rays = pixel_rays(width)
-    rows_u, rows_v = (np.concatenate([np.cross(rays, by_p), -by_p], axis=-1) for by_p in ray_jacobian(rays))
-    return rows_u, rows_v
-
-
-def pixel_motion(depth: Array32, counts: Mask) -> tuple[Array, Array]:
-    """Return derivatives (N, 6) of u and v [px] by a step, for pixels of `counts` at `depth` (H, W)."""
-    rows_u, rows_v = (rows[counts] for rows in _unit_motion(depth.shape[1]))
-    per_depth = 1.0 / np.maximum(depth[counts], LEAST_DEPTH)[:, None]
-    rows_u[:, 3:] *= per_depth  # a turn moves pixels alike at every depth
-    rows_v[:, 3:] *= per_depth
-    return rows_u, rows_v
+    def make_loss(self, panorama: Panorama) -> Loss:
+        """Return the loss of poses of a panorama."""
+        return make_sampling_loss(pack_texels(panorama.rgb, panorama.is_valid))
 
 
 def box_grid(low: Array, high: Array, num_cells: int) -> Array:
@@ -293,23 +205,12 @@ def search(
     return best_distinct(by_histogram, settings.num_by_histogram, near)
 
 
-def make_loss(panorama: Panorama, settings: PaperSettings) -> Loss:
-    """Return the loss that the settings select."""
-    if settings.loss == "photometric":
-        small = shrink(panorama, settings.photometric_width)
-        return Loss(
-            lambda points, pose: photometric_loss(points, small, pose),
-            lambda points, pose: photometric_equations(points, small, pose),
-        )
-    return make_sampling_loss(pack_texels(panorama.rgb, panorama.is_valid))
-
-
 def localize(
     paper_map: PaperMap, panorama: Panorama, settings: PaperSettings, workers: Workers, watch: Stopwatch
 ) -> Localization:
     """Localize by Algorithm 1 of the paper: search, refine, select; then evaluate the selected pose."""
     points = paper_map.points
-    loss = make_loss(panorama, settings)
+    loss = settings.make_loss(panorama)
     with watch.stage("search"):
         starts = search(paper_map, panorama, loss, settings, workers)
     with watch.stage("refine"):

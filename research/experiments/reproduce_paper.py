@@ -45,6 +45,7 @@ from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import statistics, table_of
 from ..scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
 from ..synthetic.photos import UPSIDE_DOWN
+from .photometric import PhotometricSettings
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.
 SceneTransform = Callable[[Scene, Path], Scene]
@@ -134,7 +135,8 @@ class Experiment(NamedTuple):
 
     title: str
     note: str  # what is varied, in a sentence
-    cases: Mapping[str, Mapping[str, Any]] | None  # by name: of Condition and of the settings; None: splits
+    # by name: fields of Condition and of the settings, and `kind`, another class of these; None: splits
+    cases: Mapping[str, Mapping[str, Any]] | None
     is_of_paper: bool = False  # about what only that preset has
 
 
@@ -152,8 +154,10 @@ def conditions_of(
     found = []
     for name, case in cases.items():
         own = {field: value for field, value in case.items() if field in Condition._fields}
-        settings = {field: value for field, value in case.items() if field not in own}
-        found += [Condition(name, replace(preset, **settings), **own) for preset in presets]
+        settings = {field: value for field, value in case.items() if field not in (*own, "kind")}
+        for preset in presets:
+            kind = case.get("kind", type(preset))
+            found.append(Condition(name, kind(**vars(preset) | settings), **own))
     return found
 
 
@@ -190,7 +194,7 @@ EXPERIMENTS = {
     "loss": Experiment(
         "sampling against photometric loss",
         "the loss of preset paper, in search and descent",
-        {"photometric loss": {"loss": "photometric"}, "sampling loss": {"loss": "sampling"}},
+        {"photometric loss": {"kind": PhotometricSettings}, "sampling loss": {}},
         is_of_paper=True,
     ),
     "gravity": Experiment(
