@@ -17,8 +17,8 @@ from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
-from piccolo.panorama.video import writing_video
 from piccolo.report.entries import collect_entries, shorten_names, unique_names
+from research.synthetic.walk_frames import writing_video
 
 STOREYS = ["--storeys", "Ground floor", "First floor"]
 

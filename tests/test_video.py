@@ -8,7 +8,8 @@ import pytest
 from refusals import assert_input_error
 
 from piccolo.panorama.picture import read_picture
-from piccolo.panorama.video import frames_at, frames_of, writing_video
+from piccolo.panorama.video import frames_at, frames_of
+from research.synthetic.walk_frames import writing_video
 
 MATRICES = {  # of the track, by the turn to the right that players make [deg]
     90: (0, 65536, 0, -65536, 0, 0, 0, 0, 1 << 30),

@@ -18,11 +18,11 @@ from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
 from piccolo.jobs import memory
 from piccolo.jobs.threads import Workers
 from piccolo.panorama import picture
-from piccolo.panorama.video import writing_video
 from piccolo.photo import Photo
 from piccolo.result import read_results
 from piccolo.scan_walk import Walk
 from piccolo.walk import tracker as tracker_module
+from research.synthetic.walk_frames import writing_video
 from research.synthetic.world import free_position, photograph
 
 NUM_FRAMES, STEP_S = 8, 0.5

@@ -1,8 +1,6 @@
-"""Videos: their frames as picture files, the sharpest around each time step; and frames as a video."""
+"""Videos: their frames as picture files, the sharpest around each time step."""
 
-from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
-from fractions import Fraction
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,7 +9,6 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import InputError
-from ..files.atomic import replacing
 from ..jobs.memory import check_memory
 from ..optional import import_optional
 
@@ -104,20 +101,3 @@ def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFra
     if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
         raise OSError(f"{path}: can't be written")
     return VideoFrame(time, path)
-
-
-@contextmanager
-def writing_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Callable[[Bytes], None]]:
-    """Yield a function that takes frames (H, W, 3) of an MP4 (H.264), `rate` a second; W and H are even."""
-    av = import_optional("video", "av", "video")
-    with replacing(path) as file, av.open(file, "w", format="mp4") as container:
-        stream = container.add_stream("libx264", Fraction(rate).limit_denominator(1001))
-        stream.width, stream.height = size
-        stream.pix_fmt = "yuv420p"
-        stream.options = {"crf": "18"}  # nothing to be seen is lost
-
-        def add(rgb: Bytes) -> None:
-            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
-
-        yield add
-        container.mux(stream.encode())

@@ -24,11 +24,11 @@ from piccolo.optional import import_optional
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels
-from piccolo.panorama.video import writing_video
 from piccolo.scan_map.open_map import open_points
 from piccolo.views.pictures import checkerboard, fill_holes, resize_rgb
 from piccolo.views.surfels import make_surfels, render_surfels, visible_indices
 
+from ..synthetic.walk_frames import writing_video
 from .loss_surface import add_photo_options, read_known_poses
 
 EPILOG = """\

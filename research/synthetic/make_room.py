@@ -25,13 +25,12 @@ from piccolo.export.formats import tum_lines, write_lines
 from piccolo.files.atomic import write_atomically
 from piccolo.jobs.threads import Workers
 from piccolo.optional import import_optional
-from piccolo.panorama.video import writing_video
 from piccolo.views.pictures import encode_image
 
 from .. import scene as scenes
 from . import world as worlds
 from .office import Office, make_office
-from .walk_frames import BAD_KINDS, WalkOptions, frames_of
+from .walk_frames import BAD_KINDS, WalkOptions, frames_of, writing_video
 from .walking import Walker
 from .world import World
 

@@ -1,14 +1,19 @@
 """Pictures by a camera that is carried through a building: blur, people in the way, useless frames."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
+from piccolo.files.atomic import replacing
 from piccolo.jobs.threads import Workers
+from piccolo.optional import import_optional
 
 from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .office import Office
@@ -126,3 +131,20 @@ class Person:
         for (z, size), paint in zip(BODY, self.paints, strict=True):
             b.put([0.0, 0.0, z], size, paint, yaw)
         return b.room(np.zeros(3), feet + LAMP)
+
+
+@contextmanager
+def writing_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Callable[[Bytes], None]]:
+    """Yield a function that takes frames (H, W, 3) of an MP4 (H.264), `rate` a second; W and H are even."""
+    av = import_optional("video", "av", "video")
+    with replacing(path) as file, av.open(file, "w", format="mp4") as container:
+        stream = container.add_stream("libx264", Fraction(rate).limit_denominator(1001))
+        stream.width, stream.height = size
+        stream.pix_fmt = "yuv420p"
+        stream.options = {"crf": "18"}  # nothing to be seen is lost
+
+        def add(rgb: Bytes) -> None:
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(rgb, format="rgb24")))
+
+        yield add
+        container.mux(stream.encode())
