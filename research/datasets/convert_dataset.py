@@ -33,16 +33,16 @@ from piccolo.jobs.threads import Progress, Workers
 from piccolo.views.pictures import encode_image
 
 from ..scene import CLOUD_NAME, QUERIES_NAME, Query, read_scene, write_queries
-from . import generic, research, stanford
+from . import generic, papers
 from .checking import check_scene
 from .model import AXES, DIRECTIONS, ConvertOptions, PosedPanorama, SceneList, SceneSpec
 
 DATASETS = {  # a line on each, and what finds its scenes
-    stanford.NAME: ("Stanford2D-3D-S panoramas with S3DIS room clouds", stanford.list_scenes),
-    research.OMNISCENES: ("OmniScenes, all splits", research.list_omniscenes),
-    research.MPO: ("MPO scans with panoramas, moved randomly as in the PICCOLO paper", research.list_mpo),
-    research.MATTERPORT: ("Matterport3D skyboxes and house meshes", research.list_matterport),
-    research.LOC360: ("360Loc 360-degree queries, with a cloud of your own", research.list_360loc),
+    papers.STANFORD: ("Stanford2D-3D-S panoramas with S3DIS room clouds", papers.list_stanford),
+    papers.OMNISCENES: ("OmniScenes, all splits", papers.list_omniscenes),
+    papers.MPO: ("MPO scans with panoramas, moved randomly as in the PICCOLO paper", papers.list_mpo),
+    papers.MATTERPORT: ("Matterport3D skyboxes and house meshes", papers.list_matterport),
+    papers.LOC360: ("360Loc 360-degree queries, with a cloud of your own", papers.list_360loc),
     generic.NAME: ("any panoramas with poses in a CSV, JSON or TUM file", generic.list_scenes),
 }
 
