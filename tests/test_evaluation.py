@@ -15,7 +15,6 @@ from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.walk.results import Alone, WalkFrame
 from research.evaluation import tables
-from research.evaluation.plots import errors_figure, figure_png, risk_figure
 from research.evaluation.query_result import (
     PAPER_THRESHOLDS,
     QueryResult,
@@ -24,7 +23,14 @@ from research.evaluation.query_result import (
     match_results,
     read_run,
 )
-from research.evaluation.tables import alone_table, group_walks, walk_table
+from research.evaluation.tables import (
+    alone_table,
+    errors_figure,
+    figure_png,
+    group_walks,
+    risk_figure,
+    walk_table,
+)
 from research.scene import Query, Scene
 
 TRUE_POSE = Pose(exp_so3(np.array([0.4, 0.1, -2.0])), np.array([10.0, -4.0, 1.5]))

@@ -39,7 +39,6 @@ from piccolo.scan_map.open_map import scan_sha256_of
 
 from ..scene import Query, Scene, find_scenes, input_files
 from . import query_result, tables
-from .plots import errors_figure, figure_png, risk_figure
 from .query_result import QueryResult, Thresholds
 
 EPILOG = """\
@@ -123,7 +122,7 @@ def write_report(
     if arguments.markdown:
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
-        write_atomically(arguments.errors, figure_png(errors_figure(runs, thresholds)))
+        write_atomically(arguments.errors, tables.figure_png(tables.errors_figure(runs, thresholds)))
     print_report(arguments, outputs_of(arguments), text)
 
 
@@ -290,7 +289,7 @@ def main(arguments: Namespace) -> int:
         write_atomically(arguments.csv, tables.csv_text(rows).encode())
     if arguments.risk:
         points = tables.risk_and_coverage(rows, thresholds)
-        write_atomically(arguments.risk, figure_png(risk_figure(points)))
+        write_atomically(arguments.risk, tables.figure_png(tables.risk_figure(points)))
     name = (arguments.out or arguments.results).stem
     write_report(arguments, report_of(scenes, rows, thresholds), {name: rows}, thresholds)
     return EXIT_BAD_INPUT if num_failed else 0

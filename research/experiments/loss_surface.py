@@ -33,7 +33,7 @@ from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
 from piccolo.views.zbuffer import is_free_space, visible_points
 
-from ..evaluation.plots import figure_png, new_figure
+from ..evaluation.tables import figure_png, new_figure
 from ..scene import read_scene
 
 POOL_PER_POINT = 8  # points of which visible ones are taken, for one that is used
