@@ -33,18 +33,20 @@ from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.opened_scan import OpenedScan
 from piccolo.photo import Photo
-from piccolo.result import Beside, Result, read_results
+from piccolo.result import Beside, Result, Source, read_results
 from research.synthetic.world import render_picture
 
-CAMERA = {"model": "PINHOLE"}
 PHONE = (Mount(pinhole(1024, 512, 400.0)),)
-NONE_ASKED = {"photos": [], "asked_sha256": "0"}
+NONE_ASKED = Beside((), "0" * 64)
+NOWHERE = Pose(np.eye(3), np.zeros(3))
 
 
-def _text(pano, status="localized", beside=None, camera=CAMERA, confidence=0.95):
-    fields = {"pano": pano, "pano_sha256": "1", "status": status, "confidence": confidence}
-    size = {"image_size": [1024, 512], "focal_length": None}
-    return json.dumps({**fields, **size, "beside": beside, "camera": camera})
+def _text(pano, status="localized", beside=None, cameras=PHONE, confidence=0.95):
+    source = Source(None, "1" * 64, (1024, 512))
+    about = {"beside": beside, "cameras": cameras, "source": source}
+    if status in ("unreadable", "failed"):
+        return Result(status, 0.0, "a.ply", pano, error="it is broken", source=source).to_json()
+    return Result(status, confidence, "a.ply", pano, NOWHERE, **about).to_json()
 
 
 def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
@@ -81,8 +83,8 @@ def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
     """What was localized beside others is no picture for others; spheres are not looked at again."""
     statuses = ("localized", "ambiguous", "not_localized", "unreadable", "failed")
     texts = [_text(f"{k}", status) for k, status in enumerate(statuses)]
-    texts += [_text("5", beside={"photos": ["0"], "asked_sha256": "0"}), _text("6", camera=None)]
-    texts += [_text("7", "ambiguous", camera=None), _text("8", "not_localized", NONE_ASKED)]
+    texts += [_text("5", beside=Beside(("0",), "0" * 64)), _text("6", cameras=())]
+    texts += [_text("7", "ambiguous", cameras=()), _text("8", "not_localized", NONE_ASKED)]
     texts += [_text("9", confidence=0.94)]
     looks = list_looks_beside(texts)
     assert [(look.number, look.status, look.pano, look.first) for look in looks] == [
@@ -92,8 +94,7 @@ def test_doubtful_phone_photos_are_looked_at_beside_sure_ones():
         (8, "not_localized", "8", texts[8]),
     ]
     assert all(look.beside == (texts[0], texts[6]) for look in looks)
-    asked = {"photos": [], "asked_sha256": looks[0].asked_sha256}
-    texts[1] = _text("1", "ambiguous", asked)
+    texts[1] = _text("1", "ambiguous", Beside((), looks[0].asked_sha256))
     assert [look.number for look in list_looks_beside(texts)] == [2, 5, 8]
     texts[6] = _text("6", "ambiguous")
     assert [look.number for look in list_looks_beside(texts)] == [1, 2, 5, 6, 8]

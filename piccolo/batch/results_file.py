@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files.atomic import STDOUT, write_atomically
 from ..files.line_file import LineFile, whole_lines, whole_size
 from ..result import FAILED, FORMAT, Result
-from .second_look import parse_line
+from .second_look import may_change
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"
@@ -184,7 +184,7 @@ class StreamOutput:
             self._write(text)
             return
         self._texts.append(text)
-        self._is_waiting = self._is_waiting or parse_line(text).may_change
+        self._is_waiting = self._is_waiting or may_change(text)
         if not self._is_waiting:
             self.close()
 
