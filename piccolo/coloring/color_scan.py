@@ -17,6 +17,7 @@ from ..cloud.writers import SUFFIXES, write_colored
 from ..errors import InputError
 from ..files.line_file import Journal
 from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import turn_positions
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, HALF, kernel
@@ -289,7 +290,5 @@ def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:
     turn, move = UNKNOWN_STD
     covariance = np.diag([turn**2] * 3 + [move**2] * 3)
     if result.covariance is not None:
-        J = np.eye(6)
-        J[3:, 3:] = pose_world.R_cam_from_world
-        covariance = J @ result.covariance.matrix @ J.T
+        covariance = turn_positions(result.covariance.matrix, pose_world.R_cam_from_world)
     return Anchor(pose_map, np.linalg.inv(covariance))

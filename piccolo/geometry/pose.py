@@ -285,10 +285,7 @@ def carry(pose: Pose, beside: Pose, to: Pose) -> Pose:
 
     Poses are in any one frame each: pose and beside in that of an odometry, say, and to in the map.
     """
-    R_to_from_world = to.R_cam_from_world
-    offset_cam = beside.R_cam_from_world @ (pose.center_world - beside.center_world)
-    R = pose.R_cam_from_world @ beside.R_cam_from_world.T @ R_to_from_world
-    return Pose(R, to.center_world + R_to_from_world.T @ offset_cam)
+    return pose @ beside.inverse() @ to
 
 
 def uniform_yaws(num_rotations: int) -> Array:

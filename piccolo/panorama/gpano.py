@@ -20,7 +20,7 @@ import numpy as np
 
 from ..arrays import Array, Bytes, Mask
 from ..errors import InputError
-from ..geometry.pose import DECIMALS
+from ..geometry.pose import DECIMALS, R_cam_from_angles
 from .model import GPano
 from .picture import MAX_WIDTH, SPHERE_NAMESPACE as NAMESPACE, open_picture
 
@@ -128,14 +128,7 @@ def rotation_to_level(gpano: GPano) -> Array | None:
     """
     if gpano.pitch_deg is None and gpano.roll_deg is None:
         return None
-    pitch = math.radians(gpano.pitch_deg or 0.0)
-    roll = math.radians(gpano.roll_deg or 0.0)
-    c = math.cos(pitch)
-    s = math.sin(pitch)
-    R_pitch = np.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
-    c = math.cos(roll)
-    s = math.sin(roll)
-    return np.asarray(R_pitch @ np.array([[1.0, 0.0, 0.0], [0.0, c, -s], [0.0, s, c]]))
+    return R_cam_from_angles(90.0, gpano.pitch_deg or 0.0, gpano.roll_deg or 0.0).T
 
 
 def attitude_of_gravity(down_cam: tuple[float, float, float]) -> GPano:

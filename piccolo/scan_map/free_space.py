@@ -22,12 +22,10 @@ class FreeSpace:
     def __init__(self, scan_map: ScanMap, workers: Workers) -> None:
         self.scan_map = scan_map
         self.workers = workers
-        self._graph: Any = None
 
     def prepare(self) -> None:
         """Build the graph, a second of work in a large building, before somebody waits for a distance."""
-        if self._graph is None:
-            self._graph = self._make_graph()
+        _ = self._graph
 
     @cached_property
     def _tree(self) -> Any:
@@ -35,8 +33,9 @@ class FreeSpace:
 
         return cKDTree(self.scan_map.centers)
 
-    def _make_graph(self) -> Any:
-        """Return a sparse matrix (candidates, candidates) of the edges' lengths [m].
+    @cached_property
+    def _graph(self) -> Any:
+        """Sparse matrix (candidates, candidates) of the edges' lengths [m].
 
         A way is free if a tube around it fits into the empty balls around its ends and its middle.
         """
@@ -72,7 +71,6 @@ class FreeSpace:
         if len(rows):
             _, end = self._tree.query(ends)
             nodes, node = np.unique(self._tree.query(starts[rows])[1], return_inverse=True)
-            self.prepare()
             along = dijkstra(self._graph, indices=nodes, limit=DETOUR * (limit + 2.0 * COARSE_SPACING))[node][
                 :, end
             ]
