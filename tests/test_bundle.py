@@ -27,8 +27,7 @@ from piccolo.localization.bundle import (
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
 from piccolo.localization.selection import Selection
 from piccolo.panorama import Panorama
-from research.synthetic.photos import mask_outside_field
-from research.synthetic.world import photograph
+from research.synthetic.world import mask_outside_field, photograph
 
 NEAR = np.array([2.0, -1.0, 0.5])
 SEED = 5

@@ -16,7 +16,7 @@ from piccolo.localization.verification import count_agreeing
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels
-from research.synthetic.photos import mask_outside_field, occlude
+from research.synthetic.world import mask_outside_field, occlude
 
 WIDTH = rooms.WIDTH
 TILTED = exp_so3(np.array([0.4, -1.1, 0.7]))

@@ -10,7 +10,7 @@ from piccolo.geometry.pose import exp_so3, rotate_points, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
 from piccolo.localization.cone import CONE_MARGIN, Cone, find_cone, select_cells
 from piccolo.panorama.texels import find_valid, pack_texels
-from research.synthetic.photos import mask_outside_field
+from research.synthetic.world import mask_outside_field
 
 WIDTH = 128
 UNIT = np.float32(0.001)  # [m]

@@ -11,9 +11,15 @@ from piccolo.jobs.threads import Workers
 from research.measuring import confidence
 from research.measuring.confidence import remove_texture
 from research.synthetic.layout import PLAIN
-from research.synthetic.photos import MOST_RADIUS, light_unevenly, mask_outside_field, occlude
 from research.synthetic.places import ALIKE_KINDS, CHANGED, make_alike
-from research.synthetic.world import World, make_query
+from research.synthetic.world import (
+    MOST_RADIUS,
+    World,
+    light_unevenly,
+    make_query,
+    mask_outside_field,
+    occlude,
+)
 
 WIDTH = 256
 

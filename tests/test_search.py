@@ -19,7 +19,7 @@ from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
 from piccolo.photo import Photo, Prior
-from research.synthetic.photos import mask_outside_field
+from research.synthetic.world import mask_outside_field
 
 AREA = make_grid(24).solid_angle
 

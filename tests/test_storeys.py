@@ -8,7 +8,7 @@ from rooms import scan_map
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.jobs.threads import Workers
-from piccolo.scan_map.free_space import FreeSpace
+from piccolo.scan_map.camera_positions import FreeSpace
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.scan_map.storeys import Storey, find_storeys
 from research.synthetic.world import make_world, scan_world
@@ -126,7 +126,7 @@ def test_nobody_walks_through_a_wall(two_rooms):
         scan_map.centers[is_high & ((centers > r.corner) & (centers < r.corner + rooms.SIZE)).all(axis=1)]
         for r in world.rooms
     )
-    space, start = FreeSpace(scan_map, Workers(2)), first[np.argmax(first[:, 1])]
+    space, start = FreeSpace(scan_map.octree, scan_map.centers, Workers(2)), first[np.argmax(first[:, 1])]
     same = space.distances(start[None], first, 20.0)[0]
     assert len(first) > 20
     assert np.isfinite(same).mean() > 0.95
@@ -142,7 +142,7 @@ def test_nobody_walks_through_a_wall(two_rooms):
 
 def test_far_places_are_beyond_the_limit_and_distances_the_same_one_by_one_and_together(two_rooms):
     centers = two_rooms[1].centers
-    space = FreeSpace(two_rooms[1], Workers(1))
+    space = FreeSpace(two_rooms[1].octree, two_rooms[1].centers, Workers(1))
     distance = space.distances(centers[:1], centers, 1.0)[0]
     assert np.isinf(distance[np.linalg.norm(centers - centers[0], axis=1) > 1.0]).all()
     assert distance[0] == 0.0

@@ -20,9 +20,9 @@ from piccolo.panorama import read_panorama
 from piccolo.paper.localize import PaperSettings
 from piccolo.result import Result
 from research.evaluation.query_result import QueryResult
-from research.measuring import benchmark, confidence, page, sensitivity, speed, trials
+from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries
-from research.synthetic import photos
+from research.synthetic.world import cut_photo, write_photo
 
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
 
@@ -61,7 +61,7 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
     for name in ("mirrored", "another place"):
         assert [damaged[name][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
-    assert set(trials.DAMAGED_SCANS) < set(damaged)
+    assert set(confidence.DAMAGED_SCANS) < set(damaged)
     photos = table_of(text, TITLES["photos"])
     assert [row["queries"] for row in photos.values()] == ["1", "1"]
     paper = table_of(text, TITLES["paper"])
@@ -104,8 +104,8 @@ def test_photos_of_a_scene_come_with_their_calibrations(tmp_path, capsys):
     write_room(tmp_path, "--seed 7 --points 40000 --panoramas 1 --width 512 --variants clean")
     (query,) = read_scene(tmp_path).queries
     path = tmp_path / "images" / "a.jpg"
-    photo = photos.cut_photo(read_panorama(query.image).rgb, query.pose, 70.0, np.random.default_rng(3))
-    photos.write_photo(photo, path)
+    photo = cut_photo(read_panorama(query.image).rgb, query.pose, 70.0, np.random.default_rng(3))
+    write_photo(photo, path)
     camera = {"format": "piccolo-camera/1", "model": "SIMPLE_PINHOLE", "width": 1024, "height": 768}
     (tmp_path / "cameras").mkdir()
     params = {"params": [photo.focal_px, 512, 384]}

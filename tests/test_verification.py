@@ -21,8 +21,7 @@ from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map
-from research.synthetic.photos import mask_outside_field
-from research.synthetic.world import change_light, photograph, scan_world
+from research.synthetic.world import change_light, mask_outside_field, photograph, scan_world
 
 NUM_POINTS = 200_000
 WIDTH = 1024

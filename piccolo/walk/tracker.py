@@ -24,7 +24,7 @@ from ..localization.selection import SURE_SCORE, assess_alone
 from ..localization.settings import CoarseToFineSettings
 from ..localization.verification import match_beside, place_keypoints, verify
 from ..panorama import Panorama
-from ..scan_map.free_space import FreeSpace
+from ..scan_map.camera_positions import FreeSpace
 from ..scan_map.scan_map import ScanMap
 from .frames import (
     MOST_EXPECTED,
@@ -75,7 +75,7 @@ class Tracker:
         self.settings = settings
         self.workers = workers
         self.motion: Motion = motion
-        self.lattice: Lattice = Lattice(FreeSpace(scan_map, workers), motion)
+        self.lattice: Lattice = Lattice(FreeSpace(scan_map.octree, scan_map.centers, workers), motion)
         self.read: Read = lambda k: None  # until somebody keeps the pictures
         self.queries: dict[int, Query] = {}  # by the number of the frame
         self.found_at: float = -math.inf  # time when it was last found; before that, of the first search

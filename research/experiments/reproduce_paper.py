@@ -44,7 +44,7 @@ from ..evaluation.evaluate import run_scenes
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import statistics, table_of
 from ..scene import CLOUD_NAME, Query, Scene, find_scenes, input_files
-from ..synthetic.photos import UPSIDE_DOWN
+from ..synthetic.world import UPSIDE_DOWN
 from .photometric import PhotometricSettings
 
 # A transformed copy of a scene; the folder, which is there, is for its files alone.

@@ -2,29 +2,32 @@
 
 import json
 from argparse import ArgumentParser, Namespace
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
+from typing import NamedTuple
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from piccolo import CoarseToFineSettings, Photo
+from piccolo.arrays import Bytes, Floats, Mask
 from piccolo.cli.command import option
 from piccolo.cli.terminal import print_note
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
+from piccolo.geometry.pose import Gravity, Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
 from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
 from ..scene import Scene, document_of_pose, read_scene
+from ..synthetic import world as worlds
 from ..synthetic.layout import PLAIN
-from ..synthetic.photos import change_sensor, cut_photo, occlude
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
-from ..synthetic.world import VARIANTS, World, make_query, make_world, scan_world
 from .calibration import Case, print_cases
-from .trials import Points, Trial, damage_trial, make_sceneless, thin_points, turn_over
 
 EPILOG = """\
 example:
@@ -39,9 +42,85 @@ for tools/benchmark.py calibration, and prints a table.
 WIDTH = 1024  # of the panoramas [px]
 POINTS_PER_ROOM = 120_000
 PHOTO_FOVS_DEG = 55.0, 90.0  # of phone photos
+POINT_NOISE = 0.05  # [m]
+JPEG_QUALITY = 10
+FOVS_DEG = (90.0, 120.0, 65.0)  # of narrow photos
+Points = tuple[Floats, Bytes]
 
 
-def remove_texture(world: World) -> World:
+class Trial(NamedTuple):
+    """A photo to be localized."""
+
+    case: str
+    rgb: Bytes  # (H, W, 3)
+    true_pose: Pose | None  # None if it was not taken in the scan, or not as a camera would
+    gravity: Gravity = "auto"
+    is_masked: Mask | None = None  # (H, W) what the photo does not show
+    focal_px: float | None = None  # of a pinhole photo; None for a sphere
+
+
+def damage_trial(trial: Trial, other: Bytes, rng: np.random.Generator) -> Iterator[Trial]:
+    """Yield a panorama after each kind of damage, which is then its case; pieces of `other` hide it."""
+    rgb = trial.rgb
+    height, width = rgb.shape[:2]
+
+    def change(case: str, rgb: NDArray[np.generic]) -> Trial:
+        return trial._replace(case=case, rgb=np.asarray(rgb, np.uint8))
+
+    for fraction in (0.2, 0.4, 0.6):
+        yield change(f"{fraction:.0%} hidden by objects", worlds.occlude(rgb, other, fraction, rng))
+    lit = worlds.light_unevenly(rgb, 2.0, rng)
+    yield change("uneven light (2 stops), 30% hidden", worlds.occlude(lit, other, 0.3, rng))
+    yield change("night", worlds.take_at_night(rgb, rng))
+    noisy = worlds.compress(rgb + rng.normal(0.0, 15.0, rgb.shape), JPEG_QUALITY)
+    yield change(f"noise and JPEG quality {JPEG_QUALITY}", noisy)
+    yield change("blurred by 1 deg (one sigma)", worlds.blur(rgb, width / 360.0))
+    yield change("256 x 128 pixels", cv2.resize(rgb, (256, 128), interpolation=cv2.INTER_AREA))
+    for fov_deg in FOVS_DEG:
+        is_outside = worlds.mask_outside_field(width, fov_deg, float(rng.uniform(0.0, 2.0 * np.pi)))
+        yield trial._replace(case=f"masked outside of {fov_deg:g} deg", is_masked=is_outside)
+    is_behind = np.broadcast_to(np.abs(np.arange(width) - width // 2) >= width // 4, (height, width))
+    yield trial._replace(case="half of the sphere masked", is_masked=is_behind)
+    yield change("mirrored", np.ascontiguousarray(rgb[:, ::-1]))._replace(true_pose=None)
+
+
+def make_sceneless(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
+    """Yield images that show no place, and the photo blurred, which keeps its true pose."""
+    rgb = trial.rgb
+    yield Trial("black", np.zeros_like(rgb), None)
+    yield Trial("white", np.full_like(rgb, 255), None)
+    yield Trial("noise", rng.integers(0, 256, rgb.shape, dtype=np.uint8), None)
+    yield Trial("cloudy", worlds.draw_fractal_noise(rgb.shape, rng), None)
+    yield Trial("blurred", worlds.blur(rgb, 0.02 * rgb.shape[1]).astype(np.uint8), trial.true_pose)
+
+
+def turn_over(trial: Trial) -> Trial:
+    """Turn the camera over, and search for it as if it were upright."""
+    pose = trial.true_pose
+    if pose is not None:
+        pose = Pose(worlds.UPSIDE_DOWN @ pose.R_cam_from_world, pose.center_world)
+    return Trial("upside down", np.ascontiguousarray(trial.rgb[::-1, ::-1]), pose, "known")
+
+
+def thin_points(points: Points, rng: np.random.Generator) -> Points:
+    """Draw one of twenty points, in order."""
+    count = len(points[0])
+    chosen = np.sort(rng.choice(count, int(0.05 * count), replace=False))
+    return points[0][chosen], points[1][chosen]
+
+
+def add_point_noise(points: Points, rng: np.random.Generator) -> Points:
+    """Move each point by a Gaussian."""
+    return points[0] + rng.normal(0.0, POINT_NOISE, points[0].shape), points[1]
+
+
+DAMAGED_SCANS: dict[str, Callable[[Points, np.random.Generator], Points]] = {
+    "scan thinned to 5%": thin_points,
+    "scan with 5 cm noise": add_point_noise,
+}
+
+
+def remove_texture(world: worlds.World) -> worlds.World:
     """Return the rooms with every surface in one colour."""
     plain = [(room, room.materials.copy()) for room in world.rooms]
     for _, materials in plain:
@@ -53,13 +132,13 @@ def room_trials(seed: int, workers: Workers) -> Iterator[tuple[Points, list[Tria
     """Yield clouds of one to three rooms, whole, thinned and cut down, each with its trials."""
     rng = np.random.default_rng([seed, 50])
     size = rng.uniform([3.5, 3.0, 2.3], [9.0, 7.0, 3.4])  # [m] from a box room to a hall
-    world = make_world(seed, size, int(rng.integers(1, 4)))
-    other = make_world(seed + 100_000, size, 1)  # of the same shape
+    world = worlds.make_world(seed, size, int(rng.integers(1, 4)))
+    other = worlds.make_world(seed + 100_000, size, 1)  # of the same shape
     if seed % 3 == 2:  # a third of the rooms
         world = remove_texture(world)
         other = remove_texture(other)
-    cloud = scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
-    right = [_make_trial(world, variant, variant, workers) for variant in VARIANTS]
+    cloud = worlds.scan_world(world, POINTS_PER_ROOM * len(world.rooms), workers)[:2]
+    right = [_make_trial(world, variant, variant, workers) for variant in worlds.VARIANTS]
     elsewhere = [_make_trial(other, "elsewhere", variant, workers) for variant in ("clean", "photo")]
     trials = [*right, *(trial._replace(true_pose=None) for trial in elsewhere)]
     trials += make_sceneless(right[0], rng)
@@ -79,21 +158,21 @@ def alike_trials(seed: int, kinds: Sequence[str], workers: Workers) -> Iterator[
     """Yield places alike to a degree: photos of them, one half hidden, and one of another such place."""
     for kind in kinds:
         rng = np.random.default_rng([seed, 53, ALIKE_KINDS.index(kind)])
-        elsewhere = World(seed, make_alike(kind, seed + 100_000, 0.2))
+        elsewhere = worlds.World(seed, make_alike(kind, seed + 100_000, 0.2))
         for changed in CHANGED:
-            world = World(seed, make_alike(kind, seed, changed))
-            cloud = scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
+            world = worlds.World(seed, make_alike(kind, seed, changed))
+            cloud = worlds.scan_world(world, POINTS_PER_ROOM * max(3, len(world.rooms)), workers)[:2]
             case = f"{kind}, {changed:.0%} changed"
             trials = [_make_trial(world, case, "clean", workers, index) for index in range(4)]
             another = _make_trial(elsewhere, f"{kind}, elsewhere", "clean", workers, 1)
             another = another._replace(true_pose=None)
-            hidden = occlude(trials[0].rgb, another.rgb, 0.3, rng)
+            hidden = worlds.occlude(trials[0].rgb, another.rgb, 0.3, rng)
             trials += [trials[0]._replace(case=f"{case}, hidden 30%", rgb=hidden), another]
             yield cloud, trials
 
 
-def _make_trial(world: World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
-    query = make_query(world, index, variant, WIDTH, workers)
+def _make_trial(world: worlds.World, case: str, variant: str, workers: Workers, index: int = 0) -> Trial:
+    query = worlds.make_query(world, index, variant, WIDTH, workers)
     return Trial(case, query.rgb, query.pose)
 
 
@@ -119,10 +198,10 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
     for one in (scene, *others):
         for query in (query for query in one.queries for _ in range(number)):
             fov_deg = rng.uniform(*PHOTO_FOVS_DEG)
-            photo = cut_photo(read_panorama(query.image).rgb, query.pose, fov_deg, rng)
+            photo = worlds.cut_photo(read_panorama(query.image).rgb, query.pose, fov_deg, rng)
             case = f"{fov_deg // 10:.0f}0 deg" if one is scene else "elsewhere"
             true_pose = photo.pose if one is scene else None
-            rgb = change_sensor(photo.rgb, rng)
+            rgb = worlds.change_sensor(photo.rgb, rng)
             trials.append(Trial(case, rgb, true_pose, focal_px=photo.focal_px))
     yield (cloud.points + cloud.origin_world, cloud.colors), trials
 

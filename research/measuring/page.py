@@ -28,10 +28,9 @@ from piccolo.panorama import read_panorama
 from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
 from ..scene import Query, Scene, read_scene
-from ..synthetic.photos import PHOTO_FOV_DEG, cut_photo, write_photo
-from ..synthetic.world import make_query, make_world
+from ..synthetic.world import PHOTO_FOV_DEG, cut_photo, make_query, make_world, write_photo
+from .confidence import DAMAGED_SCANS, Points, Trial, damage_trial
 from .speed import clean_queries, kernel_table, size_table
-from .trials import DAMAGED_SCANS, Points, Trial, damage_trial
 
 EPILOG = """\
 examples:

@@ -23,8 +23,7 @@ from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
 from ..evaluation.tables import table_of
 from ..scene import read_scene
-from .confidence import localize_trial, photo_trials, room_trials, scene_trials
-from .trials import Trial
+from .confidence import Trial, localize_trial, photo_trials, room_trials, scene_trials
 
 EPILOG = """\
 example:

@@ -17,9 +17,8 @@ from piccolo.optional import import_optional
 
 from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .office import Office
-from .photos import change_light
 from .walking import Walk
-from .world import make_query, make_world, photograph
+from .world import change_light, make_query, make_world, photograph
 
 BAD_KINDS = ("black", "mirrored", "elsewhere")
 WALK_VARIANTS = ("clean", "photo")
