@@ -23,8 +23,7 @@ from .result import Result, with_localization
 from .scan_map.scan_map import add_places, check_within
 from .walk.frames import Frame, Motion, check_times
 from .walk.path import believe
-from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
-from .walk.second_look import finish
+from .walk.results import WalkFrame, describe_frame, finish, make_localization, make_localizations
 from .walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"

@@ -16,7 +16,7 @@ from refusals import assert_input_error, assert_refused
 from test_cloud_las import RAW
 
 import piccolo
-from piccolo.batch.priors import read_priors
+from piccolo.batch.inputs import read_priors
 from piccolo.cloud.settings import CloudSettings, from_wgs84
 from piccolo.cloud.stream import read_crs
 from piccolo.panorama.photo import GpsPosition, PhotoFacts, read_photo_facts

@@ -10,7 +10,7 @@ from refusals import assert_input_error
 
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
-from piccolo.walk import path as walk_path, second_look
+from piccolo.walk import path as walk_path, results
 from piccolo.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
 from piccolo.walk.path import NOTHING, Belief, believe
 from piccolo.walk.tracker import Followed, expect
@@ -293,7 +293,7 @@ def walk():
 
     def find(query, frame, near):
         expected = expect(frame, [(frames[k], pose) for k, pose in near], Motion())
-        return second_look.find_near(query, expected)
+        return results.find_near(query, expected)
 
     tracker = SimpleNamespace(frames=frames, motion=Motion(), find=find, query_of=lambda k: k)
     return tracker, walk_path.Path(probabilities, [None] * len(frames)), beliefs
@@ -307,9 +307,9 @@ def _find(walk, monkeypatch, x, how="near", is_alone=True):
         asked.append(expected)
         return Followed(State(_at(x), 5.0, 0.5), how, is_alone)
 
-    monkeypatch.setattr(second_look, "find_near", find)
+    monkeypatch.setattr(results, "find_near", find)
     tracker, path, beliefs = walk
-    second_look._find_lost(tracker, path, beliefs, LOST)
+    results._find_lost(tracker, path, beliefs, LOST)
     return tracker.frames[LOST], asked
 
 
@@ -365,4 +365,4 @@ def test_rough_places_are_refined_if_they_leave_another_unsure(probabilities, is
     states = [State(_at(5.0 * k), 1.0, 0.5 if r else None) for k, r in enumerate(is_refined)]
     tracker = SimpleNamespace(frames=[Frame(0.0, states, is_key=True)])
     path = walk_path.Path([np.array(probabilities)], [None])
-    assert second_look._list_rough(tracker, path, 0) == listed
+    assert results._list_rough(tracker, path, 0) == listed

@@ -27,7 +27,7 @@ from ..result import Beside, Result, Source, unreadable_result
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy
 from ..views.pictures import encode_image, overlay_png
-from .priors import PriorTable
+from .inputs import PriorTable
 from .second_look import MOST_PICTURES, Look
 
 

@@ -12,7 +12,7 @@ import atheris
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from piccolo.batch.priors import read_priors
+from piccolo.batch.inputs import read_priors
 from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.camera.calibration import read_cameras, read_rig
 from piccolo.cloud.settings import IN_METRES
