@@ -13,3 +13,6 @@ Bytes = NDArray[np.uint8]
 Int8s = NDArray[np.int8]
 Int32s = NDArray[np.int32]
 Int64s = NDArray[np.int64]
+Uint16s = NDArray[np.uint16]
+Integers = NDArray[np.integer[Any]]
+Values = NDArray[Any]  # of any type

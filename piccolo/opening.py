@@ -4,13 +4,12 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, dataclass, replace
 from os import PathLike
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .arguments import check_fields, check_kind
-from .arrays import Floats
+from .arrays import Floats, Values
 from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from .errors import InputError
@@ -67,7 +66,7 @@ class Cloud:
 
     source: File | Sequence[File] | Floats
     _: KW_ONLY
-    colors: NDArray[Any] | None = None
+    colors: Values | None = None
     units: Units = "m"
     up: UpAxis = "auto"
     ignore_colors: bool = False

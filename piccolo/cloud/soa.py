@@ -3,9 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Bytes, Int32s
+from ..arrays import Array, Array32, Bytes, Int32s, Integers
 from ..errors import InputError
 from ..geometry.colors import pack_rgbx
 from ..geometry.pose import Pose
@@ -25,7 +24,7 @@ class PackedPoints:
     def __len__(self) -> int:
         return len(self.x)
 
-    def take(self, indices: NDArray[np.integer] | slice) -> "PackedPoints":
+    def take(self, indices: Integers | slice) -> "PackedPoints":
         """Return the points at `indices`, in that order."""
         return PackedPoints(self.x[indices], self.y[indices], self.z[indices], self.rgbx[indices])
 

@@ -7,12 +7,11 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Bytes, Floats, Mask
+from ..arrays import Array, Array32, Bytes, Floats, Mask, Values
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
 from ..geometry.pose import MAX_COORDINATE, rotate_points
@@ -215,9 +214,7 @@ class CloudStream:
         return Cloud(points, colors, origin_world, warnings, self.up, self.has_colors)
 
 
-def stream_of_arrays(
-    points: Floats, colors: NDArray[Any] | None, color_range: float | None = None
-) -> CloudStream:
+def stream_of_arrays(points: Floats, colors: Values | None, color_range: float | None = None) -> CloudStream:
     """Return a cloud in memory: points (N, 3), and colours (N, 3) of any range, or None."""
     if points.ndim != 2 or points.shape[1:] != (3,) or (colors is not None and colors.shape != points.shape):
         shapes = f"{points.shape} and {None if colors is None else colors.shape}"

@@ -12,9 +12,8 @@ scans are shifted against each other, each surface is there twice, and a pose ma
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Int64s
+from ..arrays import Array, Array32, Int64s, Integers
 from ..geometry.colors import colors_of_edges
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
@@ -82,7 +81,7 @@ def find_edges(points: Array, around: Surroundings, workers: Workers) -> Array:
     return np.concatenate(found or [np.empty((0, 2))])
 
 
-def neighbors(tree: Any, points: Array, count: int, radius: float) -> tuple[NDArray[np.intp], Array]:
+def neighbors(tree: Any, points: Array, count: int, radius: float) -> tuple[Integers, Array]:
     """Return the indices (N, count) of the nearest points within a radius, and 1 for each that is there."""
     distances, indices = tree.query(points, count, distance_upper_bound=radius)
     is_there = np.isfinite(distances)

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Bytes, Floats
+from ..arrays import Array, Bytes, Floats, Values
 from ..files.atomic import replacing, temporary_folder
 from ..geometry.pose import transform_points
 from ..jobs.memory import check_memory
@@ -27,7 +26,7 @@ TYPE_NAMES = {
 COLOR_NAMES = ("red", "green", "blue")
 MAX_DIGITS = 20  # of the number of vertices, for which the header keeps room
 
-Rows = NDArray[np.void]  # structured, a field a property
+Rows = np.ndarray[Any, np.dtype[np.void]]  # structured, a field a property
 AXES = ("x", "y", "z")
 NORMALS = ("nx", "ny", "nz")
 MAX_LOSS = 1e-4  # of float32 coordinates by rounding [m]
@@ -39,7 +38,7 @@ Colors = tuple[Bytes, Bytes]  # RGB (N, 3), and how many photos (N,) gave each
 Add = Callable[[Array, Bytes, Bytes], None]  # points (N, 3) in the files' unit
 
 
-def vertex_rows(points: Floats, colors: Bytes | None, **more: NDArray[Any] | None) -> Rows:
+def vertex_rows(points: Floats, colors: Bytes | None, **more: Values | None) -> Rows:
     """Return vertices with points (N, 3), of their own float type, colours (N, 3) RGB if any, more (N,)."""
     columns = dict(zip(AXES, points.T, strict=True))
     columns.update({} if colors is None else dict(zip(COLOR_NAMES, colors.T, strict=True)))
@@ -47,7 +46,7 @@ def vertex_rows(points: Floats, colors: Bytes | None, **more: NDArray[Any] | Non
     return _rows(columns, np.dtype([(name, column.dtype) for name, column in columns.items()]))
 
 
-def _rows(columns: dict[str, NDArray[Any]], dtype: np.dtype[Any]) -> Rows:
+def _rows(columns: dict[str, Values], dtype: np.dtype[Any]) -> Rows:
     rows = np.empty(len(columns["x"]), dtype)
     for name, column in columns.items():
         rows[name] = column
@@ -169,7 +168,7 @@ def _write_copy(
     return tuple(f"{header.path}: the element '{name}' is left out" for name in left_out)
 
 
-def _of_type(column: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
+def _of_type(column: Values, dtype: np.dtype[Any]) -> Values:
     """Return a column in the type that the file declares; that of an ASCII file was read as float64."""
     if dtype.kind in "iu" and column.dtype.kind == "f":
         limits = np.iinfo(dtype)
@@ -177,7 +176,7 @@ def _of_type(column: NDArray[Any], dtype: np.dtype[Any]) -> NDArray[Any]:
     return column.astype(dtype, copy=False)
 
 
-def _transform(columns: dict[str, NDArray[Any]], T_target_from_source: Array) -> dict[str, NDArray[Any]]:
+def _transform(columns: dict[str, Values], T_target_from_source: Array) -> dict[str, Values]:
     """Return the columns of vertices with x y z transformed, nx ny nz rotated, and all else unchanged."""
     turn = T_target_from_source.copy()
     turn[:3, 3] = 0.0

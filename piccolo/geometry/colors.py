@@ -5,9 +5,8 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Bytes, Floats, Int32s, Mask
+from ..arrays import Bytes, Floats, Int32s, Integers, Mask
 
 NUM_LEVELS = 16  # of a channel that colours are made of
 NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not fall together
@@ -19,7 +18,7 @@ class Labels:
 
     ignored: tuple[int, ...] = ()  # values that say nothing: masked in panoramas, left out of clouds
 
-    def are_kept(self, labels: NDArray[np.integer]) -> Mask:
+    def are_kept(self, labels: Integers) -> Mask:
         """Return True for the labels (...) that are not ignored."""
         return np.isin(labels, self.ignored, invert=True)
 
@@ -42,7 +41,7 @@ def palette() -> Bytes:
     return colors
 
 
-def label_colors(labels: NDArray[np.integer]) -> Bytes:
+def label_colors(labels: Integers) -> Bytes:
     """Return the colour (..., 3) of each label (...); labels equal modulo NUM_COLORS have the same colour."""
     return np.asarray(palette()[labels % NUM_COLORS])
 

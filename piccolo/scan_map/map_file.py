@@ -19,10 +19,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .. import __version__
-from ..arrays import Array, Array32, Int32s
+from ..arrays import Array, Array32, Int32s, Values
 from ..cloud.octree import Octree
 from ..cloud.readers.npz import naming_damage
 from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
@@ -38,7 +37,7 @@ from ..local_features.keypoints import DESCRIPTOR_SIZE
 from ..views.candidate_views import WIDE_RINGS, CandidateViews
 from .scan_map import MAX_SCANS, ScanMap, defer_features, is_name, sparse_candidates
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, Values]
 WIDE_CELLS = len(make_grid(WIDE_RINGS))
 # Type and shape; an axis that has a name is as long as the others of that name.
 LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
@@ -235,7 +234,7 @@ def _check_scans(path: Path, arrays: Arrays) -> None:
         _refuse(path, f"a candidate in scan {index.max()} of {len(names)}")
 
 
-def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:
+def clean_warnings(path: Path, warnings: Values) -> tuple[str, ...]:
     """Return printable warnings: without control characters, limited in number and length."""
     if warnings.dtype.kind != "U" or warnings.ndim != 1:
         _refuse(path, f"warnings of type {warnings.dtype} and shape {warnings.shape}")
@@ -245,7 +244,7 @@ def clean_warnings(path: Path, warnings: NDArray[Any]) -> tuple[str, ...]:
 
 def save_map(scan_map: ScanMap, path: Path) -> None:
     """Write a map to `path` atomically."""
-    members: dict[str, NDArray[Any]] = {
+    members: dict[str, Values] = {
         "format": np.array(FORMAT),
         "scan_names": np.array(scan_map.scan_names, dtype=np.str_),
         "warnings": np.array(scan_map.warnings, dtype=np.str_),

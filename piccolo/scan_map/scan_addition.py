@@ -5,12 +5,11 @@ keep every bit.
 """
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Int64s, Mask
+from ..arrays import Array, Int64s, Mask, Uint16s, Values
 from ..cloud.octree import Octree, build_octree
 from ..cloud.stream import CloudStream
 from ..cloud.surfaces import surface_variance
@@ -157,7 +156,7 @@ def join_views(
     is_kept = place[sparse] >= 0
     added = render_wide(octree, found.centers[sparse[~is_kept]], SEARCH_VIEW, workers)
 
-    def join(own: NDArray[Any], more: NDArray[Any]) -> NDArray[Any]:
+    def join(own: Values, more: Values) -> Values:
         values = np.empty((len(sparse), own.shape[1]), own.dtype)
         values[is_kept] = own[place[sparse[is_kept]]]
         values[~is_kept] = more
@@ -166,7 +165,7 @@ def join_views(
     return WideViews(join(old.wide_features, added.features), join(old.wide_seen, added.seen))
 
 
-def assign_scans(old: ScanMap, found: Candidates) -> NDArray[np.uint16]:
+def assign_scans(old: ScanMap, found: Candidates) -> Uint16s:
     """Assign a scan to each candidate (N,): its old one, the nearest candidate's, or the new one."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # only who prepares a scan waits for it
 

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..arrays import Array, Bytes, Int8s, Int64s, Mask
+from ..arrays import Array, Bytes, Int8s, Int64s, Mask, Uint16s
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import MapFrame, PackedPoints, pack_points
@@ -41,7 +40,7 @@ class ScanMap(MapFrame):
     octree: Octree
     surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
     centers: Array  # (candidates, 3) [m]
-    scan_of_candidate: NDArray[np.uint16]  # (candidates,) index of its name in scan_names
+    scan_of_candidate: Uint16s  # (candidates,) index of its name in scan_names
     sparse: Int64s  # candidates that are searched: no two share a cell of the coarse grid
     wide_features: Int8s  # (sparse, 3 * wide cells) what is seen from them, channels in levels
     wide_seen: Bytes  # (sparse, wide cells) fraction seen of each, 255 for all

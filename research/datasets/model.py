@@ -8,16 +8,15 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from piccolo.arrays import Array
+from piccolo.arrays import Array, Uint16s
 from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import CAMERA_AXES, OPENGL_FROM_CAM, Pose, check_transform
 from piccolo.panorama.picture import read_picture
 
-Labels = NDArray[np.uint16]  # (H, W) the class of each pixel, 0 where unknown
+Labels = Uint16s  # (H, W) the class of each pixel, 0 where unknown
 SUFFIXES = frozenset().union(*(f.suffixes for f in FORMATS)) - {".csv"}  # as these hold poses too
 AXES = {**CAMERA_AXES, "opengl": OPENGL_FROM_CAM}  # a pose file's camera axes from ours, by name
 MAX_SKEW = 1e-2  # of R R^T from the identity: some files have three decimals
@@ -149,7 +148,7 @@ def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
     return check_transform(T, where, AXES[axes], direction == CAM_FROM_WORLD, MAX_SKEW)
 
 
-def labels_by_index(path: Path, table: NDArray[np.uint16]) -> Labels:
+def labels_by_index(path: Path, table: Uint16s) -> Labels:
     """Return labels (H, W) of a picture whose colours are indices R 2^16 + G 2^8 + B of a table; 0 beyond."""
     rgb = read_picture(path).rgb.astype(np.uint32)
     index = rgb[..., 0] << 16 | rgb[..., 1] << 8 | rgb[..., 2]

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from piccolo.arrays import Uint16s
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, move, yaw_rotation
@@ -292,7 +292,7 @@ def _stanford_cloud(folder: Path, area: str, room: str, has_labels: bool) -> tup
 
 
 def _stanford_panoramas(
-    options: ConvertOptions, pictures: list[Picture], table: NDArray[np.uint16] | None
+    options: ConvertOptions, pictures: list[Picture], table: Uint16s | None
 ) -> Iterator[PosedPanorama]:
     for picture in pictures:
         semantic = options.inside(picture.semantic)
@@ -321,7 +321,7 @@ def _read_pose(picture: Picture) -> Pose:
     return move(pose, T_SCAN_FROM_5B, 1.0) if picture.part == "5b" else pose
 
 
-def _read_table(options: ConvertOptions) -> NDArray[np.uint16]:
+def _read_table(options: ConvertOptions) -> Uint16s:
     """Return the class of each index in the semantic pictures."""
     found = _glob(options.folder, LABEL_FILES)
     if not found:

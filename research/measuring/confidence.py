@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from piccolo import CoarseToFineSettings, Photo
-from piccolo.arrays import Bytes, Floats, Mask
+from piccolo.arrays import Bytes, Floats, Mask, Values
 from piccolo.cli.command import option
 from piccolo.cli.terminal import print_note
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
@@ -64,7 +63,7 @@ def damage_trial(trial: Trial, other: Bytes, rng: np.random.Generator) -> Iterat
     rgb = trial.rgb
     height, width = rgb.shape[:2]
 
-    def change(case: str, rgb: NDArray[np.generic]) -> Trial:
+    def change(case: str, rgb: Values) -> Trial:
         return trial._replace(case=case, rgb=np.asarray(rgb, np.uint8))
 
     for fraction in (0.2, 0.4, 0.6):

@@ -3,9 +3,8 @@
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-from piccolo.arrays import Array, Int64s
+from piccolo.arrays import Array, Int64s, Integers
 from piccolo.jobs.threads import Workers
 from piccolo.kernels.jit import inline_kernel, kernel
 
@@ -158,7 +157,7 @@ def shade(
             rgb[n, k] = min(1.0, lit * (m[2 + k] * (1.0 - fraction) + m[5 + k] * fraction))
 
 
-def boxes_ahead(origin: Array, directions: Array, boxes: Array) -> tuple[NDArray[np.intp], Array]:
+def boxes_ahead(origin: Array, directions: Array, boxes: Array) -> tuple[Integers, Array]:
     """Which boxes (B, 7) unit `directions` (N, 3) may hit, by their cone, and from what range on [m]."""
     axis = directions.mean(axis=0)
     axis /= max(float(np.linalg.norm(axis)), 1e-12)  # of opposite rays, for which the cone is the sphere

@@ -14,10 +14,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 import PIL.Image
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
-from piccolo.arrays import Array, Array32, Bytes, Int64s, Mask
+from piccolo.arrays import Array, Array32, Bytes, Int64s, Mask, Uint16s, Values
 from piccolo.camera import Calibration, Mount
 from piccolo.camera.calibration import compute_extent
 from piccolo.camera.model import camera_of_fov
@@ -201,7 +200,7 @@ def pose_of_query(world: World, index: int, variant: str) -> tuple[Room, Pose, n
     return room, Pose(R_cam_from_world, center_world), rng
 
 
-def make_labels(world: World, index: int, query: Query, workers: Workers) -> NDArray[np.uint16]:
+def make_labels(world: World, index: int, query: Query, workers: Workers) -> Uint16s:
     """Image (H, W) of the labels that query number `index` of its variant shows, of pixels' centres."""
     room, _, _ = pose_of_query(world, index, query.variant)
     shape = query.rgb.shape[:2]
@@ -290,7 +289,7 @@ def compress(rgb: Array, quality: int) -> Bytes:
     return np.asarray(cv2.imdecode(content, cv2.IMREAD_COLOR), np.uint8)
 
 
-def blur(image: NDArray[np.generic], sigma: float) -> Array:
+def blur(image: Values, sigma: float) -> Array:
     """Blur an equirectangular image (H, W, 3) by a Gaussian [px]."""
     mode = ("nearest", "wrap", "nearest")
     return np.asarray(gaussian_filter(image.astype(float), (sigma, sigma, 0.0), mode=mode))
