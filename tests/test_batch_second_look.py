@@ -18,9 +18,8 @@ from pictures import encoded, write
 from test_localize_cameras import SEED, place
 
 from piccolo import open_scan, opened_scan
-from piccolo.batch.localizer import Localizer
+from piccolo.batch.localizer import MOST_PICTURES, Localizer, Look, list_looks_beside
 from piccolo.batch.results_file import StreamOutput
-from piccolo.batch.second_look import MOST_PICTURES, Look, list_looks_beside
 from piccolo.camera import Mount
 from piccolo.camera.calibration import document_of
 from piccolo.camera.model import pinhole

@@ -12,16 +12,22 @@ from refusals import mutated, read_or_refused
 from scipy.spatial.transform import Rotation
 
 from piccolo.cli import export_poses
-from research.datasets import checking, true_poses
-from research.datasets.convert_dataset import list_scenes
+from research.datasets import true_poses
+from research.datasets.convert_dataset import (
+    AS_GIVEN,
+    Check,
+    ConventionCheck,
+    convention_variants,
+    list_scenes,
+)
 from research.datasets.model import AXES, DIRECTIONS, ConvertOptions, pose_of_transform
 from research.scene import read_scene
 
 ORIGIN = np.array([10.0, -4.0, 2.0])
 
 
-def fit(score, best=checking.AS_GIVEN, best_score=None):
-    return checking.ConventionCheck("images/a.jpg", score, score if best_score is None else best_score, best)
+def fit(score, best=AS_GIVEN, best_score=None):
+    return ConventionCheck("images/a.jpg", score, score if best_score is None else best_score, best)
 
 
 @pytest.mark.parametrize("axes", AXES)
@@ -35,7 +41,7 @@ def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, tak
     for taken_direction in (direction, other):
         taken = pose_of_transform("T", T, taken_direction, taken_axes)
         local = type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN)
-        found = checking.convention_variants(local, ORIGIN)
+        found = convention_variants(local, ORIGIN)
         assert any(
             np.allclose(p.R_cam_from_world, true.R_cam_from_world)
             and np.allclose(p.center_world + ORIGIN, true.center_world)
@@ -44,14 +50,14 @@ def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, tak
 
 
 def test_more_than_half_must_fit_and_advice_names_the_way_that_fits_most():
-    assert checking.Check((fit(0.5), fit(0.4), fit(0.02))).is_passed
-    assert not checking.Check((fit(0.5), fit(0.02))).is_passed
-    assert not checking.Check((fit(0.3, "axes are x", 0.4),)).is_passed
+    assert Check((fit(0.5), fit(0.4), fit(0.02))).is_passed
+    assert not Check((fit(0.5), fit(0.02))).is_passed
+    assert not Check((fit(0.3, "axes are x", 0.4),)).is_passed
     wrong = fit(0.02, "the camera's x, y, z are z, x, y", 0.6)
-    advice = checking.Check((wrong, wrong, fit(0.1))).advice
+    advice = Check((wrong, wrong, fit(0.1))).advice
     assert "scores 0.02, 0.02, 0.10, wanted 0.1 or more; 0.60 if the camera's x, y, z are z, x, y" in advice
     fits = wrong, fit(0.02), fit(0.05, "others", 0.06)
-    assert checking.Check(fits).advice.endswith("no other axes fit better")
+    assert Check(fits).advice.endswith("no other axes fit better")
 
 
 ALL_AXES = {"optical": made.OPTICAL, "piccolo": made.FORWARD_LEFT_UP, "opengl": made.OPENGL}

@@ -11,7 +11,7 @@ from pictures import encoded, write
 from test_focal_length import TRUE
 from test_localize_cameras import SEED, place
 
-from piccolo.batch.second_look import list_changed_by_consensus, list_looks_by_focal
+from piccolo.batch.localizer import list_changed_by_consensus, list_looks_by_focal
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main

@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..files.atomic import STDOUT, write_atomically
 from ..files.line_file import LineFile, whole_lines, whole_size
 from ..result import FAILED, FORMAT, Result
-from .second_look import may_change
+from .localizer import may_change
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
 WAYS = "use `overwrite` to start again, or another `out`"

@@ -15,9 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
-from ..batch.localizer import Answer, Localizer
+from ..batch.localizer import LISTINGS, Answer, Localizer, Look, list_changed_by_consensus
 from ..batch.results_file import FileOutput, Output, Records, StreamOutput
-from ..batch.second_look import LISTINGS, Look, list_changed_by_consensus
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically

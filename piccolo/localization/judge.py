@@ -4,7 +4,7 @@ Every status is made in `decide`, by `classify`. A photo alone comes here with i
 that help each other make no status; each way hands over probabilities, or a pose with errors:
 - `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`; a new way does this;
 - `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
-- `batch.second_look`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
+- `batch.localizer`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
 - `walk.results`: the probabilities of a frame's places along the path, to `decide`, its pose to `take_pose`;
 - `coloring`: nothing; each photo is localized as one alone, in colours of the others.
 """
