@@ -1,6 +1,6 @@
 """Rotate a coloured scan so that z is up, and write the cloud and the 4 x 4 transform."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +21,8 @@ from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
-from .command import check_outputs, check_suffix, checking_options, command, option
+from .command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
-from .terminal import print_error, print_report, print_warnings, progress_bar
 
 EXIT_UNKNOWN = 1
 EPILOG = """\
@@ -50,7 +49,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--pano FILE", "localize this upright photo in the scan, and take its up direction")
 
 
-def check_arguments(a: Namespace) -> None:
+def check_arguments(a: Arguments) -> None:
     """Refuse options that do not go together."""
     refusals = {
         "--assume-nothing can't be combined with --up": a.up != "auto" and a.assume_nothing,
@@ -63,7 +62,7 @@ def check_arguments(a: Namespace) -> None:
 
 
 def find_known_up(
-    arguments: Namespace, cloud: CloudStream, evident: Array | None, reason: str
+    arguments: Arguments, cloud: CloudStream, evident: Array | None, reason: str
 ) -> tuple[Array | None, str]:
     """Return the direction (3,) that is up, None if that is not known, and why.
 
@@ -91,7 +90,7 @@ def find_up_by_photo(photo: Path, cloud: CloudStream, axis: Array) -> tuple[Arra
     return up, f"{photo} is {result.status}"
 
 
-def find(arguments: Namespace, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
+def find(arguments: Arguments, cloud: CloudStream) -> tuple[Array, dict[str, object], str]:
     """Return the transform (4, 4) in the scan's unit; what is known of it; why it can't be relied on.
 
     It is the least turn that makes z up, and with --yaw-walls the least further one about z, about the middle
@@ -103,7 +102,7 @@ def find(arguments: Namespace, cloud: CloudStream) -> tuple[Array, dict[str, obj
         up, reason = find_up_by_photo(arguments.pano, cloud, axis)
     else:
         up, reason = find_known_up(arguments, cloud, sense * axis if sense else None, reason)
-    print_warnings(arguments, voxels.warnings)
+    arguments.warn(voxels.warnings)
     doubt = "" if up is not None else f"up is not known: {reason}"
     R = np.eye(3) if up is None else rotation_to_z(level(planes, up))
     yaw = wall_yaw(planes, R) if arguments.yaw_walls else None
@@ -124,7 +123,7 @@ def find(arguments: Namespace, cloud: CloudStream) -> tuple[Array, dict[str, obj
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 up is not known")
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Find a transform, write what is sure; returns the exit code."""
     with checking_options():
         check_arguments(arguments)
@@ -135,7 +134,7 @@ def main(arguments: Namespace) -> int:
     check_outputs(outputs, [*arguments.cloud, *filter(None, [arguments.pano])])
     if arguments.pano:
         read_panorama(arguments.pano)  # refused before the cloud is read
-    cloud = open_cloud(arguments.cloud, settings, progress_bar(arguments.quiet))
+    cloud = open_cloud(arguments.cloud, settings, arguments.progress())
     T, report, doubt = find(arguments, cloud)
 
     def write_transform() -> None:
@@ -144,8 +143,8 @@ def main(arguments: Namespace) -> int:
             write_atomically(transform, "".join(lines).encode())
 
     if out and not doubt:
-        print_warnings(arguments, write_transformed(cloud, T, out, write_transform))
+        arguments.warn(write_transformed(cloud, T, out, write_transform))
     report |= {"cloud": list(map(str, arguments.cloud)), "out": str(out) if out and not doubt else None}
     report |= {"T_aligned_from_scan": T.tolist(), "metres_per_unit": cloud.scale}
-    print_report(arguments, outputs, report)
-    return print_error(arguments, doubt, EXIT_UNKNOWN) if doubt else 0
+    arguments.report(outputs, report)
+    return arguments.error(doubt, EXIT_UNKNOWN) if doubt else 0

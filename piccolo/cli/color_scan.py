@@ -1,14 +1,13 @@
 """Colour a scan by photos that were localized in it."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 
 from ..coloring.color_scan import check_suffix, write_colored_scan
 from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..result import read_results
-from .command import check_outputs, checking_options, command, option
+from .command import Arguments, check_outputs, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
-from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -31,7 +30,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read, align, paint, write; returns the exit code."""
     with checking_options():
         settings = cloud_settings_from(arguments)
@@ -39,10 +38,10 @@ def main(arguments: Namespace) -> int:
     check_outputs({"--out": arguments.out}, [*arguments.cloud, *arguments.results])
     results = read_results(arguments.results)
     method = CoarseToFineSettings()
-    scan = open_files(arguments.cloud, settings, method, cache_from(arguments), workers_from(arguments))
-    print_warnings(arguments, scan.warnings)
+    scan = open_files(arguments.cloud, settings, method, cache_from(arguments), arguments.workers())
+    arguments.warn(scan.warnings)
     colored = write_colored_scan(scan, results, arguments.out)
     line = {"out": str(arguments.out), "photos": colored.num_photos, "points": colored.num_points}
     line["colored_points"] = colored.num_colored
-    print_report(arguments, {}, line)
+    arguments.report({}, line)
     return 0

@@ -1,25 +1,29 @@
 """Commands: options written as a help text shows them, checks before any work, and the `main` that runs."""
 
 import argparse
+import json
 import math
 import os
 import signal
 import stat
 import sys
 import threading
-from argparse import Namespace
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import traceback
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from ..errors import InputError, text_of
+from tqdm import tqdm
+
+from ..errors import InputError, printable, text_of
 from ..files.atomic import check_output, is_stdout, is_stream
 from ..jobs.memory import check_address_space, is_shortage
+from ..jobs.threads import Progress, Workers, num_cores
 from ..panorama.cube import SUFFIXES
 from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started, for_terminal
-from .terminal import EXIT_BAD_INPUT, Outputs, print_error, showing_log
+from .terminal import LOG, progress_bar, showing_log
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
     **dict.fromkeys(("FILE", "FOLDER", "JSONL", "PNG"), Path),
@@ -27,12 +31,69 @@ KINDS: dict[str, type] = {  # of the values, by the first metavar; of others tex
     **dict.fromkeys(("X", "M", "S", "DEG", "X0", "MIN", "HZ", "FRACTION", "GB"), float),
 }
 EXIT_BAD_USAGE = 2
+EXIT_BAD_INPUT = 3
 EXIT_INTERNAL = 4
 EXIT_BROKEN_PIPE = 141
 RETRY = 0.1  # [s] after which a signal is sent again
 SHORTAGE = "not enough memory ({}); lower --max-memory or --threads, or thin the scan"
 EXIT_CODES = "2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 terminated."
+Outputs = Mapping[str, Path | None]  # by option; None where it is not given
 Main = Callable[..., int]  # runs a command line, by default this program's, and returns its exit code
+
+
+class UsageError(InputError):
+    """The options are wrong, whatever the files hold."""
+
+
+class Arguments(argparse.Namespace):
+    """The options given to a command. It prints what is no result as --quiet and --debug say."""
+
+    def error(self, text: str, exit_code: int = EXIT_BAD_INPUT) -> int:
+        """Print a line on stderr, with --debug after the traceback of the error at hand; return the code."""
+        if self.debug and sys.exc_info()[0]:
+            traceback.print_exc()
+        tqdm.write(f"{self.program}: {for_terminal(printable(text))}", file=sys.stderr)
+        return exit_code
+
+    def note(self, text: str) -> None:
+        """Print a line on stderr, but not with --quiet."""
+        if not self.quiet:
+            tqdm.write(f"{self.program}: {for_terminal(printable(text))}", file=sys.stderr)
+
+    def warn(self, warnings: Iterable[str]) -> None:
+        """Print a line on stderr for each warning, unless --quiet."""
+        for warning in warnings:
+            self.note(f"warning: {warning}")
+
+    def report(self, outputs: Outputs, report: Mapping[str, object] | str) -> None:
+        """Print JSON, or text, on stdout; on stderr, without --quiet, where one of the outputs is stdout."""
+        text = report if isinstance(report, str) else f"{json.dumps(report, allow_nan=False)}\n"
+        if not any(path and is_stdout(path) for path in outputs.values()):
+            print(text, end="")
+        elif not self.quiet:
+            print(text, end="", file=sys.stderr)
+
+    def progress(self) -> Progress:
+        """Return a function that wraps values in a progress bar, or in nothing with --quiet."""
+        return progress_bar(self.quiet)
+
+    def workers(self, num_threads: int | None = None) -> Workers:
+        """Return workers, by default one a core, that show progress, unless --quiet, and log warnings."""
+        return Workers(num_threads or num_cores(), self.progress(), LOG.warning)
+
+    def check_least(self, **limits: float) -> None:
+        """Refuse an option below its limit, by its name; one that is not there may be anything."""
+        for name, limit in limits.items():
+            value = getattr(self, name, None)
+            if value is not None and not limit <= value < math.inf:
+                raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
+
+    def refuse_given(self, options: Sequence[str], why: str) -> None:
+        """Refuse options without a default that are given, by their names."""
+        for name in options:
+            value = getattr(self, name)
+            if value is not None and value is not False:
+                raise UsageError(f"--{name.replace('_', '-')}: {why}")
 
 
 class HelpFormatter(argparse.RawDescriptionHelpFormatter):
@@ -55,6 +116,15 @@ def new_parser(
     return parser
 
 
+def add_command(
+    commands: "argparse._SubParsersAction[argparse.ArgumentParser]", name: str, **more: Any
+) -> Any:
+    """Return the parser of a subcommand; `more` goes to argparse."""
+    parser = commands.add_parser(name, formatter_class=HelpFormatter, **more)
+    add_run_options(parser)
+    return parser
+
+
 def add_run_options(parser: argparse.ArgumentParser) -> None:
     """Add --quiet and --debug to a parser, or to one of its subcommands."""
     unless_given = argparse.SUPPRESS  # a subcommand keeps what stood before it
@@ -62,7 +132,7 @@ def add_run_options(parser: argparse.ArgumentParser) -> None:
     option(parser, "--debug", "print the traceback of an error", default=unless_given)
 
 
-def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.Namespace:
+def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> Arguments:
     """Return the options given; argparse alone would take the value of `--up -y` for an option."""
     words: list[str] = []
     for word in sys.argv[1:] if argv is None else argv:
@@ -70,7 +140,7 @@ def parse(parser: argparse.ArgumentParser, argv: list[str] | None) -> argparse.N
             words[-1] = f"--up={word}"
         else:
             words.append(word)
-    return parser.parse_args(words)
+    return parser.parse_args(words, Arguments())
 
 
 def option(group: argparse._ActionsContainer, usage: str, text: str = "", **more: Any) -> None:
@@ -100,13 +170,13 @@ def command(
     epilog: str,
     add_options: Callable[[argparse.ArgumentParser], None],
     exit_codes: str = "0 done",
-) -> Callable[[Callable[[argparse.Namespace], int]], Main]:
+) -> Callable[[Callable[[Arguments], int]], Main]:
     """Make a function of the options given, which returns an exit code, the `main` of a command.
 
     The command is named after its source `file`; `exit_codes` are its own, below 2.
     """
 
-    def decorate(run: Callable[[argparse.Namespace], int]) -> Main:
+    def decorate(run: Callable[[Arguments], int]) -> Main:
         def main(argv: list[str] | None = None) -> int:
             parser = new_parser(Path(file).stem, description, epilog, exit_codes)
             add_options(parser)
@@ -131,26 +201,26 @@ class Terminated(KeyboardInterrupt):
 
 
 def report_error(
-    arguments: argparse.Namespace, error: Exception | KeyboardInterrupt, lost: list[KeyboardInterrupt]
+    arguments: Arguments, error: Exception | KeyboardInterrupt, lost: list[KeyboardInterrupt]
 ) -> int:
     """Print the error that ended a command, and return its exit code; `lost` is that of raising_signals."""
     is_foreseen = isinstance(error, OSError | InputError)
     if lost and isinstance(error, Exception) and not is_foreseen:
         error = lost[0]  # what was called back by C has failed for it
     if isinstance(error, Terminated):
-        return print_error(arguments, "terminated", EXIT_TERMINATED)
+        return arguments.error("terminated", EXIT_TERMINATED)
     if isinstance(error, KeyboardInterrupt):
-        return print_error(arguments, "interrupted", EXIT_INTERRUPTED)
+        return arguments.error("interrupted", EXIT_INTERRUPTED)
     if isinstance(error, OSError | InputError):
         discard_stdout()
         if isinstance(error, BrokenPipeError) and not error.filename:  # stdout's reader has gone: say nothing
             return EXIT_BROKEN_PIPE
         code = EXIT_BAD_USAGE if isinstance(error, UsageError) else EXIT_BAD_INPUT
-        return print_error(arguments, text_of(error), code)
+        return arguments.error(text_of(error), code)
     if is_shortage(error):
         text = " ".join(str(error).split()) or "none is left"
-        return print_error(arguments, SHORTAGE.format(text), EXIT_BAD_INPUT)
-    return print_error(arguments, f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
+        return arguments.error(SHORTAGE.format(text))
+    return arguments.error(f"internal error: {error!r}; --debug shows where", EXIT_INTERNAL)
 
 
 @contextmanager
@@ -199,10 +269,6 @@ def discard_stdout() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
-class UsageError(InputError):
-    """The options are wrong, whatever the files hold."""
-
-
 @contextmanager
 def checking_options() -> Iterator[None]:
     """Within this, an InputError is a UsageError."""
@@ -210,22 +276,6 @@ def checking_options() -> Iterator[None]:
         yield
     except InputError as error:
         raise UsageError(str(error)) from error
-
-
-def check_least(arguments: Namespace, **limits: float) -> None:
-    """Refuse an option below its limit, by its name in `arguments`; one that is not there may be anything."""
-    for name, limit in limits.items():
-        value = getattr(arguments, name, None)
-        if value is not None and not limit <= value < math.inf:
-            raise UsageError(f"--{name.replace('_', '-')}: found {value}, wanted at least {limit}")
-
-
-def refuse_given(arguments: Namespace, options: Sequence[str], why: str) -> None:
-    """Refuse options without a default that are given, by their names in `arguments`."""
-    for name in options:
-        value = getattr(arguments, name)
-        if value is not None and value is not False:
-            raise UsageError(f"--{name.replace('_', '-')}: {why}")
 
 
 def check_outputs(outputs: Outputs, inputs: Iterable[Path] = ()) -> None:

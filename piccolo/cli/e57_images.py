@@ -2,15 +2,14 @@
 
 import json
 import re
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from pathlib import Path
 
 from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
-from .command import check_distinct, check_folder_name, command, option
-from .terminal import EXIT_BAD_INPUT, print_error
+from .command import Arguments, check_distinct, check_folder_name, command, option
 
 EPILOG = """\
 example:
@@ -41,7 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """List and, if asked, write the images; returns the exit code. A broken one doesn't stop the others."""
     check_folder_name("--extract", arguments.extract)
     images = list_images(arguments.e57)
@@ -59,6 +58,6 @@ def main(arguments: Namespace) -> int:
                 write_atomically(file, read_image(arguments.e57, index))
                 row["file"] = str(file)
             except InputError as error:
-                exit_code = print_error(arguments, str(error), EXIT_BAD_INPUT)
+                exit_code = arguments.error(str(error))
         print(json.dumps(row, allow_nan=False), flush=True)
     return exit_code

@@ -3,7 +3,6 @@
 import os
 import signal
 import sys
-from argparse import Namespace
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from dataclasses import dataclass, replace
@@ -27,10 +26,9 @@ from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map
 from ..scan_map.open_map import CachePolicy
 from ..scan_map.scan_map import ScanMap
-from .command import UsageError
+from .command import EXIT_BAD_INPUT, Arguments, UsageError
 from .options import PHOTOS_OF_A_JOB
 from .start import for_terminal
-from .terminal import EXIT_BAD_INPUT, print_error
 
 EXIT_SOME_NOT = 1
 MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
@@ -64,10 +62,10 @@ def advise(result: Result) -> list[str]:
     return [f"  it fits nowhere well: another scan{lens}, or bare walls?"]
 
 
-def print_result(arguments: Namespace, result: Result, warnings: Sequence[str]) -> None:
+def print_result(arguments: Arguments, result: Result, warnings: Sequence[str]) -> None:
     """Print an error; or, unless --quiet, what was found, the warnings, and what to do if it is doubtful."""
     if result.error is not None:
-        print_error(arguments, result.error, EXIT_BAD_INPUT)
+        arguments.error(result.error)
         return
     if arguments.quiet:
         return
@@ -76,7 +74,7 @@ def print_result(arguments: Namespace, result: Result, warnings: Sequence[str]) 
         tqdm.write(line, file=sys.stderr)
 
 
-def check_execution(arguments: Namespace) -> None:
+def check_execution(arguments: Arguments) -> None:
     """Refuse options that do not go together."""
     if arguments.dask and arguments.jobs not in (None, 1):
         raise UsageError(f"--jobs: not with --dask {arguments.dask}, whose scheduler starts the workers")
@@ -84,7 +82,7 @@ def check_execution(arguments: Namespace) -> None:
         raise UsageError(f"--mask {arguments.mask}: wanted an absolute path with --dask {arguments.dask}")
 
 
-def count_jobs(arguments: Namespace, num_left: int | None) -> int:
+def count_jobs(arguments: Arguments, num_left: int | None) -> int:
     """Return the processes asked for, or as many as are worth their start for `num_left` photos, if known."""
     if arguments.jobs is not None:
         return int(min(arguments.jobs, num_left or arguments.jobs))
@@ -93,7 +91,7 @@ def count_jobs(arguments: Namespace, num_left: int | None) -> int:
     return max(1, min(num_cores(), num_left // PHOTOS_OF_A_JOB))
 
 
-def count_fitting(arguments: Namespace, num_jobs: int) -> int:
+def count_fitting(arguments: Arguments, num_jobs: int) -> int:
     """Return how many of the processes memory is left for; called where one has what each will need."""
     if arguments.jobs is not None:
         return num_jobs
@@ -101,7 +99,7 @@ def count_fitting(arguments: Namespace, num_jobs: int) -> int:
     return max(1, min(num_jobs, int((memory_left() + taken) // (taken + QUERY_MEMORY))))
 
 
-def share_of_a_job(arguments: Namespace, localizer: Localizer, num_jobs: int) -> Localizer:
+def share_of_a_job(arguments: Arguments, localizer: Localizer, num_jobs: int) -> Localizer:
     """Return the localizer of one of some processes, which divide cores and --max-memory."""
     if arguments.dask:
         return replace(localizer, num_threads=arguments.threads or 1, max_memory=arguments.max_memory)
@@ -112,14 +110,14 @@ def share_of_a_job(arguments: Namespace, localizer: Localizer, num_jobs: int) ->
     return replace(localizer, num_threads=num_threads, max_memory=memory)
 
 
-def connecting(arguments: Namespace) -> AbstractContextManager[Cluster | None]:
+def connecting(arguments: Arguments) -> AbstractContextManager[Cluster | None]:
     """Return the cluster of --dask; None without."""
     return connect(arguments.dask) if arguments.dask else nullcontext()
 
 
 @contextmanager
 def executing(
-    arguments: Namespace,
+    arguments: Arguments,
     localizer: Localizer,
     num_jobs: int,
     cluster: Cluster | None,
@@ -147,7 +145,7 @@ def executing(
 
 
 def at_the_workers(
-    arguments: Namespace, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
+    arguments: Arguments, cluster: Cluster, localizer: Localizer, scan: OpenedScan, is_kept: bool
 ) -> Localizer:
     """Return a localizer whose scan a cluster's workers can open: at its path, or sent to them."""
     here = Path.cwd()
@@ -194,12 +192,12 @@ class Interruption:
         finally:
             self.is_at_work = False
 
-    def stop(self, arguments: Namespace, done: str, is_kept: bool) -> int:
+    def stop(self, arguments: Arguments, done: str, is_kept: bool) -> int:
         """Say what a signal has ended and how to go on; returns the code that a shell expects of that."""
         same = "the same command"
         how = f"{same} continues from here" if is_kept else f"with --out FILE {same} would continue"
         text = f"ended by {SIGNALS[self.number]} after {done}; {how}"
-        return print_error(arguments, text, 128 + self.number)
+        return arguments.error(text, 128 + self.number)
 
     def handle(self, number: int, _frame: FrameType | None) -> None:
         """Note a signal; raises Stopped where it ends the work at once."""

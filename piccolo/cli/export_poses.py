@@ -1,6 +1,6 @@
 """Write the poses of localize.py for other tools: COLMAP, nerfstudio, OpenSfM, trajectories, maps."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,8 +11,7 @@ from ..export.posed_images import Options, Selection, select
 from ..geometry.pose import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
-from .command import check_distinct, checking_options, command, option
-from .terminal import print_note, print_report
+from .command import Arguments, check_distinct, checking_options, command, option
 
 _FORMATS = "\n".join(f"  {form.name:<11} {form.description}" for form in FORMATS.values())
 EPILOG = f"""\
@@ -57,7 +56,7 @@ def _takers(option: str) -> str:
     return ", ".join(form.name for form in FORMATS.values() if option in form.options)
 
 
-def options_from(arguments: Namespace) -> Options:
+def options_from(arguments: Arguments) -> Options:
     """Return the options given; one that the format does not take is refused."""
     given = {name: value for name, value in vars(arguments).items() if value is not None}
     form = FORMATS[arguments.format]
@@ -80,7 +79,7 @@ def notes_on(selection: Selection) -> Iterable[str]:
         yield f"poses in {num_clouds} clouds are assumed to be in one coordinate system; --cloud selects"
 
 
-def check_content(arguments: Namespace, results: Sequence[Result]) -> Iterable[str]:
+def check_content(arguments: Arguments, results: Sequence[Result]) -> Iterable[str]:
     """Yield notes on results of other clouds than those chosen; without --force they are refused."""
     for cloud in dict.fromkeys(result.cloud for result in results if result.cloud_name in arguments.cloud):
         paths = [Path(path) for path in ([cloud] if isinstance(cloud, str) else cloud)]
@@ -92,7 +91,7 @@ def check_content(arguments: Namespace, results: Sequence[Result]) -> Iterable[s
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, EXIT_CODES)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read, choose, write; returns the exit code."""
     with checking_options():
         options = options_from(arguments)
@@ -103,12 +102,12 @@ def main(arguments: Namespace) -> int:
     check_distinct(outputs, [*arguments.results, *files])
     selection = select(results, arguments.cloud, arguments.all)
     for note in (*notes_on(selection), *check_content(arguments, selection.results)):
-        print_note(arguments, note)
+        arguments.note(note)
     left_out = export(selection.results, arguments.format, arguments.out, options)
     counts = {reason: len(names) for reason, names in left_out.items()}
     for reason, names in left_out.items():
-        print_note(arguments, f"left out {len(names)}, the first {names[0]}: {reason}")
+        arguments.note(f"left out {len(names)}, the first {names[0]}: {reason}")
     num_poses = len(selection.results) - sum(counts.values())
     report = {"out": str(arguments.out), "format": arguments.format, "poses": num_poses}
-    print_report(arguments, outputs, {**report, "left_out": {**selection.left_out, **counts}})
+    arguments.report(outputs, {**report, "left_out": {**selection.left_out, **counts}})
     return EXIT_LEFT_OUT if left_out else 0

@@ -3,7 +3,6 @@
 import itertools
 import os
 import sys
-from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -35,7 +34,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..views.pictures import encode_image
 from . import execution, terminal, together
-from .command import UsageError, check_distinct, check_suffix, checking_options, command
+from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options, command
 from .execution import Executor, Interruption
 from .options import DESCRIPTION, EPILOG, add_arguments, check_arguments, localizer_from
 
@@ -54,7 +53,7 @@ Write = Callable[[str], object]
 class Run:
     """A command's batch, and what it has done so far."""
 
-    arguments: Namespace
+    arguments: Arguments
     localizer: Localizer
     panoramas: Iterable[Path]
     total: int | None  # of the panoramas; None if they come on standard input
@@ -70,7 +69,7 @@ class Run:
         return is_default and self.total not in (None, 1) and not self.localizer.sends_photos
 
 
-def check_files(arguments: Namespace, panoramas: list[Path], total: int | None) -> None:
+def check_files(arguments: Arguments, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
     a = arguments
     given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative, a.odometry))
@@ -94,7 +93,7 @@ def check_files(arguments: Namespace, panoramas: list[Path], total: int | None) 
         check_output(path)
 
 
-def prepare_run(arguments: Namespace) -> Run:
+def prepare_run(arguments: Arguments) -> Run:
     """Return what is to be done: the options, the panoramas, and how many there are."""
     with checking_options():
         check_arguments(arguments)
@@ -125,17 +124,17 @@ def prepare_run(arguments: Namespace) -> Run:
     return Run(arguments, localizer, known, len(known), left_out, Counter())
 
 
-def note_unused_priors(arguments: Namespace, localizer: Localizer) -> None:
+def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
     if localizer.priors and (names := localizer.priors.names_without_panorama):
         note = f"{len(names)} names without a photo, such as {names[0]}"
-        terminal.print_note(arguments, f"warning: {localizer.priors.path}: {note}")
+        arguments.note(f"warning: {localizer.priors.path}: {note}")
 
 
 def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
     """Read and prepare the scan."""
     arguments = run.arguments
-    workers = terminal.workers_from(arguments, num_threads)
+    workers = arguments.workers(num_threads)
     scan = localizer.open_scan(workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
@@ -244,7 +243,7 @@ def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
     replace_line = partial(output.replace, look.number)
     is_other = not look.first or (result.beside is not None and result.beside.photos)
     if result.error is not None:
-        terminal.print_error(run.arguments, result.error, terminal.EXIT_BAD_INPUT)
+        run.arguments.error(result.error)
     elif is_other:
         run.counts[look.status] -= 1
         record(run, answer, replace_line)
@@ -269,7 +268,7 @@ def note_left_handed(run: Run, records: Records, executor: Executor, interruptio
         answers = execution.answer_all(executor, localizer, map(localizer.task, paths))
         found = [answer.result.status for answer in answers]
         if 2 * found.count(LOCALIZED) >= NUM_MIRRORED:
-            terminal.print_note(run.arguments, LEFT_HANDED)
+            run.arguments.note(LEFT_HANDED)
 
 
 def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
@@ -286,7 +285,7 @@ def finish(run: Run, records: Records, output: Output, interruption: Interruptio
         note = f"{counts.total()} photos in {seconds:.0f} s: {words}{again}"
         dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
         parts = note, dropped, describe_left_out(run.left_out)
-        terminal.print_note(arguments, "; ".join(filter(None, parts)))
+        arguments.note("; ".join(filter(None, parts)))
     if interruption.number:
         return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
     if run.total is None:
@@ -306,7 +305,7 @@ def run_jointly(run: Run) -> int:
     if arguments.walk or arguments.video:
         with together.walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
             if run.left_out:
-                terminal.print_note(arguments, describe_left_out(run.left_out))
+                arguments.note(describe_left_out(run.left_out))
             walk = Walk(opening(), settings, motion)
             return together.run_together(arguments, together.make_walk_job(arguments, frames, walk))
     make_job = together.make_bundle_job if arguments.relative else together.make_coloring_job
@@ -314,7 +313,7 @@ def run_jointly(run: Run) -> int:
 
 
 @command(__file__, DESCRIPTION, EPILOG, add_arguments, "0 all localized, 1 some not")
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Localize every panorama, write the results, return the exit code."""
     watch = Stopwatch()
     run = prepare_run(arguments)
@@ -324,7 +323,7 @@ def main(arguments: Namespace) -> int:
     with open_output(run) as (output, records):
         panoramas = iter(run.panoramas)
         if run.total is not None:
-            show = terminal.progress_bar(arguments.quiet)
+            show = arguments.progress()
             panoramas = show(panoramas, run.total, "check what is finished")
         left = records.remaining(panoramas, lambda pano: sha256_of(pano, rig))
         num_left = None
@@ -336,7 +335,7 @@ def main(arguments: Namespace) -> int:
         texts = follow_consensus(run, output) if first is None and run.looks_again else []
         looks = [look for list_looks in LISTINGS for look in list_looks(texts)]
         if first is None and not looks:
-            terminal.print_note(arguments, f"{arguments.out or 'nothing'}: nothing is left to do")
+            arguments.note(f"{arguments.out or 'nothing'}: nothing is left to do")
             return finish(run, records, output, Interruption(), 0.0)
         num_jobs = execution.count_jobs(arguments, num_left or len(looks) or None)
         opening = partial(open_scan, run)

@@ -19,7 +19,7 @@ from ..paper.localize import PaperSettings
 from ..photo import Photo, Prior, Projection
 from ..scan_map.open_map import CachePolicy
 from ..walk.frames import MAX_SPEED, MAX_STEP
-from .command import check_least, option
+from .command import Arguments, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
 EPILOG = """\
@@ -204,7 +204,7 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
     option(group, "--max-memory GB", text)
 
 
-def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
+def cloud_settings_from(arguments: Arguments) -> CloudSettings:
     """Return the options of add_cloud_reading_options."""
     scale = METRES["m"] if arguments.units is None else arguments.units
     crs = vars(arguments).get("crs")  # not of commands without photos
@@ -218,13 +218,13 @@ def cloud_settings_from(arguments: argparse.Namespace) -> CloudSettings:
     return CloudSettings(scale, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns))
 
 
-def cache_from(arguments: argparse.Namespace) -> CachePolicy:
+def cache_from(arguments: Arguments) -> CachePolicy:
     """Return where prepared maps are kept."""
     is_used = arguments.cache != Path(NONE)
     return CachePolicy(is_used, arguments.cache if is_used else None)
 
 
-def localizer_from(arguments: argparse.Namespace, paths: tuple[Path, ...] = ()) -> Localizer:
+def localizer_from(arguments: Arguments, paths: tuple[Path, ...] = ()) -> Localizer:
     """Return what localizes photos in the scan of some files as the options ask for."""
     cloud_settings = cloud_settings_from(arguments)
     names = {f.name for f in fields(Photo)}
@@ -233,7 +233,7 @@ def localizer_from(arguments: argparse.Namespace, paths: tuple[Path, ...] = ()) 
     return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
 
 
-def settings_from(arguments: argparse.Namespace) -> Settings:
+def settings_from(arguments: Arguments) -> Settings:
     """Return the settings that the options ask for; an option of the other preset is refused."""
     name, *words = arguments.preset
     if name not in PRESETS:
@@ -285,8 +285,8 @@ def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
     return given
 
 
-def check_arguments(arguments: argparse.Namespace) -> None:
+def check_arguments(arguments: Arguments) -> None:
     """Refuse values that are wrong whatever the files hold."""
-    check_least(arguments, threads=1, jobs=1, every=MIN_EVERY)
+    arguments.check_least(threads=1, jobs=1, every=MIN_EVERY)
     if arguments.overwrite and not arguments.out:
         raise InputError("--overwrite: only with --out")

@@ -1,13 +1,12 @@
 """Prepare the map of a cloud: a file that localize.py takes instead of the cloud."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 
 from ..jobs.threads import Stopwatch
 from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
 from ..scan_map.scan_map import check_name, name_scan
-from .command import check_outputs, checking_options, command, option
+from .command import Arguments, check_outputs, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
-from .terminal import print_report, workers_from
 
 EPILOG = """\
 example:
@@ -33,7 +32,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Build and write the map; returns the exit code."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
@@ -42,7 +41,7 @@ def main(arguments: Namespace) -> int:
     name = arguments.cloud[0].stem if arguments.name is None else arguments.name
     check_name(name, ())
     watch = Stopwatch()
-    workers = workers_from(arguments)
+    workers = arguments.workers()
     if arguments.add:
         scan_map = extend_map(arguments.add, arguments.cloud, cloud_settings, name, workers, watch)
     else:
@@ -59,5 +58,5 @@ def main(arguments: Namespace) -> int:
         "seconds": {stage: round(seconds, 3) for stage, seconds in watch.seconds.items()},
         "warnings": list(scan_map.warnings),
     }
-    print_report(arguments, outputs, report)
+    arguments.report(outputs, report)
     return 0

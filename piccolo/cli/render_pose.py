@@ -1,6 +1,6 @@
 """Render the cloud as a camera at a pose would see it: colours or depth."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from contextlib import nullcontext
 from io import BytesIO
 from pathlib import Path
@@ -21,9 +21,8 @@ from ..result import read_results
 from ..scan_map.open_map import open_points
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
-from .command import check_distinct, check_suffix, checking_options, command, option
+from .command import Arguments, check_distinct, check_suffix, checking_options, command, option
 from .options import add_cloud_options, cloud_settings_from
-from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -76,7 +75,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--mask-out PNG", "mask of the pixels without scan, see below")
 
 
-def check_usage(arguments: Namespace) -> None:
+def check_usage(arguments: Arguments) -> None:
     """Refuse options that make no sense, whatever the files hold."""
     cloud_settings_from(arguments)
     if (arguments.depth or arguments.mask_out) and is_folder(arguments.out):
@@ -88,7 +87,7 @@ def check_usage(arguments: Namespace) -> None:
     check_pose_options(arguments)
 
 
-def check_pose_options(arguments: Namespace) -> None:
+def check_pose_options(arguments: Arguments) -> None:
     """Refuse options that do not go with where the pose is from."""
     angles = [arguments.heading, arguments.pitch, arguments.roll]
     if not arguments.at and any(angle is not None for angle in angles):
@@ -97,7 +96,7 @@ def check_pose_options(arguments: Namespace) -> None:
         raise InputError("--at and angles must be finite numbers")
 
 
-def outputs_of(arguments: Namespace) -> dict[str, Path | None]:
+def outputs_of(arguments: Arguments) -> dict[str, Path | None]:
     """Return the outputs by option."""
     return {name: getattr(arguments, name[2:].replace("-", "_")) for name in SUFFIXES}
 
@@ -112,7 +111,7 @@ def suffix_of(option: str, path: Path) -> str:
     return SUFFIXES[option][0] if is_stream(path) else path.suffix.lower()
 
 
-def check_files(arguments: Namespace, poses: list[Shot]) -> None:
+def check_files(arguments: Arguments, poses: list[Shot]) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     given = (arguments.result, arguments.pose, arguments.camera)
     photos = [Path(shot.pano) for shot in poses]
@@ -121,7 +120,7 @@ def check_files(arguments: Namespace, poses: list[Shot]) -> None:
         (check_output_folder if is_folder(path) else check_output)(path)
 
 
-def poses_from(arguments: Namespace) -> list[Shot]:
+def poses_from(arguments: Arguments) -> list[Shot]:
     """Return poses asked for, named by the panorama's path, the pose's file or "at", with their cameras."""
     given = read_calibration(arguments.camera).mounts if arguments.camera else ()
     if len(given) > 1:
@@ -176,7 +175,7 @@ def depth_file(depth: Array32, suffix: str) -> bytes:
     return file.getvalue()
 
 
-def draw_pictures(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
+def draw_pictures(arguments: Arguments, cloud: LocalCloud, poses: list[Shot], workers: Workers) -> None:
     """Write the pictures; one JSON line each."""
     is_many = is_folder(arguments.out)
     names = [f"{Path(shot.pano).stem}.png" for shot in poses] if is_many else [arguments.out.name]
@@ -203,19 +202,19 @@ def draw_pictures(arguments: Namespace, cloud: LocalCloud, poses: list[Shot], wo
     with replacing_folder(arguments.out) if is_many else nullcontext(arguments.out.parent) as folder:
         lines = [write(folder, name, shot) for name, shot in zip(names, poses, strict=True)]
     for line in lines:
-        print_report(arguments, outputs_of(arguments), line)
+        arguments.report(outputs_of(arguments), line)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read, draw, write."""
     with checking_options():
         check_usage(arguments)
     poses = poses_from(arguments)
     check_files(arguments, poses)
 
-    workers = workers_from(arguments)
+    workers = arguments.workers()
     cloud = open_points(arguments.cloud, cloud_settings_from(arguments), workers)
-    print_warnings(arguments, cloud.warnings)
+    arguments.warn(cloud.warnings)
     draw_pictures(arguments, cloud, poses, workers)
     return 0

@@ -1,6 +1,6 @@
 """Write a web page of results: plans of the storeys, photos as spheres, the scan seen from their poses."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections import Counter
 from dataclasses import fields
 from pathlib import Path
@@ -14,9 +14,8 @@ from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file
 from ..report.site import check_folder
 from ..scan_map.open_map import open_map
-from .command import UsageError, check_distinct, check_least, check_suffix, checking_options, command, option
+from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
-from .terminal import print_report, print_warnings, workers_from
 
 EPILOG = """\
 examples:
@@ -52,9 +51,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--cache FOLDER", CACHE_TEXT)
 
 
-def settings_from(arguments: Namespace) -> ReportSettings:
+def settings_from(arguments: Arguments) -> ReportSettings:
     """Return what the options ask for; those that make no sense are refused."""
-    check_least(arguments, jobs=1)
+    arguments.check_least(jobs=1)
     if not (arguments.out or arguments.plan):
         raise UsageError("--out, --plan: found none of them, wanted one or both")
     check_suffix("--plan", arguments.plan, SUFFIXES)
@@ -69,7 +68,7 @@ def settings_from(arguments: Namespace) -> ReportSettings:
     return ReportSettings(own_plans=own_plans, **given)
 
 
-def check_files(arguments: Namespace) -> None:
+def check_files(arguments: Arguments) -> None:
     """Refuse, before any work, what could not be written, or would replace an input."""
     own = [Path(name) for _, *names in arguments.own_plan for name in names]
     inputs = [*arguments.results, *arguments.cloud, *own]
@@ -84,14 +83,14 @@ def check_files(arguments: Namespace) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read, draw, write; returns the exit code."""
     with checking_options():
         settings = settings_from(arguments)
         cloud_settings = cloud_settings_from(arguments)
     check_files(arguments)
     entries = collect_entries(arguments.results)
-    workers = workers_from(arguments, arguments.jobs)
+    workers = arguments.workers(arguments.jobs)
     cache = cache_from(arguments)
     scan_map = open_map(arguments.cloud, cloud_settings, cache, workers, Stopwatch())
     line: dict[str, object] = {"photos": len(entries)}
@@ -100,10 +99,10 @@ def main(arguments: Namespace) -> int:
         line["storeys"] = write_plan_file(entries, scan_map, arguments.plan, settings)
     if arguments.out:
         report = build_report(entries, scan_map, arguments.out, settings, workers)
-        print_warnings(arguments, report.warnings)
+        arguments.warn(report.warnings)
         line["out"] = str(arguments.out)
         line["url"] = report.page.resolve().as_uri()
         line["storeys"] = len(report.document["storeys"])
     line |= Counter(entry.result.status for entry in entries)
-    print_report(arguments, {"--plan": arguments.plan}, line)
+    arguments.report({"--plan": arguments.plan}, line)
     return 0

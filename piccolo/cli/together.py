@@ -4,7 +4,6 @@ Results are written when all are known. Until then the steps of the job are kept
 """
 
 import json
-from argparse import Namespace
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +34,7 @@ from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..walk.frames import Motion
 from . import terminal
-from .command import UsageError, refuse_given
+from .command import Arguments, UsageError
 from .execution import EXIT_SOME_NOT, Interruption, choose_exit_code, interruptible, print_result
 from .options import DEFAULT_EVERY
 
@@ -49,21 +48,21 @@ ONLY_WITH_WALKS = ("times", "max_speed", "odometry")
 NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
 
 
-def check_joint_options(arguments: Namespace) -> None:
+def check_joint_options(arguments: Arguments) -> None:
     """Refuse options that do not go with photos that help each other, or with each other."""
     a = arguments
     if not a.video:
-        refuse_given(a, ("every",), "only with --video")
+        a.refuse_given(("every",), "only with --video")
     if not (a.walk or a.video):
         if not a.pano:
             raise UsageError("the following arguments are required: --pano")
-        refuse_given(a, ONLY_WITH_WALKS, "only with --walk or --video")
+        a.refuse_given(ONLY_WITH_WALKS, "only with --walk or --video")
     elif bool(a.video) == bool(a.pano):
         raise UsageError("--walk, --video: wanted --walk with --pano, or --video alone")
     asked = {"a video": a.video, "a walk": a.walk or a.video, "--relative": a.relative}
     asked["--color-scan"] = a.color_scan
     for what in (what for what, is_asked in asked.items() if is_asked):
-        refuse_given(a, NOT_WITH[what], f"not with {what}")
+        a.refuse_given(NOT_WITH[what], f"not with {what}")
     if (a.walk or a.color_scan) and is_from_stdin(a.pano):
         option = "--walk" if a.walk else "--color-scan"
         raise UsageError(f"{option}: found names on stdin, wanted files or folders")
@@ -84,7 +83,7 @@ class Job(NamedTuple):
     output: Path | None = None  # that is written beside the results
 
 
-def run_together(arguments: Namespace, job: Job) -> int:
+def run_together(arguments: Arguments, job: Job) -> int:
     """Do a job, or what an earlier run has left of it; write and print the results, return the exit code."""
     out = arguments.out
     path = steps_file(out)
@@ -92,7 +91,7 @@ def run_together(arguments: Namespace, job: Job) -> int:
     if path and not arguments.overwrite and is_finished(out, job):
         results = read_results([out])
         if job.output is None or job.output.exists():
-            terminal.print_note(arguments, f"{out}: nothing is left to do")
+            arguments.note(f"{out}: nothing is left to do")
             return choose_exit_code({result.status for result in results})
     else:
         digest = sha256(json.dumps([job.fields(Path(name)) for name in job.photos]).encode()).hexdigest()
@@ -111,8 +110,8 @@ def run_together(arguments: Namespace, job: Job) -> int:
     note = f"{len(results)} {job.what} in {watch.seconds.get('all', 0.0):.0f} s: {words}{more}"
     code = choose_exit_code(counts)
     if not is_whole:
-        return terminal.print_error(arguments, note, code or EXIT_SOME_NOT)
-    terminal.print_note(arguments, note)
+        return arguments.error(note, code or EXIT_SOME_NOT)
+    arguments.note(note)
     return code
 
 
@@ -133,7 +132,7 @@ def is_finished(out: Path, job: Job) -> bool:
 
 
 def make_bundle_job(
-    arguments: Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
+    arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
 ) -> Job:
     """Return the job of localizing photos as one camera, by --relative; a stopped one begins again."""
     poses = read_relative_poses(arguments.relative, photos)
@@ -161,7 +160,7 @@ def make_bundle_job(
 
 
 def make_coloring_job(
-    arguments: Namespace, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
+    arguments: Arguments, photos: Sequence[Path], localizer: Localizer, scan: OpenedScan
 ) -> Job:
     """Return the job of localizing photos in the colours of the others, and of colouring the scan by them.
 
@@ -217,7 +216,7 @@ class WalkInput(NamedTuple):
 
 @contextmanager
 def walk_frames(
-    arguments: Namespace, photo: Photo, panoramas: Sequence[Path]
+    arguments: Arguments, photo: Photo, panoramas: Sequence[Path]
 ) -> Iterator[tuple[list[WalkInput], Motion]]:
     """Yield the frames of a walk, those of a video as files until the end, and how the camera was carried."""
     with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
@@ -241,7 +240,7 @@ def walk_frames(
         yield frames, Motion(max_speed=arguments.max_speed, is_timed=is_timed)
 
 
-def make_walk_job(arguments: Namespace, frames: Sequence[WalkInput], walk: Walk) -> Job:
+def make_walk_job(arguments: Arguments, frames: Sequence[WalkInput], walk: Walk) -> Job:
     """Return the job of localizing the frames of a walk."""
     if arguments.odometry:
         walk.more_settings["odometry_sha256"] = sha256_of(arguments.odometry, None)
@@ -249,11 +248,11 @@ def make_walk_job(arguments: Namespace, frames: Sequence[WalkInput], walk: Walk)
 
     def run(journal: Journal) -> list[Result] | Interruption:
         interruption = follow_all(arguments, walk, frames, journal)
-        return interruption if interruption.number else walk.finish(terminal.progress_bar(arguments.quiet))
+        return interruption if interruption.number else walk.finish(arguments.progress())
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
         warnings = {w for r in results for w in r.warnings if w.startswith("`odometry`")}
-        terminal.print_warnings(arguments, warnings)
+        arguments.warn(warnings)
         gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
         return f"; {gaps} gaps", True
 
@@ -262,7 +261,7 @@ def make_walk_job(arguments: Namespace, frames: Sequence[WalkInput], walk: Walk)
 
 
 def follow_all(
-    arguments: Namespace, walk: Walk, frames: Sequence[WalkInput], journal: Journal
+    arguments: Arguments, walk: Walk, frames: Sequence[WalkInput], journal: Journal
 ) -> Interruption:
     """Follow the frames, and keep what was found of each; say why one can't be read."""
     steps = (frame.step(sha256_of(frame.photo.path, frame.photo.instant)) for frame in frames)
@@ -278,7 +277,7 @@ def follow_all(
             if result.status == UNREADABLE and frame is frames[0]:
                 check_others(walk, frames, str(result.error))
             if result.error is not None:
-                terminal.print_error(arguments, result.error, terminal.EXIT_BAD_INPUT)
+                arguments.error(result.error)
             if result.status != FAILED:
                 journal.append(frame.step(result.source.pano_sha256), walk.last_to_json())
         pool.shutdown(cancel_futures=True)

@@ -4,7 +4,7 @@ import json
 import math
 import os
 import shutil
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import fields
@@ -15,15 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from piccolo.arrays import Array
-from piccolo.cli.command import (
-    HelpFormatter,
-    add_run_options,
-    check_folder_name,
-    check_least,
-    command,
-    option,
-)
-from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, workers_from
+from piccolo.cli.command import Arguments, add_command, check_folder_name, command, option
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import CHUNK
 from piccolo.cloud.settings import IN_COLORS
@@ -160,7 +152,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     """All options; those that one dataset alone has are in its own subparser."""
     subparsers = parser.add_subparsers(dest="dataset", required=True, metavar="DATASET")
     for name, (description, _) in DATASETS.items():
-        one = subparsers.add_parser(name, description=description, formatter_class=HelpFormatter)
+        one = add_command(subparsers, name, description=description)
         option(one, "--from FOLDER", "folder of the dataset", required=True, dest="folder")
         option(one, "--out FOLDER", "folder of the scenes; created if missing", required=True)
         text = "only these, the last parts of scene names: office_1, weddingHall_1, a house"
@@ -169,7 +161,6 @@ def add_arguments(parser: ArgumentParser) -> None:
         text = "copy the panoramas, so that the dataset can be deleted (default: link to them)"
         option(one, "--copy", text)
         add_own_options(one, name)
-        add_run_options(one)
 
 
 def add_own_options(parser: ArgumentParser, dataset: str) -> None:
@@ -298,9 +289,9 @@ def _write_panorama(spec: SceneSpec, panorama: PosedPanorama, folder: Path, copi
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 --check found poses that don't fit")
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Write the scenes one by one; returns the exit code."""
-    check_least(arguments, check=0, seed=0)
+    arguments.check_least(check=0, seed=0)
     check_folder_name("--out", arguments.out)
     # a dataset's subparser has only some of the options
     own = {field.name: getattr(arguments, field.name, field.default) for field in fields(ConvertOptions)}
@@ -308,13 +299,13 @@ def main(arguments: Namespace) -> int:
     found = list_scenes(arguments.dataset, options)
     specs = choose_scenes(found.specs, arguments.rooms)
     for note in found.notes:
-        print_note(arguments, note)
-    workers = workers_from(arguments)
+        arguments.note(note)
+    workers = arguments.workers()
     # bad input goes before a bad fit
     return max((convert_scene(spec, arguments, workers) for spec in specs), default=0)
 
 
-def convert_scene(spec: SceneSpec, arguments: Namespace, workers: Workers) -> int:
+def convert_scene(spec: SceneSpec, arguments: Arguments, workers: Workers) -> int:
     """Write a scene, check it, and print its line; returns the exit code."""
     try:
         written = write_scene(spec, arguments.out, arguments.copy, workers.show)
@@ -322,9 +313,9 @@ def convert_scene(spec: SceneSpec, arguments: Namespace, workers: Workers) -> in
         if arguments.check:
             check = check_scene(read_scene(written.folder, spec.name), arguments.check, workers)
     except InputError as error:
-        return print_error(arguments, f"{spec.name}: {error}", EXIT_BAD_INPUT)
+        return arguments.error(f"{spec.name}: {error}")
     for warning in written.warnings:
-        print_note(arguments, warning)
+        arguments.note(warning)
     status = "there already" if written.num_points is None else "written"
     line: dict[str, object] = {"scene": spec.name, "folder": str(written.folder), "status": status}
     line |= {"points": written.num_points, "queries": written.num_queries}
@@ -332,5 +323,5 @@ def convert_scene(spec: SceneSpec, arguments: Namespace, workers: Workers) -> in
         line |= {"fits": check.is_passed, "check": [panorama._asdict() for panorama in check.panoramas]}
     print(json.dumps(line), flush=True)
     if check and not check.is_passed:
-        return print_error(arguments, f"{spec.name}: {check.advice}", EXIT_BAD_FIT)
+        return arguments.error(f"{spec.name}: {check.advice}", EXIT_BAD_FIT)
     return 0

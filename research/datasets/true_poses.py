@@ -1,13 +1,13 @@
 """Write the true poses of scenes as results of localize.py, or those of an aligned scan beside it."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from dataclasses import replace
 
 import numpy as np
 
 from piccolo import InputError, Result
 from piccolo.batch.results_file import write_results
-from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
+from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import move
@@ -43,7 +43,7 @@ def true_results(scene: Scene) -> list[Result]:
     ]
 
 
-def write_moved(arguments: Namespace, scene: Scene) -> None:
+def write_moved(arguments: Arguments, scene: Scene) -> None:
     """Write a scene's queries in the coordinates of the cloud beside the transform."""
     rows = read_text(arguments.transform, WANTED).splitlines()
     try:
@@ -55,7 +55,7 @@ def write_moved(arguments: Namespace, scene: Scene) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read and write."""
     with checking_options():
         if arguments.transform and arguments.out.name != QUERIES_NAME:

@@ -2,11 +2,10 @@
 
 import json
 import signal
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,10 +14,11 @@ import numpy as np
 from piccolo.batch.localizer import Localizer
 from piccolo.cli import execution, options
 from piccolo.cli.command import (
+    EXIT_BAD_INPUT,
+    Arguments,
     Terminated,
     UsageError,
     check_distinct,
-    check_least,
     check_outputs,
     check_suffix,
     checking_options,
@@ -26,7 +26,6 @@ from piccolo.cli.command import (
     option,
 )
 from piccolo.cli.execution import Interruption
-from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error, print_note, print_report, progress_bar
 from piccolo.errors import InputError
 from piccolo.files.atomic import check_output, is_stream, write_atomically
 from piccolo.files.line_file import open_locked
@@ -84,7 +83,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     options.add_execution_options(parser, default_jobs=1)
 
 
-def check_usage(arguments: Namespace) -> None:
+def check_usage(arguments: Arguments) -> None:
     """Refuse options that do not go together, and values that are wrong whatever the files hold."""
     if (arguments.scenes is None) == (arguments.compare is None):
         raise UsageError("--scenes: needed with --out and --results, not with --compare")
@@ -92,7 +91,7 @@ def check_usage(arguments: Namespace) -> None:
         raise UsageError("--csv, --risk: not with --compare, they show one run")
     if not (0.0 < arguments.max_distance < np.inf and 0.0 < arguments.max_angle < np.inf):
         raise UsageError("--max-distance, --max-angle: wanted numbers above 0")
-    check_least(arguments, jobs=1, threads=1)
+    arguments.check_least(jobs=1, threads=1)
     execution.check_execution(arguments)
     for option_ in ("errors", "risk"):
         check_suffix(f"--{option_}", getattr(arguments, option_), (".png",))
@@ -116,17 +115,17 @@ def report_of(scenes: Sequence[Scene], rows: Sequence[QueryResult], thresholds: 
 
 
 def write_report(
-    arguments: Namespace, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
+    arguments: Arguments, text: str, runs: dict[str, list[QueryResult]], thresholds: Thresholds
 ) -> None:
     """Print the tables of one run or two, and write them and the plot of their errors if asked for."""
     if arguments.markdown:
         write_atomically(arguments.markdown, text.encode())
     if arguments.errors:
         write_atomically(arguments.errors, tables.figure_png(tables.errors_figure(runs, thresholds)))
-    print_report(arguments, outputs_of(arguments), text)
+    arguments.report(outputs_of(arguments), text)
 
 
-def compare(arguments: Namespace, thresholds: Thresholds) -> int:
+def compare(arguments: Arguments, thresholds: Thresholds) -> int:
     """Print two runs side by side."""
     runs = [query_result.read_run(path)[0] for path in arguments.compare]
     if arguments.variants:
@@ -144,12 +143,12 @@ def compare(arguments: Namespace, thresholds: Thresholds) -> int:
     return 0
 
 
-def outputs_of(arguments: Namespace) -> dict[str, Path | None]:
+def outputs_of(arguments: Arguments) -> dict[str, Path | None]:
     """Return the files beside a run, by option."""
     return {f"--{name}": getattr(arguments, name) for name in ("csv", "markdown", "errors", "risk")}
 
 
-def check_files(arguments: Namespace, inputs: list[Path]) -> None:
+def check_files(arguments: Arguments, inputs: list[Path]) -> None:
     """Refuse outputs that would replace an input, a run or each other."""
     given = arguments.results, arguments.mask, arguments.camera, arguments.rig
     more = filter(None, (*given, *(arguments.compare or ())))
@@ -157,18 +156,18 @@ def check_files(arguments: Namespace, inputs: list[Path]) -> None:
     check_outputs(outputs_of(arguments))
 
 
-def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: Namespace) -> None:
+def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: Arguments) -> None:
     """Refuse results of other content than the scenes' clouds have, or with --force say so."""
     for scene in scenes:
         results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
         if results and scene.cloud.is_file():
             digest = scan_sha256_of([scene.cloud], options.cache_from(arguments))
             if note := check_scan(results, digest, str(scene.cloud), arguments.force):
-                print_note(arguments, f"warning: {note}")
+                arguments.note(f"warning: {note}")
 
 
 def run_scenes(
-    arguments: Namespace, path: Path, config: Localizer, scenes: Sequence[Scene], variants: Sequence[str]
+    arguments: Arguments, path: Path, config: Localizer, scenes: Sequence[Scene], variants: Sequence[str]
 ) -> tuple[list[QueryResult], int]:
     """Localize the queries that a run does not have yet; `config` is for any scan, no variants are all.
 
@@ -207,17 +206,16 @@ def run_scenes(
     return own, len(keys) - len(own)
 
 
-def select_labelled(arguments: Namespace, scene: Scene, queries: Sequence[Query]) -> list[Query]:
+def select_labelled(arguments: Arguments, scene: Scene, queries: Sequence[Query]) -> list[Query]:
     """Return the queries that have labels; say which have none."""
     for query in queries:
         if query.labels is None:
-            text = f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json"
-            print_error(arguments, text, EXIT_BAD_INPUT)
+            arguments.error(f"{scene.folder}: {scene.name_of(query)} has no labels in queries.json")
     return [query for query in queries if query.labels]
 
 
 def localize_queries(
-    arguments: Namespace,
+    arguments: Arguments,
     config: Localizer,
     scene: Scene,
     queries: Sequence[Query],
@@ -226,7 +224,7 @@ def localize_queries(
     keep: Callable[[QueryResult], None],
 ) -> None:
     """Localize queries of a scene until a signal; keep each result as it comes, or say why there is none."""
-    show = progress_bar(arguments.quiet)
+    show = arguments.progress()
     are_inside: list[bool] = []  # the cloud's box
 
     def open_scan(localizer: Localizer, num_threads: int) -> OpenedScan:
@@ -245,7 +243,7 @@ def localize_queries(
         try:
             executor, localizer = stack.enter_context(place)
         except Exception as error:
-            print_error(arguments, f"{scene.name}: {describe_failure(error)}", EXIT_BAD_INPUT)
+            arguments.error(f"{scene.name}: {describe_failure(error)}")
             return
         tasks = (localizer.task((has_labels and q.labels) or q.image, q.calibration) for q in queries)
 
@@ -258,11 +256,11 @@ def localize_queries(
                 in_box = None if result.error else is_inside
                 keep(query_result.make_query_result(scene, query, result, in_box))
             else:
-                print_error(arguments, result.error, EXIT_BAD_INPUT)
+                arguments.error(result.error)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Run or read the results, print the tables; returns the exit code."""
     check_usage(arguments)
     with checking_options():
@@ -275,7 +273,7 @@ def main(arguments: Namespace) -> int:
         return compare(arguments, thresholds)
     if arguments.results:
         results = read_results([arguments.results])
-        report = partial(print_error, arguments, exit_code=EXIT_BAD_INPUT)
+        report = arguments.error
         rows = list(query_result.match_results(scenes, results, report))
         num_failed = len(results) - len(rows)
         check_clouds(scenes, rows, arguments)

@@ -1,6 +1,6 @@
 """Animate a descent on the sampling loss: a checkerboard of panorama and cloud at each pose on the way."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from dataclasses import replace
 from io import BytesIO
@@ -12,9 +12,8 @@ import PIL.Image
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
-from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
+from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import cloud_settings_from
-from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import PackedPoints
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import pose_errors, step
@@ -127,7 +126,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read, descend, draw, write."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
@@ -141,10 +140,10 @@ def main(arguments: Namespace) -> int:
     if is_video:
         import_optional("--out", "av", "video")  # now: where it is missing, the work would be lost
 
-    workers = workers_from(arguments)
+    workers = arguments.workers()
     panorama = shrink(read_panorama(arguments.pano), PANORAMA_WIDTH)
     cloud = open_points(arguments.cloud, cloud_settings, workers)
-    print_warnings(arguments, cloud.warnings)
+    arguments.warn(cloud.warnings)
     known = read_known_poses(arguments, cloud)
     goal = known.get("true") or known["found"]
     start = perturb_pose(goal, START_DISTANCE, START_ANGLE_DEG)
@@ -163,5 +162,5 @@ def main(arguments: Namespace) -> int:
         distance, angle = pose_errors(pose, goal)
         line |= {f"{label}_distance": round(distance, 6), f"{label}_deg": round(float(np.degrees(angle)), 6)}
     line["loss"] = refined.loss if np.isfinite(refined.loss) else None
-    print_report(arguments, outputs, line)
+    arguments.report(outputs, line)
     return 0

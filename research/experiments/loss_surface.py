@@ -9,7 +9,7 @@ with L over the points that a camera at (x, y, z) sees, and the same rotations a
 
 import math
 import time
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,9 +18,8 @@ from scipy.ndimage import minimum_filter
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Array, Int64s, Mask
-from piccolo.cli.command import check_outputs, check_suffix, checking_options, command, option
+from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import add_cloud_options, cloud_settings_from
-from piccolo.cli.terminal import print_report, print_warnings, workers_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import uniform_rotations, uniform_yaws
@@ -182,7 +181,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--gravity", text, choices=["known", "unknown"], default="known")
 
 
-def read_known_poses(arguments: Namespace, cloud: LocalCloud) -> KnownPoses:
+def read_known_poses(arguments: Arguments, cloud: LocalCloud) -> KnownPoses:
     """Return the pose found and the true one of the panorama, as far as files are given."""
     name = arguments.pano.name
     known: KnownPoses = {}
@@ -199,7 +198,7 @@ def read_known_poses(arguments: Namespace, cloud: LocalCloud) -> KnownPoses:
     return known
 
 
-def grid_from(arguments: Namespace, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
+def grid_from(arguments: Arguments, cloud: LocalCloud, known: KnownPoses) -> PoseGrid:
     """Return the poses to try over all of the cloud, in the frame of the points."""
     points = cloud.points
     ends = [np.percentile(c, [0.5, 99.5]) for c in (points.x, points.y)]
@@ -240,7 +239,7 @@ def summary(surface: LossSurface, grid: PoseGrid, cloud: LocalCloud, known: Know
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Read, compute, write."""
     with checking_options():
         cloud_settings = cloud_settings_from(arguments)
@@ -252,11 +251,11 @@ def main(arguments: Namespace) -> int:
     check_outputs(outputs, filter(None, inputs))
     new_figure()  # now: where matplotlib is missing, the work would be lost
 
-    workers = workers_from(arguments)
+    workers = arguments.workers()
     panorama = shrink(read_panorama(arguments.pano), WIDTH)
     texels = pack_texels(panorama.rgb, panorama.is_valid)
     cloud = open_points(arguments.cloud, cloud_settings, workers)
-    print_warnings(arguments, cloud.warnings)
+    arguments.warn(cloud.warnings)
     known = read_known_poses(arguments, cloud)
     grid = grid_from(arguments, cloud, known)
     begin = time.perf_counter()
@@ -267,5 +266,5 @@ def main(arguments: Namespace) -> int:
     write_atomically(arguments.out, surface_png(surface, grid, cloud, known, arguments.pano.name))
     report = {"out": str(arguments.out)} | summary(surface, grid, cloud, known)
     report |= {"seconds": round(seconds, 3), "poses_per_s": round(grid.num_poses / seconds)}
-    print_report(arguments, outputs, report)
+    arguments.report(outputs, report)
     return 0

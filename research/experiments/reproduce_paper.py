@@ -5,7 +5,7 @@ The paper's figures are of its own data (Stanford2D-3D-S, OmniScenes, MPO) on an
 """
 
 import tempfile
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -20,16 +20,16 @@ from piccolo import CoarseToFineSettings, InputError, PaperSettings, Photo
 from piccolo.arrays import Array, Bytes
 from piccolo.batch.localizer import Localizer
 from piccolo.cli.command import (
+    EXIT_BAD_INPUT,
+    Arguments,
     check_distinct,
     check_folder_name,
-    check_least,
     checking_options,
     command,
     option,
 )
 from piccolo.cli.execution import check_execution
 from piccolo.cli.options import add_execution_options
-from piccolo.cli.terminal import EXIT_BAD_INPUT, print_error
 from piccolo.cloud.settings import IN_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.writers import vertex_rows, writing_ply
@@ -284,7 +284,7 @@ def file_name(condition: Condition) -> str:
 
 
 def run_condition(
-    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: Namespace
+    condition: Condition, scenes: Sequence[Scene], out: Path, arguments: Arguments
 ) -> tuple[list[QueryResult], int]:
     """Return the results under one condition, and how many queries could not be localized."""
     labels = Labels() if condition.use_labels else None
@@ -298,7 +298,7 @@ def run_condition(
             try:
                 transformed.append(condition.transform(scene, folder))
             except InputError as error:
-                print_error(arguments, str(error), EXIT_BAD_INPUT)
+                arguments.error(str(error))
                 num_failed += len(scene.queries)
         cache = CachePolicy(True, Path(temporary))
         config = Localizer((), condition.settings, cloud_settings, Photo(Path()), cache)
@@ -309,7 +309,7 @@ def run_condition(
 
 
 def run_experiment(
-    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: Namespace
+    name: str, scenes: Sequence[Scene], presets: Sequence[Settings], arguments: Arguments
 ) -> int:
     """All conditions of an experiment and its table; returns how many queries were not localized."""
     experiment = EXPERIMENTS[name]
@@ -339,9 +339,9 @@ def run_experiment(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Run the experiments one by one; returns the exit code."""
-    check_least(arguments, jobs=1, threads=1)
+    arguments.check_least(jobs=1, threads=1)
     check_folder_name("--out", arguments.out)
     with checking_options():
         check_execution(arguments)

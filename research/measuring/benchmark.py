@@ -1,8 +1,8 @@
 """Measure the method, write BENCHMARK.md, and fit the confidence."""
 
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 
-from piccolo.cli.command import HelpFormatter, add_run_options, command
+from piccolo.cli.command import Arguments, add_command, command
 
 from . import calibration, confidence, page, sensitivity
 
@@ -24,12 +24,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     subparsers = parser.add_subparsers(dest="measurement", required=True)
     for name, module in MEASUREMENTS.items():
         lines = {"help": module.__doc__, "description": module.__doc__, "epilog": module.EPILOG}
-        subparser = subparsers.add_parser(name, formatter_class=HelpFormatter, **lines)
-        module.add_arguments(subparser)
-        add_run_options(subparser)
+        module.add_arguments(add_command(subparsers, name, **lines))
 
 
 @command(__file__, __doc__, EPILOG, add_arguments, "0 done, 1 confidence found a false answer")
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Run the measurement asked for; returns the exit code."""
     return int(MEASUREMENTS[arguments.measurement].run(arguments))

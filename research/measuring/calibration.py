@@ -1,7 +1,7 @@
 """Fit the confidence to trials, and check it and the covariances on others."""
 
 import json
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,7 +11,7 @@ from scipy.optimize import minimize
 from scipy.stats import chi2
 
 from piccolo.arrays import Array
-from piccolo.cli.command import option
+from piccolo.cli.command import Arguments, option
 from piccolo.confidence import confidence
 from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED, ChoiceModel, EvidenceKind, Standing
 from piccolo.confidence.covariance import PoseCovariance
@@ -149,7 +149,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--without CASE ...", "leave these cases out", default=[])
 
 
-def run(arguments: Namespace) -> int:
+def run(arguments: Arguments) -> int:
     """Fit the weights, print the tables."""
 
     def read(paths: Sequence[Path]) -> list[Outcome]:

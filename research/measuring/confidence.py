@@ -1,7 +1,7 @@
 """Measure the status on seeded queries with and without an answer: how often each is called localized."""
 
 import json
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from typing import NamedTuple
@@ -11,8 +11,7 @@ import numpy as np
 
 from piccolo import CoarseToFineSettings, Photo
 from piccolo.arrays import Bytes, Floats, Mask, Values
-from piccolo.cli.command import option
-from piccolo.cli.terminal import print_note
+from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
@@ -205,7 +204,7 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
     yield (cloud.points + cloud.origin_world, cloud.colors), trials
 
 
-def all_trials(arguments: Namespace, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
+def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
         alike = alike_trials(seed, arguments.kinds, workers)
@@ -257,7 +256,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--threads N", "number of threads", default=num_cores())
 
 
-def run(arguments: Namespace) -> int:
+def run(arguments: Arguments) -> int:
     """Localize every trial, write its line, print the table."""
     workers = Workers(arguments.threads)
     rows: list[Case] = []
@@ -272,5 +271,5 @@ def run(arguments: Namespace) -> int:
                 rows.append((trial.case, found.status, ok))
                 file.write(json.dumps(trial_line(scene, trial, found)) + "\n")
                 file.flush()
-                print_note(arguments, f"{scene}: {trial.case}: {found.status}, {'right' if ok else 'wrong'}")
+                arguments.note(f"{scene}: {trial.case}: {found.status}, {'right' if ok else 'wrong'}")
     return 1 if print_cases("case", rows) else 0

@@ -4,7 +4,7 @@ import datetime
 import platform
 import subprocess
 import tempfile
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
@@ -17,8 +17,7 @@ from scipy.stats import chi2
 import piccolo
 from piccolo import InputError, PaperSettings, Pose, Result
 from piccolo.arrays import Bytes
-from piccolo.cli.command import check_least, option
-from piccolo.cli.terminal import print_note
+from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose_gaussian import subtract
@@ -124,7 +123,7 @@ def camera_path(scene: Scene, query: Query) -> Path:
 class Bench:
     """Measurements of one run of the command."""
 
-    def __init__(self, arguments: Namespace) -> None:
+    def __init__(self, arguments: Arguments) -> None:
         self.arguments = arguments
         scenes = [read_scene(folder) for folder in arguments.scenes]
         if empty := [scene for scene in scenes if not scene.queries]:
@@ -138,7 +137,7 @@ class Bench:
         row = QueryResult(part, query, label, None, true_pose, result)
         self.rows[part].append(row)
         end = "" if true_pose is None else ", right" if row.is_correct() else ", not right"
-        self.note(f"{part}: {label}: {query}: {result.status}{end}")
+        self.arguments.note(f"{part}: {label}: {query}: {result.status}{end}")
 
     def measure(self) -> None:
         """Localize all queries."""
@@ -225,17 +224,13 @@ class Bench:
             yield f"## Confidences\n{text}\n\n{table.markdown()}\n{wrong_lines(rows)}"
         if self.of_panoramas and "size" in self.arguments.only:
             scene = self.of_panoramas[0]
-            sizes = size_table(scene, self.arguments.points, self.arguments.rooms, self.note)
+            sizes = size_table(scene, self.arguments.points, self.arguments.rooms, self.arguments.note)
             yield f"{PARTS['size']}\n\n{sizes.markdown()}"
         if self.of_panoramas and "kernels" in self.arguments.only:
             scene = self.of_panoramas[0]
             rgb = read_panorama(scene.queries[0].image).rgb
             speeds = kernel_table(open_cloud([scene.cloud]).read(), rgb)
             yield f"{PARTS['kernels']}\n{speeds.markdown()}"
-
-    def note(self, text: str) -> None:
-        """Print progress."""
-        print_note(self.arguments, text)
 
 
 def read_foreign(scenes: Sequence[Scene]) -> list[Bytes]:
@@ -282,7 +277,7 @@ def processor_name() -> str:
     return names[0] if names else platform.processor() or platform.machine()
 
 
-def page_head(arguments: Namespace) -> str:
+def page_head(arguments: Arguments) -> str:
     """Return title, date, commit, options, versions and machine."""
     words = ["all", "--scenes", *(folder.resolve().name for folder in arguments.scenes)]
     for name in ("only", "damaged", "photos", "points", "rooms"):
@@ -314,9 +309,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--out FILE", "write the page here (default: print it)")
 
 
-def run(arguments: Namespace) -> int:
+def run(arguments: Arguments) -> int:
     """Measure, and write the page."""
-    check_least(arguments, damaged=0, photos=0)
+    arguments.check_least(damaged=0, photos=0)
     head = page_head(arguments)
     bench = Bench(arguments)
     bench.measure()

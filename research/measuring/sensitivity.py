@@ -3,7 +3,7 @@
 import importlib
 import math
 import sys
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -12,8 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from piccolo.cli.command import option
-from piccolo.cli.terminal import print_note
+from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.confidence.localization import Localization
@@ -108,7 +107,7 @@ def moved(module: str, name: str, factor: float) -> Iterator[None]:
             names[name] = value
 
 
-def list_places(arguments: Namespace, workers: Workers) -> Iterator[Place]:
+def list_places(arguments: Arguments, workers: Workers) -> Iterator[Place]:
     """Yield each scene and each seed's made rooms, prepared, with the first of their trials."""
     scenes = [read_scene(folder) for folder in arguments.scenes]
     of_scenes = []
@@ -164,7 +163,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--threads N", "number of threads", default=num_cores())
 
 
-def run(arguments: Namespace) -> int:
+def run(arguments: Arguments) -> int:
     """Measure with every constant as it is, then with each of them moved; print the table."""
     workers = Workers(arguments.threads)
     places = list(list_places(arguments, workers))
@@ -174,6 +173,6 @@ def run(arguments: Namespace) -> int:
         for name, factor in product(names, (1.0 - STEP, 1.0 + STEP)):
             with moved(module, name, factor):
                 rows.append(row_of(f"{module}.{name} x {factor:.1f}", measure(places, workers), before))
-            print_note(arguments, " ".join(rows[-1].values()))
+            arguments.note(" ".join(rows[-1].values()))
     print(table_of(rows).markdown())
     return 0

@@ -2,7 +2,7 @@
 
 import itertools
 import json
-from argparse import ArgumentParser, Namespace
+from argparse import ArgumentParser
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -10,16 +10,7 @@ import numpy as np
 
 from piccolo.camera import Calibration
 from piccolo.camera.calibration import read_cameras
-from piccolo.cli.command import (
-    UsageError,
-    check_folder_name,
-    check_least,
-    checking_options,
-    command,
-    option,
-    refuse_given,
-)
-from piccolo.cli.terminal import workers_from
+from piccolo.cli.command import Arguments, UsageError, check_folder_name, checking_options, command, option
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.export.formats import tum_lines, write_lines
 from piccolo.files.atomic import write_atomically
@@ -93,14 +84,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--video", "also write FOLDER/VARIANT_walk_K.mp4")
 
 
-def is_building(arguments: Namespace) -> bool:
+def is_building(arguments: Arguments) -> bool:
     """Return True if the rooms are to be joined."""
     return bool(arguments.storeys or arguments.walk)
 
 
-def check_usage(arguments: Namespace) -> None:
+def check_usage(arguments: Arguments) -> None:
     """Refuse options that do not go together."""
-    check_least(arguments, panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
+    arguments.check_least(panoramas=0, seed=0, scenes=0, storeys=0, walks=1)
     if arguments.twins and not is_building(arguments):
         raise UsageError("--twins: only with --storeys or --walk")
     if is_building(arguments) and "change" in arguments.variants:
@@ -108,7 +99,7 @@ def check_usage(arguments: Namespace) -> None:
     if arguments.labels and arguments.camera:
         raise UsageError("--labels: not with --camera")
     if not arguments.walk:
-        refuse_given(arguments, [name for name in OF_WALKS if getattr(arguments, name)], "only with --walk")
+        arguments.refuse_given([name for name in OF_WALKS if getattr(arguments, name)], "only with --walk")
     if not 0.0 <= arguments.walk <= MAX_LENGTH:
         raise UsageError(f"--walk: found {arguments.walk}, wanted up to {MAX_LENGTH:g} m")
     if arguments.walk and (arguments.labels or arguments.camera):
@@ -117,14 +108,14 @@ def check_usage(arguments: Namespace) -> None:
         walk_options(arguments, variant)  # refuses what can't be made
 
 
-def walk_options(arguments: Namespace, variant: str) -> WalkOptions:
+def walk_options(arguments: Arguments, variant: str) -> WalkOptions:
     """Return the options of walks of a variant."""
     a = arguments
     return WalkOptions(a.frame_rate, variant, a.people, a.blur, a.bad_frames, a.width)
 
 
 def write_photos(
-    arguments: Namespace, world: World, folder: Path, cameras: Calibration | None, workers: Workers
+    arguments: Arguments, world: World, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> list[scenes.Query]:
     """Write single photos, of each variant as many; those of a rig are a folder."""
     queries = []
@@ -149,7 +140,7 @@ def write_photos(
     return queries
 
 
-def write_walks(arguments: Namespace, office: Office, folder: Path, workers: Workers) -> list[scenes.Query]:
+def write_walks(arguments: Arguments, office: Office, folder: Path, workers: Workers) -> list[scenes.Query]:
     """Write the frames, poses and videos of all walks."""
     walker = Walker(office)
     queries: list[scenes.Query] = []
@@ -176,7 +167,7 @@ def write_walks(arguments: Namespace, office: Office, folder: Path, workers: Wor
 
 
 def write_scene(
-    arguments: Namespace, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
+    arguments: Arguments, seed: int, folder: Path, cameras: Calibration | None, workers: Workers
 ) -> dict[str, object]:
     """Make and write one scene; returns what was written."""
     office = None
@@ -209,7 +200,7 @@ def write_scene(
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
-def main(arguments: Namespace) -> int:
+def main(arguments: Arguments) -> int:
     """Make and write all scenes."""
     check_folder_name("--out", arguments.out)
     cameras = read_cameras(arguments.camera) if arguments.camera else None
@@ -219,7 +210,7 @@ def main(arguments: Namespace) -> int:
             worlds.check_cameras(cameras)
     if arguments.video:
         import_optional("--video", "av", "video")
-    workers = workers_from(arguments)
+    workers = arguments.workers()
     for number in range(max(1, arguments.scenes)):
         folder = arguments.out / f"{number:03}" if arguments.scenes else arguments.out
         line = write_scene(arguments, arguments.seed + number, folder, cameras, workers)
