@@ -1,8 +1,10 @@
-"""The exceptions of bad input and of a system that gave way, in words for a person."""
+"""The exceptions of bad input, a missing library and a system that gave way, in words for a person."""
 
 import errno
 import re
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
 # of the system's errors those of the path itself, which come again however often it is tried
 LASTING = {
@@ -46,3 +48,14 @@ def text_of(error: OSError | InputError) -> str:
 def printable(text: str) -> str:
     """Return a text on one line: control characters and bytes of names that are no text are escaped."""
     return UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
+def import_optional(what: Path | str, module_name: str, extra: str = "formats") -> ModuleType:
+    """Return the module that `what` needs, or a ResourceError that says how to install it."""
+    try:
+        return import_module(module_name)
+    except ImportError as error:
+        raise ResourceError(
+            f"{what}: needs {module_name}, which can't be imported ({error}); "
+            f"pip install 'piccolo-localize[{extra}]', in a checkout: -r requirements-{extra}.txt"
+        ) from error

@@ -44,7 +44,6 @@ LAYERS = [
     "kernels",
     "files",
     "jobs",
-    "optional",
     "arguments",
     "errors",
     "arrays",

@@ -12,7 +12,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..optional import import_optional
+from ..errors import import_optional
 from .model import MODELS, Camera
 
 READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, XML of OpenCV or Metashape"

@@ -5,10 +5,9 @@ from collections import Counter
 from dataclasses import fields
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, import_optional
 from ..files.atomic import check_output
 from ..jobs.threads import Stopwatch, num_cores
-from ..optional import import_optional
 from ..report.build import WIDTH, ReportSettings, build_report
 from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file

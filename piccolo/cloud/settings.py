@@ -7,10 +7,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..arrays import Array
-from ..errors import InputError
+from ..errors import InputError, import_optional
 from ..geometry.colors import Labels
 from ..geometry.pose import rotation_to_z
-from ..optional import import_optional
 
 # of points: what photos are compared with
 Channel = Literal["colors", "intensity", "shape"]

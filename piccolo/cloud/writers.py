@@ -11,10 +11,10 @@ from typing import IO, Any
 import numpy as np
 
 from ..arrays import Array, Bytes, Floats, Values
+from ..errors import import_optional
 from ..files.atomic import replacing, temporary_folder
 from ..geometry.pose import transform_points
 from ..jobs.memory import check_memory
-from ..optional import import_optional
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK
 from .stream import CloudStream

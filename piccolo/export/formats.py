@@ -15,7 +15,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ..errors import InputError, printable
+from ..errors import InputError, import_optional, printable
 from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
 from ..files.json_file import read_bytes
 from ..geometry.pose import (
@@ -29,7 +29,6 @@ from ..geometry.pose import (
     translation,
     turn_axes,
 )
-from ..optional import import_optional
 from ..panorama.gpano import with_pose
 from ..panorama.picture import WANTED
 from ..result import Result

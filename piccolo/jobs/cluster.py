@@ -14,8 +14,7 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from .. import __version__
-from ..errors import InputError
-from ..optional import import_optional
+from ..errors import InputError, import_optional
 from .processes import IN_FLIGHT, Function, InFlight, Opening, WorkerLostError
 
 TIMEOUT = 10.0  # [s] for a scheduler to answer, and for a first worker to be there

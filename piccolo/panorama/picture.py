@@ -25,11 +25,10 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from ..arrays import Bytes, Mask
-from ..errors import InputError, ResourceError
+from ..errors import InputError, ResourceError, import_optional
 from ..files.json_file import read_bytes
 from ..geometry.colors import Labels, label_colors
 from ..jobs.memory import check_memory
-from ..optional import import_optional
 
 WANTED = "wanted a whole JPEG, PNG, TIFF, WebP, HEIC or AVIF picture"
 MIN_WIDTH = 128

@@ -8,9 +8,8 @@ import cv2
 import numpy as np
 
 from ..arrays import Bytes
-from ..errors import InputError
+from ..errors import InputError, import_optional
 from ..jobs.memory import check_memory
-from ..optional import import_optional
 
 SHARPNESS_WIDTH = 512  # [px] at which sharpness is judged
 NEIGHBORHOOD = 0.25  # of a step, before and after its time, in which the sharpest frame is taken

@@ -10,9 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from piccolo.arrays import Array
-from piccolo.errors import printable
+from piccolo.errors import import_optional, printable
 from piccolo.export.formats import cell
-from piccolo.optional import import_optional
 from piccolo.result import Result
 
 from ..scene import Query, Scene

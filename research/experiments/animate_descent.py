@@ -15,11 +15,11 @@ from piccolo.arrays import Bytes
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.cli.options import cloud_settings_from
 from piccolo.cloud.soa import PackedPoints
+from piccolo.errors import import_optional
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import pose_errors, step
 from piccolo.jobs.threads import Workers
 from piccolo.optimize.refine import DescentSettings, Equations, Refined, make_sampling_loss, refine
-from piccolo.optional import import_optional
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.model import shrink
 from piccolo.panorama.texels import Texels, pack_texels

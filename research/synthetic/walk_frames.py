@@ -11,9 +11,9 @@ import numpy as np
 
 from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
+from piccolo.errors import import_optional
 from piccolo.files.atomic import replacing
 from piccolo.jobs.threads import Workers
-from piccolo.optional import import_optional
 
 from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
 from .office import Office

@@ -17,9 +17,8 @@ from xml.etree.ElementTree import Element, ParseError, TreeBuilder, XMLParser
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError
+from ...errors import InputError, import_optional
 from ...geometry.pose import Pose, rotation_from_quaternion_wxyz
-from ...optional import import_optional
 from .reader import quote_line
 
 MAGIC = b"ASTM-E57"

@@ -17,8 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...arrays import Array, Bytes
-from ...errors import InputError
-from ...optional import import_optional
+from ...errors import InputError, import_optional
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .reader import CHUNK, MissingChannelError, PointSource, quote_line

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Array
-from ...errors import InputError
-from ...optional import import_optional
+from ...errors import InputError, import_optional
 from ..settings import IN_METRES, CloudSettings
 from . import mesh_files
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture
