@@ -17,7 +17,7 @@ from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
-from piccolo.report.entries import collect_entries, shorten_names, unique_names
+from piccolo.report.site import collect_entries, shorten_names, unique_names
 from research.synthetic.walk_frames import writing_video
 
 STOREYS = ["--storeys", "Ground floor", "First floor"]

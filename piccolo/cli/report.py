@@ -9,9 +9,8 @@ from ..errors import InputError, import_optional
 from ..files.atomic import check_output
 from ..jobs.threads import Stopwatch, num_cores
 from ..report.build import WIDTH, ReportSettings, build_report
-from ..report.entries import collect_entries
 from ..report.plan_file import DXF, SUFFIXES, write_plan_file
-from ..report.site import check_folder
+from ..report.site import check_folder, collect_entries
 from ..scan_map.open_map import open_map
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from

@@ -25,9 +25,8 @@ from ..scan import Scan
 from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
-from .entries import Entry, collect_entries, document_of_entry, shorten_names, unique_names
+from . import site
 from .pictures import PlanImage, draw_plan, extract_frames, make_pictures, own_plan
-from .site import begin_folder, check_folder, finish_folder, picture_path, self_contained, write_photo_script
 
 FORMAT = "piccolo-report/1"
 WIDTH = 2048  # [px] of spheres
@@ -94,14 +93,14 @@ class Report(NamedTuple):
 class Task(NamedTuple):
     """A photo whose pictures are to be made."""
 
-    entry: Entry
+    entry: site.Entry
     photo: Path
     key: str
     poses: list[Pose]  # the best and the alternatives, in the map's frame
 
 
 def build_report(
-    entries: Sequence[Entry], scan_map: ScanMap, out: Path, settings: ReportSettings, workers: Workers
+    entries: Sequence[site.Entry], scan_map: ScanMap, out: Path, settings: ReportSettings, workers: Workers
 ) -> Report:
     """Write the report of results in a scan: a folder, or one file."""
     if not entries:
@@ -112,19 +111,19 @@ def build_report(
     note = check_settings(settings, scan_map, entries)
     with temporary_folder() if settings.self_contained else nullcontext(out) as folder:
         if not settings.self_contained:
-            check_folder(out)
-        begin_folder(folder)
+            site.check_folder(out)
+        site.begin_folder(folder)
         tasks = [make_task(entry, scan_map, settings) for entry in entries]
         warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
         document = {**document_of(tasks, scan_map, folder, settings), "note": note}
         if not settings.self_contained:
-            finish_folder(folder, document)
+            site.finish_folder(folder, document)
             return Report(out / "index.html", document, warnings)
-        write_atomically(out, self_contained(folder, document).encode())
+        write_atomically(out, site.self_contained(folder, document).encode())
         return Report(out, document, warnings)
 
 
-def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequence[Entry]) -> str:
+def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequence[site.Entry]) -> str:
     """Refuse storeys that are not there, and results of another scan; if forced, return words on these."""
     found = max(len(scan_map.storeys.storeys), 1)
     if settings.storeys and len(settings.storeys) != found:
@@ -137,7 +136,7 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     return check_scan(results, scan_map.scan_sha256, "that given", settings.force)
 
 
-def make_task(entry: Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
+def make_task(entry: site.Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
     """Return what is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
     photo = Path(result.pano)
@@ -158,7 +157,7 @@ def write_pictures(
 ) -> tuple[str, ...]:
     """Make the pictures that are not there yet; why some could not be made."""
     readable = [task for task in tasks if task.entry.result.status not in (UNREADABLE, FAILED)]
-    missing = [task for task in readable if not picture_path(folder, "photos", task.key).exists()]
+    missing = [task for task in readable if not site.picture_path(folder, "photos", task.key).exists()]
     todo = list({task.key: task for task in missing}.values())
     if not todo:
         return ()
@@ -174,8 +173,8 @@ def write_pictures(
             is_here = settings.images is not None or task.photo.is_absolute()
             where = "" if is_here else "; if it is in another folder, give `images` FOLDER"
             return f"{task.photo}: no pictures of it ({error}){where}"
-        write_atomically(picture_path(folder, "thumbs", task.key), thumbnail)
-        write_photo_script(folder, task.key, script)  # last: it says that both are there
+        write_atomically(site.picture_path(folder, "thumbs", task.key), thumbnail)
+        site.write_photo_script(folder, task.key, script)  # last: it says that both are there
         return ""
 
     with extract_frames([task.photo for task in todo]) as files:
@@ -187,12 +186,12 @@ def document_of(
     tasks: Sequence[Task], scan_map: ScanMap, folder: Path, settings: ReportSettings
 ) -> dict[str, Any]:
     """All that the page knows at once; writes the plans."""
-    names = unique_names([task.entry for task in tasks])
+    names = site.unique_names([task.entry for task in tasks])
     photos = []
-    for task, name, short in zip(tasks, names, shorten_names(names), strict=True):
-        has_pictures = picture_path(folder, "photos", task.key).exists()
-        thumb = f"thumbs/{task.key}.jpg" if picture_path(folder, "thumbs", task.key).exists() else None
-        entry = document_of_entry(task.entry, name, task.key, scan_map)
+    for task, name, short in zip(tasks, names, site.shorten_names(names), strict=True):
+        has_pictures = site.picture_path(folder, "photos", task.key).exists()
+        thumb = f"thumbs/{task.key}.jpg" if site.picture_path(folder, "thumbs", task.key).exists() else None
+        entry = site.document_of_entry(task.entry, name, task.key, scan_map)
         photos.append({**entry, "short": short, "hasPictures": has_pictures, "thumb": thumb})
     cloud = tasks[0].entry.result.cloud
     clouds = [Path(path).name for path in ([cloud] if isinstance(cloud, str) else cloud)]
@@ -239,7 +238,7 @@ def write_plan(plan: PlanImage, folder: Path) -> dict[str, Any]:
     """Write a plan under the name of its content: its file, size [px], matrix and metres a pixel."""
     content = encode_image(plan.pixels, ".png")
     key = hashlib.sha256(content).hexdigest()[:32]
-    write_atomically(picture_path(folder, "plans", key), content)
+    write_atomically(site.picture_path(folder, "plans", key), content)
     height, width = plan.pixels.shape[:2]
     size = {"width": width, "height": height, "pixel": float(np.hypot(plan.matrix[0], plan.matrix[1]))}
     return {"file": f"plans/{key}.png", "matrix": plan.matrix, **size}
@@ -289,5 +288,5 @@ def write_report(
     if not isinstance(opened.prepared, ScanMap):
         raise InputError("write_report: found a scan of the preset paper, wanted one of the default method")
     several = [results] if isinstance(results, str | PathLike) else results
-    entries = collect_entries([item if isinstance(item, Result) else Path(item) for item in several])
+    entries = site.collect_entries([item if isinstance(item, Result) else Path(item) for item in several])
     return build_report(entries, opened.prepared, Path(out), settings, opened.workers).page

@@ -17,8 +17,7 @@ from ..files.atomic import temporary_folder, write_atomically
 from ..panorama.picture import read_picture
 from ..scan_map.scan_map import ScanMap
 from .build import ReportSettings, Task, check_settings, document_of
-from .entries import Entry
-from .site import begin_folder
+from .site import Entry, begin_folder
 
 DXF = ".dxf"
 SUFFIXES = (".png", ".svg", ".pdf", DXF)

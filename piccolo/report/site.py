@@ -1,4 +1,4 @@
-"""The files of a report: a page that opens from disk, its data as scripts, pictures beside it.
+"""The page of a report, which opens from disk: what it says of each result, its files, its data as scripts.
 
 A page of file:// may run scripts and show images beside it, but fetch nothing, and read no pixel of them:
 what WebGL shows lies in scripts, one a photo. Names of files are digests of what they were made from, so that
@@ -8,14 +8,24 @@ what is there already need not be made again. One file holds all of it where the
 import base64
 import hashlib
 import json
+import math
 import re
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
-from ..errors import InputError
+import numpy as np
+
+from ..arrays import Array
+from ..confidence.confidence import NOT_LOCALIZED
+from ..confidence.covariance import PoseCovariance
+from ..errors import InputError, printable
 from ..files.atomic import is_stream, write_atomically
+from ..geometry.pose import Pose, heading_pitch_roll_deg
+from ..result import FAILED, UNREADABLE, Result, read_results
+from ..scan_map.scan_map import ScanMap
 
 INDEX = "index.html"
 PAGE_FILES = ("app.js", "app.css")
@@ -28,6 +38,150 @@ POLICY = (
     "script-src {script}; style-src {style}"
 )
 OWN = "'self' file:"
+CHI_SQUARE_95 = 5.991  # of two degrees of freedom
+LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
+ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
+DIGITS = 6  # of positions [m] and rotations
+EVIDENCE = ("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction", "num_matches")
+NOT_FOUND = ("pose", "storey", "height", "evidence", "spread")
+NOTHING_FOUND: dict[str, Any] = {**dict.fromkeys(NOT_FOUND), "alternatives": []}
+
+
+class Entry(NamedTuple):
+    """A result of a report."""
+
+    result: Result
+    walk: int | None  # which walk it is of, a number; None for a photo that stands alone
+    time: float  # [s] by which a walk's photos are in order; else its place in the files
+
+
+def collect_entries(items: Sequence[Path | Result]) -> list[Entry]:
+    """Return the results given and those in files; the frames of a file, or those given, are one walk."""
+    entries: list[Entry] = []
+    for number, item in enumerate(items):
+        is_given = isinstance(item, Result)
+        for result in [item] if isinstance(item, Result) else read_results([item]):
+            time = result.walk.time if result.walk else float(len(entries))
+            walk = -1 if is_given else number
+            entries.append(Entry(result, walk if result.walk else None, time))
+    return entries
+
+
+def unique_names(entries: Sequence[Entry]) -> list[str]:
+    """Return a name for each, which no other has: its path below the folder that all share."""
+    paths = [Path(entry.result.pano) for entry in entries]
+    folders = [path.parent.parts for path in paths]
+    shared = 0
+    while all(len(f) > shared and f[shared] == folders[0][shared] for f in folders):
+        shared += 1
+    names = []
+    counts = Counter[str]()
+    for path in paths:
+        name = printable("/".join(path.parts[shared:]))
+        counts[name] += 1
+        names.append(f"{name} ({counts[name]})" if counts[name] > 1 else name)
+    return names
+
+
+def shorten_names(names: Sequence[str]) -> list[str]:
+    """Return the file's own name without its ending, or the name as it is where several would be the same."""
+    own = [ENDING.sub(r"\1", name.rpartition("/")[2]) for name in names]
+    counts = Counter(own)
+    return [short if counts[short] == 1 else name for short, name in zip(own, names, strict=True)]
+
+
+def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> dict[str, Any]:
+    """Return what the page knows of a result before it is opened; angles in degrees, lengths in metres."""
+    result = entry.result
+    is_hopeless = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
+    return {
+        "name": name,
+        "key": key,
+        "status": UNREADABLE if result.status == FAILED else result.status,  # the page has no word for it
+        "confidence": round(result.confidence, 5),
+        "probabilityNone": _round(result.probability_none, 5),
+        "error": result.error and _below(result.error, result.pano, name),
+        "warnings": [_below(warning, result.pano, name) for warning in result.warnings],
+        "isOnPlan": result.best_pose is not None and not is_hopeless,
+        "scan": result.scan,
+        "captured": result.source.capture_time,
+        "size": result.source.image_size,
+        "walk": entry.walk,
+        "time": entry.time if entry.walk is not None else None,
+        "gap": bool(result.walk and result.walk.gap),
+        **(document_of_found(result, result.best_pose, scan_map) if result.best_pose else NOTHING_FOUND),
+    }
+
+
+def document_of_found(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
+    """Return what was found: the best pose, the others, and what speaks for them."""
+    poses = [best_pose, *(alternative.pose for alternative in result.alternatives)]
+    centers = np.array([scan_map.from_world(pose).center_world for pose in poses])
+    storey, height = scan_map.storeys.at(centers)
+    storeys = [int(k) if k >= 0 else None for k in storey]
+    alternatives = [
+        {
+            **pose_document(other.pose, scan_map),
+            "score": round(other.score, 3),
+            "probability": _round(other.probability, 5),
+            "scan": other.scan,
+            "storey": storey,
+        }
+        for other, storey in zip(result.alternatives, storeys[1:], strict=True)
+    ]
+    evidence = result.evidence
+    covariance = result.covariance
+    R_map_from_world = scan_map.R_map_from_world
+    return {
+        **pose_document(best_pose, scan_map),
+        "storey": storeys[0],
+        "height": None if storeys[0] is None else round(float(height[0]), 3),
+        "alternatives": alternatives,
+        "evidence": evidence and {name: _round(getattr(evidence, name), 4) for name in EVIDENCE},
+        "spread": covariance and spread_document(covariance, R_map_from_world),
+    }
+
+
+def pose_document(pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
+    """Return a pose in the plan's frame, and as the world has it."""
+    local = scan_map.from_world(pose)
+    heading, pitch, roll = heading_pitch_roll_deg(pose)
+    return {
+        "pose": {
+            "center": _list(local.center_world),
+            "rotation": _list(local.R_cam_from_world.ravel()),
+            "world": _list(pose.center_world),
+            "worldRotation": _list(pose.R_cam_from_world.ravel(), 12),
+            "angles": [round(heading, 2), round(pitch, 2), round(roll, 2)],
+        }
+    }
+
+
+def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict[str, Any]:
+    """Describe the pose's uncertainty: its 95 % ellipse on the plan [m], standard deviations, and words."""
+    level = (R_map_from_world @ covariance.matrix[3:, 3:] @ R_map_from_world.T)[:2, :2]
+    variances, axes = np.linalg.eigh(level)
+    half = np.sqrt(np.maximum(variances, 0.0) * CHI_SQUARE_95)
+    return {
+        "ellipse": [*_list(half[::-1]), round(math.degrees(math.atan2(axes[1, 1], axes[0, 1])), 2)],
+        "mm": _list(covariance.std_mm, 2),
+        "deg": _list(covariance.std_deg, 4),
+        "largest": round(1000.0 * covariance.largest_std, 2),
+        "direction": covariance.least_constrained_direction,
+    }
+
+
+def _below(words: str, pano: str, name: str) -> str:
+    """Words on a photo with its name in place of its path."""
+    return printable(words.replace(pano, name))
+
+
+def _list(values: Array, digits: int = DIGITS) -> list[float]:
+    return [round(float(value), digits) for value in values]
+
+
+def _round(value: float | None, digits: int) -> float | None:
+    return None if value is None else round(value, digits)
 
 
 def page_file(name: str) -> str:
