@@ -36,10 +36,10 @@ def fit(score, best=AS_GIVEN, best_score=None):
 def test_the_true_pose_is_among_the_readings_of_a_wrong_one(axes, direction, taken_axes):
     (pose,) = tilted_poses(1, center=np.array([11.0, -3.0, 3.5]))
     T = np.column_stack([pose.R_cam_from_world, pose.center_world])
-    true = pose_of_transform("T", T, direction, axes)
+    true = pose_of_transform("T", T, axes, direction)
     (other,) = set(DIRECTIONS) - {direction}
     for taken_direction in (direction, other):
-        taken = pose_of_transform("T", T, taken_direction, taken_axes)
+        taken = pose_of_transform("T", T, taken_axes, taken_direction)
         local = type(taken)(taken.R_cam_from_world, taken.center_world - ORIGIN)
         found = convention_variants(local, ORIGIN)
         assert any(

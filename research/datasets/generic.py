@@ -13,19 +13,7 @@ from piccolo.files.json_file import read_json, read_text
 from piccolo.geometry.pose import Pose, rotation_from_quaternion_wxyz
 from piccolo.panorama.cube import SUFFIXES
 
-from .model import (
-    AXES,
-    DIRECTIONS,
-    WORLD_FROM_CAM,
-    CloudPart,
-    ConvertOptions,
-    PosedPanorama,
-    SceneList,
-    SceneSpec,
-    array_of,
-    only_cloud_in,
-    pose_of_transform,
-)
+from . import model
 
 NAME = "generic"
 LISTS = ("poses.csv", "poses.json", "poses.txt", "poses.tum")
@@ -35,10 +23,10 @@ OWN_QUATERNION = {f"quaternion_{letter}" for letter in "wxyz"}  # of R_cam_from_
 WANTED = f"wanted rows with image, {', '.join(NUMBERS)}, direction, axes"
 
 Row = Mapping[str, str]
-Entry = tuple[Path | None, PosedPanorama]  # a row of the list: its cloud, None for the one of all
+Entry = tuple[Path | None, model.PosedPanorama]  # a row of the list: its cloud, None for the one of all
 
 
-def list_scenes(options: ConvertOptions) -> SceneList:
+def list_scenes(options: model.ConvertOptions) -> model.SceneList:
     """Return the rooms that the list names, or one by the folder's name."""
     found = [path for name in LISTS if (path := options.folder / name).exists()]
     if not options.poses and len(found) != 1:
@@ -54,10 +42,10 @@ def list_scenes(options: ConvertOptions) -> SceneList:
     if not entries:
         raise InputError(f"{path}: found no row with a picture, {WANTED}")
     specs = tuple(_scene_spec(room, entries[room], options) for room in sorted(entries))
-    return SceneList(specs, tuple(notes))
+    return model.SceneList(specs, tuple(notes))
 
 
-def _rows(path: Path, options: ConvertOptions, notes: list[str]) -> Iterator[Row]:
+def _rows(path: Path, options: model.ConvertOptions, notes: list[str]) -> Iterator[Row]:
     """Return the rows as text by column; a blank field is as good as none."""
     if path.suffix.lower() == ".json":
         document = read_json(path, WANTED)
@@ -90,10 +78,10 @@ def _rename_columns(row: dict[str, str]) -> dict[str, str]:
     inverse["qw"] = w[1:] if w.startswith("-") else f"-{w}"
     position = {f"t{letter}": row.get(letter, "") for letter in "xyz"}
     position["image"] = row.get("image", "").removeprefix("'")  # as of export's `cell`
-    return {**row, **inverse, **position, "direction": WORLD_FROM_CAM, "axes": "piccolo", "cloud": ""}
+    return {**row, **inverse, **position, "direction": model.WORLD_FROM_CAM, "axes": "piccolo", "cloud": ""}
 
 
-def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[dict[str, str]]:
+def _trajectory(path: Path, options: model.ConvertOptions, notes: list[str]) -> list[dict[str, str]]:
     """Return the lines of a TUM trajectory that have a picture named by their time."""
     folder = options.images or options.folder / "images"
     if not folder.is_dir():
@@ -109,13 +97,13 @@ def _trajectory(path: Path, options: ConvertOptions, notes: list[str]) -> list[d
         row = dict(zip(TUM_COLUMNS, fields, strict=True))
         if row["timestamp"] in pictures:
             image = str(pictures[row["timestamp"]].absolute())
-            rows.append({**row, "image": image, "direction": WORLD_FROM_CAM})
+            rows.append({**row, "image": image, "direction": model.WORLD_FROM_CAM})
     if len(rows) < len(lines):
         notes.append(f"{path}: {len(lines) - len(rows)} of {len(lines)} times without a picture")
     return rows
 
 
-def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[str, Entry]:
+def _entry(where: str, path: Path, row: Row, options: model.ConvertOptions) -> tuple[str, Entry]:
     """Return a row's room, and the row itself."""
     if missing := [name for name in ("image", *NUMBERS) if name not in row]:
         raise InputError(f"{where}: found no {missing[0]}, {WANTED}")
@@ -125,39 +113,39 @@ def _entry(where: str, path: Path, row: Row, options: ConvertOptions) -> tuple[s
         raise InputError(f"{where}: found the room {room!r}, wanted a name for a folder")
     pose = _pose(where, row, options)
     cloud = options.inside(path.parent / row["cloud"], where) if "cloud" in row else None
-    return room, (cloud, PosedPanorama(image.name, {image.name: image}, row.get("variant", NAME), pose))
+    return room, (cloud, model.PosedPanorama(image.name, {image.name: image}, row.get("variant", NAME), pose))
 
 
-def _pose(where: str, row: Row, options: ConvertOptions) -> Pose:
+def _pose(where: str, row: Row, options: model.ConvertOptions) -> Pose:
     """Return pose in a row, its direction and axes by the row or by the options, and never by guessing."""
     axes = row.get("axes", options.axes)
     direction = row.get("direction", options.direction)
-    for name, value, known in (("axes", axes, AXES), ("direction", direction, DIRECTIONS)):
+    for name, value, known in (("axes", axes, model.AXES), ("direction", direction, model.DIRECTIONS)):
         if value not in known:
             wanted = f"wanted one of {', '.join(known)} in the list, or as `{name}`"
             raise InputError(f"{where}: found the {name} {value}, {wanted}")
-    numbers = array_of(where, [row[name] for name in NUMBERS], "wanted numbers", (len(NUMBERS),))
+    numbers = model.array_of(where, [row[name] for name in NUMBERS], "wanted numbers", (len(NUMBERS),))
     length = float(np.linalg.norm(numbers[3:]))
     if not abs(length - 1.0) < 1e-2:
         raise InputError(f"{where}: found a quaternion of length {length:.3g}, wanted 1")
     T = np.column_stack([rotation_from_quaternion_wxyz(numbers[3:]), numbers[:3]])
-    return pose_of_transform(where, T, str(direction), str(axes))
+    return model.pose_of_transform(where, T, str(axes), str(direction))
 
 
-def _scene_spec(room: str, entries: list[Entry], options: ConvertOptions) -> SceneSpec:
+def _scene_spec(room: str, entries: list[Entry], options: model.ConvertOptions) -> model.SceneSpec:
     found = {cloud for cloud, _ in entries}
-    clouds = {cloud or options.cloud or only_cloud_in(options.folder) for cloud in found}
+    clouds = {cloud or options.cloud or model.only_cloud_in(options.folder) for cloud in found}
     if None in clouds:
         raise InputError(f"{options.folder}: found no cloud, wanted one, or `cloud`, or a column 'cloud'")
     if len(clouds) > 1:
         names = ", ".join(sorted(map(str, clouds))[:2])
         raise InputError(f"room {room}: found the clouds {names}, wanted one")
     panoramas = _with_unique_names([panorama for _, panorama in entries])
-    parts = tuple(CloudPart(cloud) for cloud in clouds if cloud)
-    return SceneSpec(NAME, room, parts, panoramas)
+    parts = tuple(model.CloudPart(cloud) for cloud in clouds if cloud)
+    return model.SceneSpec(NAME, room, parts, panoramas)
 
 
-def _with_unique_names(panoramas: list[PosedPanorama]) -> list[PosedPanorama]:
+def _with_unique_names(panoramas: list[model.PosedPanorama]) -> list[model.PosedPanorama]:
     """Panoramas whose pictures have names of their own, else with their number before it."""
     if len({panorama.name for panorama in panoramas}) == len(panoramas):
         return panoramas

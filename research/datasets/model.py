@@ -143,7 +143,7 @@ def array_of(where: str, value: object, wanted: str, *shapes: tuple[int, ...]) -
     return array
 
 
-def pose_of_transform(where: str, T: Array, direction: str, axes: str) -> Pose:
+def pose_of_transform(where: str, T: Array, axes: str, direction: str = WORLD_FROM_CAM) -> Pose:
     """Return the pose in a matrix (3 or 4, 4) [R | t]; `where` names the file for refusals."""
     return check_transform(T, where, AXES[axes], direction == CAM_FROM_WORLD, MAX_SKEW)
 

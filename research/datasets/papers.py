@@ -19,21 +19,7 @@ from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, move, yaw_rotation
 from piccolo.panorama.cube import SUFFIXES
 
-from .model import (
-    WORLD_FROM_CAM,
-    CloudPart,
-    ConvertOptions,
-    PosedPanorama,
-    SceneList,
-    SceneSpec,
-    array_of,
-    is_cloud,
-    labels_by_index,
-    only_cloud_in,
-    pose_of_transform,
-    read_matrix,
-    scene_list,
-)
+from . import model
 
 LOC360 = "360loc"
 QUERIES = "query_360"
@@ -84,23 +70,23 @@ def _glob(folder: Path, patterns: Iterable[str]) -> list[Path]:
     return [path for pattern in patterns for path in sorted(folder.glob(pattern))]
 
 
-def list_360loc(options: ConvertOptions) -> SceneList:
+def list_360loc(options: model.ConvertOptions) -> model.SceneList:
     """Return the scenes that have 360-degree queries, and a cloud that the user put there."""
     below = (options.folder, *sorted(options.folder.glob("*")))
     specs = []
     missing = []
     for folder in (path for path in below if (path / QUERIES).is_dir()):
         name = folder.resolve().name
-        if cloud := only_cloud_in(folder):
+        if cloud := model.only_cloud_in(folder):
             panoramas = _360loc_panoramas(options, folder)
-            specs.append(SceneSpec(LOC360, name, (CloudPart(cloud),), panoramas))
+            specs.append(model.SceneSpec(LOC360, name, (model.CloudPart(cloud),), panoramas))
         else:
             missing.append(folder.name)
     layout = f"scene with {QUERIES}/SEQUENCE/{CAMERA_POSES} and a coloured cloud beside {QUERIES}"
-    return scene_list(options.folder, specs, missing, layout)
+    return model.scene_list(options.folder, specs, missing, layout)
 
 
-def _360loc_panoramas(options: ConvertOptions, folder: Path) -> Iterator[PosedPanorama]:
+def _360loc_panoramas(options: model.ConvertOptions, folder: Path) -> Iterator[model.PosedPanorama]:
     """Yield the panoramas of all sequences: camera-to-world matrices, axes as of COLMAP."""
     for path in map(options.inside, sorted((folder / QUERIES).glob(f"*/{CAMERA_POSES}"))):
         document = read_json(path, WANTED)
@@ -108,14 +94,14 @@ def _360loc_panoramas(options: ConvertOptions, folder: Path) -> Iterator[PosedPa
             raise InputError(f"{path}: found no object, {WANTED}")
         for file, value in document.items():
             where = f"{path}, {file!r}"
-            matrix = array_of(where, value, WANTED, (4, 4), (3, 4))
+            matrix = model.array_of(where, value, WANTED, (4, 4), (3, 4))
             picture = options.inside(path.parent / "image" / Path(file).name, where)
             name = f"{path.parent.name}_{picture.name}"
-            pose = pose_of_transform(where, matrix, WORLD_FROM_CAM, "optical")
-            yield PosedPanorama(name, {name: picture}, path.parent.name, pose)
+            pose = model.pose_of_transform(where, matrix, "optical")
+            yield model.PosedPanorama(name, {name: picture}, path.parent.name, pose)
 
 
-def list_matterport(options: ConvertOptions) -> SceneList:
+def list_matterport(options: model.ConvertOptions) -> model.SceneList:
     """Return the houses with skyboxes, six faces of a cube at each place, poses and a mesh."""
     patterns = ["*/" * depth + SKYBOXES for depth in range(MAX_DEPTH)]
     specs = []
@@ -138,30 +124,30 @@ def list_matterport(options: ConvertOptions) -> SceneList:
         if len(posed) < len(places):
             count = len(places) - len(posed)
             notes.append(f"{folder}: {count} skyboxes without a pose or without six faces")
-        parts = tuple(map(CloudPart, meshes))
+        parts = tuple(map(model.CloudPart, meshes))
         panoramas = _matterport_panoramas(options, folder, posed)
-        specs.append(SceneSpec(MATTERPORT, folder.resolve().name, parts, panoramas))
-    listed = scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
+        specs.append(model.SceneSpec(MATTERPORT, folder.resolve().name, parts, panoramas))
+    listed = model.scene_list(options.folder, specs, missing, f"HOUSE/{SKYBOXES} with a mesh")
     return listed._replace(notes=(*listed.notes, *notes))
 
 
 def _matterport_panoramas(
-    options: ConvertOptions, folder: Path, places: dict[str, dict[str, Path]]
-) -> Iterator[PosedPanorama]:
+    options: model.ConvertOptions, folder: Path, places: dict[str, dict[str, Path]]
+) -> Iterator[model.PosedPanorama]:
     """Yield the skyboxes: turned as the level camera at one of its stops, in the middle of all of them.
 
     The camera's axes are right, down, forward; skybox 1 is what our cubes have in front.
     """
     for place, files in places.items():
         paths = [folder / POSE_FILES.format(place, yaw) for yaw in range(6)]
-        matrices = {path: read_matrix(options.inside(path), 4) for path in paths if path.exists()}
+        matrices = {path: model.read_matrix(options.inside(path), 4) for path in paths if path.exists()}
         T_world_from_skybox = matrices[paths[SKYBOX_YAW]].copy()
         T_world_from_skybox[:3, 3] = np.mean([matrix[:3, 3] for matrix in matrices.values()], axis=0)
-        pose = pose_of_transform(str(paths[SKYBOX_YAW]), T_world_from_skybox, WORLD_FROM_CAM, "optical")
-        yield PosedPanorama(place, files, "skybox", pose)
+        pose = model.pose_of_transform(str(paths[SKYBOX_YAW]), T_world_from_skybox, "optical")
+        yield model.PosedPanorama(place, files, "skybox", pose)
 
 
-def list_omniscenes(options: ConvertOptions) -> SceneList:
+def list_omniscenes(options: model.ConvertOptions) -> model.SceneList:
     """Return the rooms, each with the panoramas of all splits."""
     pictures: dict[tuple[str, Path], list[Path]] = defaultdict(list)
     for split in _glob(options.folder, PANORAMAS):
@@ -170,29 +156,31 @@ def list_omniscenes(options: ConvertOptions) -> SceneList:
                 files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
                 pictures[match[1], split.parent / "pcd" / f"{match[1]}.txt"] += files
     specs = [
-        SceneSpec(OMNISCENES, room, (CloudPart(cloud),), _omniscenes_panoramas(options, files))
+        model.SceneSpec(OMNISCENES, room, (model.CloudPart(cloud),), _omniscenes_panoramas(options, files))
         for (room, cloud), files in sorted(pictures.items())
         if cloud.exists()
     ]
     missing = sorted(str(cloud) for _, cloud in pictures if not cloud.exists())
     layout = "SPLIT_pano/HOW_ROOM_N_scene_K with a cloud pcd/ROOM_N.txt"
-    return scene_list(options.folder, specs, missing, layout)
+    return model.scene_list(options.folder, specs, missing, layout)
 
 
-def _omniscenes_panoramas(options: ConvertOptions, pictures: list[Path]) -> Iterator[PosedPanorama]:
+def _omniscenes_panoramas(
+    options: model.ConvertOptions, pictures: list[Path]
+) -> Iterator[model.PosedPanorama]:
     """Panoramas with the pose [R_cam_from_world | center_world] of a file of their own, in our own axes."""
     for path in pictures:
         split = path.parents[1]
         variant = split.name.removesuffix("_pano")
         pose_file = split.parent / f"{variant}_pose" / path.parent.name / f"{path.stem}.txt"
-        matrix = read_matrix(options.inside(pose_file), 3)
+        matrix = model.read_matrix(options.inside(pose_file), 3)
         matrix[:, :3] = matrix[:, :3].T.copy()
-        pose = pose_of_transform(str(pose_file), matrix, WORLD_FROM_CAM, "piccolo")
+        pose = model.pose_of_transform(str(pose_file), matrix, "piccolo")
         name = f"{variant}_{path.parent.name}_{path.name}"
-        yield PosedPanorama(name, {name: path}, variant, pose)
+        yield model.PosedPanorama(name, {name: path}, variant, pose)
 
 
-def list_mpo(options: ConvertOptions) -> SceneList:
+def list_mpo(options: model.ConvertOptions) -> model.SceneList:
     """Each scan with a picture of the same name beside it.
 
     All true poses are the identity, so each scan and its camera get a random rigid transform: a turn about z
@@ -204,7 +192,7 @@ def list_mpo(options: ConvertOptions) -> SceneList:
     specs = []
     num_alone = 0
     for stem, found in files.items():
-        clouds = [path for path in found if is_cloud(path)]
+        clouds = [path for path in found if model.is_cloud(path)]
         pictures = [path for path in found if path.suffix.lower() in SUFFIXES]
         picture = min(pictures, key=lambda path: path.suffix.lower() not in (".jpg", ".jpeg"), default=None)
         if not clouds or picture is None:
@@ -218,12 +206,12 @@ def list_mpo(options: ConvertOptions) -> SceneList:
         T[:3, :3] = yaw_rotation(rng.uniform(0.0, math.pi)).T
         T[:3, 3] = rng.uniform(0.0, 3.0, 3)
         pose = Pose(np.eye(3), np.zeros(3))  # at the scanner's origin, with the scanner's axes
-        panorama = PosedPanorama(picture.name, {picture.name: picture}, "moved", pose)
+        panorama = model.PosedPanorama(picture.name, {picture.name: picture}, "moved", pose)
         source: dict[str, object] = {"seed": options.seed}
-        specs.append(SceneSpec(MPO, name, (CloudPart(clouds[0]),), iter([panorama]), T, source))
+        specs.append(model.SceneSpec(MPO, name, (model.CloudPart(clouds[0]),), iter([panorama]), T, source))
     if not specs:
         raise InputError(f"{options.folder}: found no cloud with a picture of the same name")
-    return SceneList(tuple(specs), (f"{num_alone} clouds without a picture",) if num_alone else ())
+    return model.SceneList(tuple(specs), (f"{num_alone} clouds without a picture",) if num_alone else ())
 
 
 class Picture(NamedTuple):
@@ -235,7 +223,7 @@ class Picture(NamedTuple):
     semantic: Path
 
 
-def list_stanford(options: ConvertOptions) -> SceneList:
+def list_stanford(options: model.ConvertOptions) -> model.SceneList:
     """Return the rooms for which there are panoramas and a cloud."""
     table = _read_table(options) if options.labels else None
     specs = []
@@ -249,11 +237,11 @@ def list_stanford(options: ConvertOptions) -> SceneList:
             if options.labels:
                 settings["label_names"] = ["unknown", *CLASSES]
             panoramas = _stanford_panoramas(options, pictures, table)
-            specs.append(SceneSpec(STANFORD, name, parts, panoramas, settings=settings))
+            specs.append(model.SceneSpec(STANFORD, name, parts, panoramas, settings=settings))
         else:
             missing.append(name)
     layout = f"room with panoramas ({AREA_PANORAMAS[0]}) and a cloud ({CLOUDS[0]}, with `labels` Annotations)"
-    return scene_list(options.folder, specs, missing, layout)
+    return model.scene_list(options.folder, specs, missing, layout)
 
 
 def _stanford_pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
@@ -278,7 +266,7 @@ def _stanford_pictures(folder: Path) -> dict[tuple[str, str], list[Picture]]:
     return pictures
 
 
-def _stanford_cloud(folder: Path, area: str, room: str, has_labels: bool) -> tuple[CloudPart, ...]:
+def _stanford_cloud(folder: Path, area: str, room: str, has_labels: bool) -> tuple[model.CloudPart, ...]:
     """Return the room's points, one `x y z r g b` a line; with labels, an object a file named by class."""
     found = _glob(folder, [pattern.format(area=area, room=room) for pattern in CLOUDS])
     usable = [path for path in found if not any(ALIGNED in part for part in path.parts)]
@@ -286,21 +274,21 @@ def _stanford_cloud(folder: Path, area: str, room: str, has_labels: bool) -> tup
         text = f"found a cloud of the {ALIGNED}, whose rooms are rotated one by one"
         raise InputError(f"{found[0]}: {text}, wanted those of Stanford3dDataset_v1.2")
     if not has_labels:
-        return tuple(CloudPart(path) for path in usable[:1])
+        return tuple(model.CloudPart(path) for path in usable[:1])
     objects = [path for cloud in usable[:1] for path in sorted(cloud.parent.glob("Annotations/*.txt"))]
-    return tuple(CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
+    return tuple(model.CloudPart(path, NUMBERS.get(path.name.split("_")[0], 0)) for path in objects)
 
 
 def _stanford_panoramas(
-    options: ConvertOptions, pictures: list[Picture], table: Uint16s | None
-) -> Iterator[PosedPanorama]:
+    options: model.ConvertOptions, pictures: list[Picture], table: Uint16s | None
+) -> Iterator[model.PosedPanorama]:
     for picture in pictures:
         semantic = options.inside(picture.semantic)
         options.inside(picture.pose)
-        read_labels = None if table is None else partial(labels_by_index, semantic, table)
+        read_labels = None if table is None else partial(model.labels_by_index, semantic, table)
         name = picture.path.name
         variant = f"area_{picture.part}"
-        yield PosedPanorama(name, {name: picture.path}, variant, _read_pose(picture), read_labels)
+        yield model.PosedPanorama(name, {name: picture.path}, variant, _read_pose(picture), read_labels)
 
 
 def _read_pose(picture: Picture) -> Pose:
@@ -313,15 +301,16 @@ def _read_pose(picture: Picture) -> Pose:
     if not isinstance(document, dict) or not all(name in document for name in names):
         raise InputError(f"{picture.pose}: found no {' and '.join(names)}, {WANTED_POSE}")
     angles, center_world = (
-        array_of(f"{picture.pose}, {name}", document[name], "wanted three numbers", (3,)) for name in names
+        model.array_of(f"{picture.pose}, {name}", document[name], "wanted three numbers", (3,))
+        for name in names
     )
     R_world_from_opengl = Rotation.from_euler("xyz", angles).as_matrix()  # about fixed axes, x first
     T = np.column_stack([R_world_from_opengl, center_world])
-    pose = pose_of_transform(str(picture.pose), T, WORLD_FROM_CAM, "opengl")
+    pose = model.pose_of_transform(str(picture.pose), T, "opengl")
     return move(pose, T_SCAN_FROM_5B, 1.0) if picture.part == "5b" else pose
 
 
-def _read_table(options: ConvertOptions) -> Uint16s:
+def _read_table(options: model.ConvertOptions) -> Uint16s:
     """Return the class of each index in the semantic pictures."""
     found = _glob(options.folder, LABEL_FILES)
     if not found:
