@@ -51,11 +51,6 @@ from .photometric import PhotometricSettings
 SceneTransform = Callable[[Scene, Path], Scene]
 
 
-def identity(scene: Scene, folder: Path) -> Scene:
-    """Return the scene itself."""
-    return scene
-
-
 def thin(scene: Scene, folder: Path, fraction: float = 1.0, num_points: int | None = None) -> Scene:
     """Return a number or a fraction of the points, drawn at random; InputError where there are fewer."""
     cloud = open_cloud([scene.cloud], IN_COLORS).read()
@@ -119,7 +114,7 @@ class Condition(NamedTuple):
 
     name: str
     settings: Settings
-    transform: SceneTransform = identity
+    transform: SceneTransform | None = None
     variants: tuple[str, ...] = ()  # the queries that it is about; empty for all
     use_labels: bool = False
     paper: str = "-"  # what the paper has in this place
@@ -296,7 +291,7 @@ def run_condition(
             folder = Path(temporary) / str(number)
             folder.mkdir()
             try:
-                transformed.append(condition.transform(scene, folder))
+                transformed.append(condition.transform(scene, folder) if condition.transform else scene)
             except InputError as error:
                 arguments.error(str(error))
                 num_failed += len(scene.queries)
