@@ -164,17 +164,12 @@ NUM_ROTATIONS = 1000  # of SO(3)
 HEIGHTS_ABOUT = (-0.15, 0.0, 0.15)  # [m] of the known one
 
 
-def add_photo_options(parser: ArgumentParser) -> None:
-    """Add the options of a panorama in a scan whose pose `read_known_poses` may find."""
+def add_arguments(parser: ArgumentParser) -> None:
+    """All options."""
     add_cloud_options(parser, "coloured scan as for localize.py, or a map of tools/prepare_map.py")
     option(parser, "--pano FILE", "the panorama", required=True)
     option(parser, "--result FILE", "result of localize.py with the estimated pose")
     option(parser, "--truth FILE", "queries.json with the true pose")
-
-
-def add_arguments(parser: ArgumentParser) -> None:
-    """All options."""
-    add_photo_options(parser)
     option(parser, "--out PNG", "write the picture here; - is stdout", required=True)
     option(parser, "--step M", "spacing of the grid", default=0.2)
     text = "known: rotations about z only; unknown: all of SO(3)"

@@ -1,4 +1,0 @@
-#!/usr/bin/env python3
-from _checkout import run
-
-run(__name__, "research.experiments.animate_descent")
