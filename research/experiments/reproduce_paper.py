@@ -151,8 +151,8 @@ def conditions_of(
         own = {field: value for field, value in case.items() if field in Condition._fields}
         settings = {field: value for field, value in case.items() if field not in (*own, "kind")}
         for preset in presets:
-            kind = case.get("kind", type(preset))
-            found.append(Condition(name, kind(**vars(preset) | settings), **own))
+            base = case["kind"](**vars(preset)) if "kind" in case else preset
+            found.append(Condition(name, replace(base, **settings), **own))
     return found
 
 
