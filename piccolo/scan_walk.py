@@ -23,7 +23,7 @@ from .result import Result, with_localization
 from .scan_map.scan_map import add_places, check_within
 from .walk.frames import Frame, Motion, check_times
 from .walk.path import believe
-from .walk.results import WalkFrame, describe_frame, finish, make_localization, make_localizations
+from .walk.results import WalkFrame, describe_frame, make_localization, make_localizations
 from .walk.tracker import Tracker
 
 NO_REFINING = "`refine_focal`: not an option of walks; refine the focal length with a single photo"
@@ -157,7 +157,7 @@ class Walk:
 
     def finish(self, show: Progress = no_progress) -> list[Result]:
         """Return the result of each frame, given all frames."""
-        found = make_localizations(self.tracker, *finish(self.tracker, show))
+        found = make_localizations(self.tracker, show)
         return [self._result(blank, *parts) for blank, parts in zip(self.blanks, found, strict=True)]
 
     def _result(self, blank: Result, found: Localization, walk: WalkFrame) -> Result:

@@ -6,7 +6,7 @@ These are COLMAP's cameras.txt and rig_config.json, OpenSfM's camera_models.json
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
@@ -251,18 +251,9 @@ def read_mounts(document: Mapping[str, Any]) -> tuple[Mount, ...]:
 
 def _entry_of(mount: Mount) -> dict[str, object]:
     """One camera; what is as usual is left out."""
-    camera = mount.camera
-    entry: dict[str, object] = {"model": camera.model, "width": camera.width, "height": camera.height}
-    entry["params"] = list(camera.params)
-    if camera.max_angle_deg is not None:
-        entry["max_angle_deg"] = camera.max_angle_deg
-    if mount.R_lens_from_cam != IDENTITY:
-        entry["R_lens_from_cam"] = [list(row) for row in mount.R_lens_from_cam]
-    if any(mount.center_cam):
-        entry["center_cam"] = list(mount.center_cam)
-    if any(mount.offset):
-        entry["offset"] = list(mount.offset)
-    return entry if mount.image is None else {**entry, "image": mount.image}
+    usual = vars(Mount(mount.camera))
+    camera = {name: value for name, value in asdict(mount.camera).items() if value is not None}
+    return camera | {name: value for name, value in vars(mount).items() if value != usual[name]}
 
 
 def _mount_of(entry: Mapping[str, Any]) -> Mount:

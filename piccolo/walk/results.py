@@ -56,9 +56,10 @@ class WalkFrame:
 
 
 def make_localizations(
-    tracker: Tracker, path: Path, beliefs: Sequence[Belief]
+    tracker: Tracker, show: Progress = no_progress
 ) -> list[tuple[Localization, WalkFrame]]:
-    """Return the result of each frame of a walk, poses smoothed together."""
+    """Return the result of each frame of a walk, given all frames; poses are smoothed together."""
+    path, beliefs = finish(tracker, show)
     frames = tracker.frames
     motion = tracker.motion
     found = [make_localization(tracker, f, belief) for f, belief in zip(frames, beliefs, strict=True)]
@@ -197,7 +198,7 @@ def move_pose(located: PoseGaussian, move: Array, variance: Array) -> PoseGaussi
 
 
 @one_blas_thread()
-def finish(tracker: Tracker, show: Progress = no_progress) -> tuple[Path, list[Belief]]:
+def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Belief]]:
     """Find the path of all frames of a tracker, and what each may be.
 
     The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
