@@ -18,7 +18,6 @@ from piccolo.cli.command import (
     Arguments,
     Terminated,
     UsageError,
-    check_distinct,
     check_outputs,
     check_suffix,
     checking_options,
@@ -152,8 +151,7 @@ def check_files(arguments: Arguments, inputs: list[Path]) -> None:
     """Refuse outputs that would replace an input, a run or each other."""
     given = arguments.results, arguments.mask, arguments.camera, arguments.rig
     more = filter(None, (*given, *(arguments.compare or ())))
-    check_distinct({"--out": arguments.out, **outputs_of(arguments)}, [*inputs, *more])
-    check_outputs(outputs_of(arguments))
+    check_outputs({"--out": arguments.out, **outputs_of(arguments)}, [*inputs, *more])
 
 
 def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments: Arguments) -> None:
