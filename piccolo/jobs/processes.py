@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
@@ -32,6 +33,9 @@ MAX_POLLS = 1000
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
 CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = {signal.SIGINT, signal.SIGTERM}  # are for this process, which ends the others
+HAS_MASKS = hasattr(signal, "pthread_sigmask")  # not on Windows
+# in a thread, and so, from their first moment on, in the processes that it starts
+block_signals = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS) if HAS_MASKS else None
 Worker = tuple[ProcessPoolExecutor, BaseProcess]  # a pool of one process, and this
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 Function = Callable[[Any], Any]  # of an item
@@ -44,12 +48,12 @@ class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
 
 
+@dataclass
 class Here:
     """Works on one item after another in this process, on each when its value is asked for."""
 
-    def __init__(self, function: Function, items: Iterable[Any] = ()) -> None:
-        self.function = function
-        self.items = items
+    function: Function
+    items: Iterable[Any] = ()
 
     def values(self, items: Iterator[Any]) -> "Here":
         """Begin with the items."""
@@ -120,11 +124,9 @@ class Processes:
         self._children: list[BaseProcess] = []
         self._starting = threading.Lock()
         self._is_closed = False
-        resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
-        # What a thread blocks, its processes do from their first moment on.
-        self._threads = ThreadPoolExecutor(
-            num_processes, initializer=signal.pthread_sigmask, initargs=(signal.SIG_BLOCK, SIGNALS)
-        )
+        if block_signals:
+            resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
+        self._threads = ThreadPoolExecutor(num_processes, initializer=block_signals)
 
     def values(self, items: Iterator[Any]) -> InFlight:
         """Begin with the items."""
@@ -215,6 +217,8 @@ class _Own:
 
 
 def _begin(opening: Opening) -> None:
+    for number in () if HAS_MASKS else SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     share_arenas()
     _Own.opening = opening
