@@ -30,11 +30,10 @@ WAITS_S = (0.01, 0.1, 0.5) if IS_WINDOWS else ()  # which replaces no file that 
 
 def is_stdout(path: Path) -> bool:
     """Return True for -, /dev/stdout, and any other name of what stdout is; not for /dev/null."""
-    try:
-        is_same = sys.stdout is not None and os.path.samestat(path.stat(), os.fstat(1))
-    except OSError:  # there is no such file, or no stdout
-        is_same = False
-    return path == STDOUT or (is_same and os.path.realpath(path) != os.devnull)
+    with suppress(OSError):  # there is no such file, or no stdout
+        if sys.stdout is not None and os.path.samestat(path.stat(), os.fstat(1)):
+            return os.path.realpath(path) != os.devnull
+    return path == STDOUT
 
 
 def is_stream(path: Path) -> bool:

@@ -10,7 +10,6 @@ import os
 import pickle
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -28,8 +27,6 @@ from .memory import share_arenas
 ATTEMPTS = 2  # to work on an item, or to open
 IN_FLIGHT = 4  # items a process, so that none waits for a slow one before
 PARENT_LOST = 1  # exit code
-POLL_S = 0.001
-MAX_POLLS = 1000
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
 CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = {signal.SIGINT, signal.SIGTERM}  # are for this process, which ends the others
@@ -150,7 +147,7 @@ class Processes:
             try:
                 return pool.submit(_value_of, item).result()
             except BrokenProcessPool:
-                end = self._end_of(child)
+                end = self._end_of(pool, child)
         raise WorkerLostError(f"each of {ATTEMPTS} processes at work on it {end}")
 
     def _worker(self) -> Worker:
@@ -169,32 +166,23 @@ class Processes:
             try:
                 opened.result()
             except BrokenProcessPool:
-                end = self._end_of(child)
+                end = self._end_of(pool, child)
                 continue
             self._own.worker = pool, child
             return pool, child
         advice = "use fewer processes or more memory"
         raise InputError(f"`jobs`: a process {end} while it opened the scan; {advice}")
 
-    def _end_of(self, child: BaseProcess) -> str:
+    def _end_of(self, pool: ProcessPoolExecutor, child: BaseProcess) -> str:
         """Return how a process ended; raises CancelledError if that was by `close`."""
         with self._starting:
             if self._is_closed:
                 raise CancelledError
             self._children.remove(child)
         vars(self._own).pop("worker", None)
-        code = _exit_code_of(child)
+        pool.shutdown()  # whose thread waits for the process, and then has its exit code
+        code = child.exitcode or 0
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-
-
-def _exit_code_of(child: BaseProcess) -> int:
-    """Wait for a process; its pool's thread, which waits too, may have its exit code a moment earlier."""
-    child.join()
-    for _ in range(MAX_POLLS):
-        if child.exitcode is not None:
-            return child.exitcode
-        time.sleep(POLL_S)
-    return 0
 
 
 @contextmanager
