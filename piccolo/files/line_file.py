@@ -6,7 +6,7 @@ A journal is such a file of the steps of a job, so that a stopped job goes on wh
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, TypeVar
@@ -58,34 +58,29 @@ class LineFile:
     """A file of lines that this process alone may write."""
 
     def __init__(self, path: Path) -> None:
-        """Open it, made if there is none."""
         self.path = path
-        self._stream = path.open("a+b", buffering=0)
+        self.stream = path.open("a+b", buffering=0)
 
     @property
     def size(self) -> int:
         """Bytes in the file."""
-        return os.fstat(self._stream.fileno()).st_size
-
-    def close(self) -> None:
-        """Close it."""
-        self._stream.close()
+        return os.fstat(self.stream.fileno()).st_size
 
     def cut(self, size: int) -> None:
         """Keep the first `size` bytes."""
-        self._stream.truncate(size)
+        self.stream.truncate(size)
 
     def read(self, begin: int, end: int) -> bytes:
         """Return a span of bytes."""
-        self._stream.seek(begin)
-        return self._stream.read(end - begin)
+        self.stream.seek(begin)
+        return self.stream.read(end - begin)
 
     def append(self, line: str) -> None:
         """Append a line at once; one that does not fit on the disk is taken back, the others stay whole."""
         begin = self.size
         try:
-            write_line(self._stream.fileno(), self.path, line)
-            os.fsync(self._stream.fileno())
+            write_line(self.stream.fileno(), self.path, line)
+            os.fsync(self.stream.fileno())
         except OSError:
             self.cut(begin)
             raise
@@ -98,8 +93,8 @@ class LineFile:
         with replacing(self.path) as file:
             for begin, end in spans:
                 file.write(self.read(begin, end))
-            self.close()  # Windows replaces no open file
-        self._stream = self.path.open("a+b", buffering=0)
+            self.stream.close()  # Windows replaces no open file
+        self.stream = self.path.open("a+b", buffering=0)
 
 
 @contextmanager
@@ -110,10 +105,11 @@ def open_locked(path: Path) -> Iterator[LineFile]:
     """
     with hold_lock(path):
         is_new = not path.exists()
+        file = LineFile(path)
         try:
-            with closing(LineFile(path)) as file:
-                yield file
+            yield file
         finally:
+            file.stream.close()
             if is_new and path.exists() and path.stat().st_size == 0:
                 path.resolve().unlink()
 

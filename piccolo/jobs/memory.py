@@ -60,8 +60,7 @@ def check_address_space() -> None:
     """Raise a MemoryError where `ulimit -v` leaves too little for errors to be raised as they should."""
     left = free_of_process()
     if left < LEAST_LEFT:
-        wanted = f"wanted {LEAST_LEFT / GB:g} or more"
-        raise MemoryError(f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, {wanted}")
+        raise MemoryError(f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more")
 
 
 def limit_of_process() -> float:

@@ -156,11 +156,11 @@ class Processes:
         if own:
             return own
         for _ in range(ATTEMPTS):
-            pool = ProcessPoolExecutor(1, CONTEXT, initializer=_begin, initargs=(self.opening,))
+            pool = ProcessPoolExecutor(1, CONTEXT, initializer=_begin)
             with self._starting, library_threads(self.num_threads):
                 if self._is_closed:
                     raise CancelledError
-                opened = pool.submit(_open)
+                opened = pool.submit(_open, self.opening)
                 (child,) = pool._processes.values()
                 self._children.append(child)
             try:
@@ -198,23 +198,21 @@ def library_threads(count: int) -> Iterator[None]:
 
 
 class _Own:
-    """The opening and the function of this process."""
+    """The function of this process."""
 
-    opening: Opening
     function: Function
 
 
-def _begin(opening: Opening) -> None:
-    for number in () if HAS_MASKS else SIGNALS:
+def _begin() -> None:
+    for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     share_arenas()
-    _Own.opening = opening
 
 
-def _open() -> None:
+def _open(opening: Opening) -> None:
     with _raising_what_can_be_sent():
-        _Own.function = _Own.opening()
+        _Own.function = opening()
 
 
 def _value_of(item: object) -> Any:
