@@ -58,9 +58,9 @@ def memory_taken() -> float:
 
 def check_address_space() -> None:
     """Raise a MemoryError where `ulimit -v` leaves too little for errors to be raised as they should."""
-    left = free_of_process()
+    left = max(free_of_process(), 0.0)
     if left < LEAST_LEFT:
-        raise MemoryError(f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more")
+        raise MemoryError(f"ulimit -v leaves {left / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more")
 
 
 def limit_of_process() -> float:
