@@ -1,4 +1,4 @@
-"""Checks of the values of options against their annotations."""
+"""Values that options may have, for those who show and who read them; checks against annotations."""
 
 import inspect
 import types
@@ -11,6 +11,14 @@ import numpy as np
 
 from .errors import InputError
 
+Projection = Literal["equirectangular", "pinhole", "fisheye", "cylindrical"]
+PICTURES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".heif", ".insp")  # suffixes
+EXIF = "exif"  # sources of the times of a walk's frames
+NAMES = "names"
+ORDER = "order"
+MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
+MAX_STEP = 5.0  # [m] from one frame without time to the next
+MIN_CONFIDENCE = 0.9  # from which a pose is localized
 WORDS = {
     str: "a text",
     PathLike: "a path",

@@ -5,11 +5,10 @@ from collections.abc import Sequence
 from dataclasses import KW_ONLY, asdict, dataclass, fields, replace
 from os import PathLike
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
-from .arguments import check_fields
+from .arguments import Projection, check_fields
 from .arrays import Bytes, Mask
 from .camera import Calibration, Mount
 from .camera.calibration import IDENTITY, find_calibration, open_calibration, read_rig
@@ -17,7 +16,6 @@ from .errors import InputError
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
 MAX_FOCAL_PX = 1e6
-Projection = Literal["equirectangular", "pinhole", "fisheye", "cylindrical"]
 File = str | PathLike[str]
 Vector = tuple[float, float, float]
 HEADING_TOLERANCE_DEG = 20.0

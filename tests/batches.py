@@ -1,5 +1,7 @@
 """Batches in processes of their own, watched by tests."""
 
+import contextlib
+import io
 import re
 import subprocess
 import sys
@@ -9,6 +11,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PAPER = ["--preset", "paper", "num_translations=4", "num_iterations=5", "max_points=5000"]
+
+WORK = (  # of the main commands, in a folder beside that of a room
+    "prepare_map --cloud ../room/cloud.ply --out a.map",
+    "localize --cloud a.map --pano ../room/images/clean_0.jpg --out poses.jsonl",
+    "localize --cloud a.map --pano ../room/images --out poses.jsonl",
+    "export_poses --results poses.jsonl --format tum --out poses.tum",
+    "align_gravity --cloud ../room/cloud.ply --out aligned.ply",
+    "report --results poses.jsonl --cloud a.map --cache none --out report",
+)
 
 
 def command_of(script, *words):
@@ -50,3 +61,11 @@ def wait_for_lines(process, out, count):
     while not out.exists() or out.read_bytes().count(b"\n") < count:
         assert process.poll() is None
         time.sleep(0.01)
+
+
+def work():
+    """Run the commands in this process, with their files in its folder."""
+    for line in WORK:
+        name, *words = line.split()
+        with contextlib.redirect_stdout(io.StringIO()):
+            assert import_module(f"piccolo.cli.{name}").main([*words, "--quiet"]) == 0, line

@@ -1,5 +1,4 @@
 import contextlib
-import fcntl
 import os
 import signal
 import subprocess
@@ -7,6 +6,7 @@ import sys
 import threading
 from pathlib import Path
 
+import filelock
 import numpy as np
 import pytest
 from batches import run
@@ -244,21 +244,58 @@ def test_two_processes_do_not_write_one_file(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_file_that_was_removed_before_it_was_locked_is_opened_again(tmp_path, monkeypatch):
-    """The first of two writes nothing and removes the file, which the second has opened before."""
+def test_a_lock_whose_file_was_removed_before_it_was_taken_is_taken_again(tmp_path, monkeypatch):
+    """The first of two ends, and removes the lock's file, which the second has opened before."""
     out = tmp_path / "poses.jsonl"
-    flock = fcntl.flock
+    lock_descriptor = filelock.lock_descriptor
     first = contextlib.ExitStack()
     first.enter_context(open_locked(out))
 
-    def flock_late(handle, how):
+    def lock_late(handle, blocking):
         first.close()
-        flock(handle, how)
+        return lock_descriptor(handle, blocking=blocking)
 
-    monkeypatch.setattr(fcntl, "flock", flock_late)
+    monkeypatch.setattr(filelock, "lock_descriptor", lock_late)
     with open_locked(out) as file:
         file.append("{}")
+        assert len(list(tmp_path.iterdir())) == 2
+    assert list(tmp_path.iterdir()) == [out]
     assert out.read_text() == "{}\n"
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from piccolo.files.line_file import open_locked
+with open_locked(Path(sys.argv[1])) as file:
+    file.append("{}")
+    print(flush=True)
+    time.sleep(600)
+"""
+
+
+def test_the_lock_of_a_killed_process_is_free(tmp_path):
+    out = tmp_path / "poses.jsonl"
+    with subprocess.Popen([sys.executable, "-c", HOLD, out], cwd=ROOT, stdout=subprocess.PIPE) as process:
+        process.stdout.readline()
+        with pytest.raises(InputError, match="another process is writing it"), open_locked(out):
+            pass
+        process.kill()
+    with open_locked(out) as file:
+        file.append("[]")
+    assert out.read_text() == "{}\n[]\n"
+    assert list(tmp_path.iterdir()) == [out]
+
+
+def test_lines_are_rearranged_and_more_follow(tmp_path):
+    out = tmp_path / "a.jsonl"
+    with open_locked(out) as file:
+        for line in "abc":
+            file.append(line)
+        file.rearrange([(4, 6), (0, 2)])
+        file.append("d")
+        assert file.read(0, file.size) == b"c\na\nd\n"
+    assert out.read_text() == "c\na\nd\n"
 
 
 def test_a_full_disk_keeps_the_lines_before(tmp_path):

@@ -271,7 +271,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
 def test_importing_writes_nothing(tmp_path):
     folders = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
     environment = {**os.environ, **folders, "PYTHONDONTWRITEBYTECODE": "1"}
-    command = [sys.executable, "-c", "import piccolo.cli.localize, research.evaluation.evaluate"]
+    command = [sys.executable, "-c", "import piccolo.cli.photo_run, research.evaluation.evaluate"]
     subprocess.run(command, cwd=ROOT, env=environment, check=True)
     assert list(tmp_path.iterdir()) == []
 

@@ -128,4 +128,4 @@ def test_a_cluster_that_is_none_is_told_in_one_line(scene, tmp_path, monkeypatch
     assert localize.main([*words, "--dask", "x"]) == 3
     err = capsys.readouterr().err
     assert "--dask: needs distributed" in err
-    assert "pip install 'piccolo-localize[distributed]'" in err
+    assert "pip install 'piccolo-localize[cluster]'" in err

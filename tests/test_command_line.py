@@ -1,6 +1,7 @@
 """The options that say what a cloud is, what all commands share, and progress."""
 
 import ctypes
+import importlib.metadata
 import json
 import runpy
 import signal
@@ -15,9 +16,10 @@ import pytest
 from batches import ROOT
 from rooms import errors, query, room
 
-from piccolo.cli import localize, prepare_map, terminal
+from piccolo.cli import localize, photo_run, prepare_map, terminal
 from piccolo.cli.command import UsageError, checking_options, command, new_parser, parse
-from piccolo.cli.options import add_arguments, cloud_settings_from
+from piccolo.cli.options import add_arguments
+from piccolo.cli.settings import cloud_settings_from
 from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import IN_METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError
@@ -110,10 +112,10 @@ def test_a_warning_is_written_once_whenever_it_comes(monkeypatch, capsys, quiet)
         prepared = SimpleNamespace(scan_sha256="")
         return SimpleNamespace(warnings=("early", "set `up` to -y"), prepared=prepared)
 
-    monkeypatch.setattr(localize.Localizer, "open_scan", opened)
-    run = localize.prepare_run(_parse(*["--quiet"] * quiet))
+    monkeypatch.setattr(photo_run.Localizer, "open_scan", opened)
+    run = photo_run.prepare_run(_parse(*["--quiet"] * quiet))
     with terminal.showing_log(quiet):
-        localize.open_scan(run, run.localizer, 1)
+        photo_run.open_scan(run, run.localizer, 1)
     assert capsys.readouterr().err == ("" if quiet else "warning: early\nwarning: set --up to -y\n")
 
 
@@ -204,3 +206,14 @@ def test_progress_says_step_and_time_left(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: False)
     assert list(show(iter([1, 2]), 2, "write")) == [1, 2]
     assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("package", ["opencv-python", "nothing"])
+def test_two_packages_of_opencv_are_told_of_in_a_line(monkeypatch, capsys, package):
+    distribution = importlib.metadata.distribution
+    installed = lambda name: distribution("opencv-python-headless" if name == package else name)  # noqa: E731
+    monkeypatch.setattr(importlib.metadata, "distribution", installed)
+    main = command("a.py", None, "", lambda parser: None)(lambda arguments: 0)
+    assert main([]) == 0
+    line = "warning: found opencv-python and opencv-python-headless, which overwrite each other; "
+    assert capsys.readouterr().err.startswith(line) == (package == "opencv-python")

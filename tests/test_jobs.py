@@ -11,7 +11,7 @@ import pytest
 from batches import PAPER, start_localize, untimed, wait_for_lines, workers_of
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import execution, localize, options
+from piccolo.cli import execution, localize, settings
 from piccolo.result import Result, read_results
 
 
@@ -66,7 +66,7 @@ class Deadly(Localizer):
 def test_a_photo_that_kills_its_processes_is_a_line_that_says_so(scene, tmp_path, monkeypatch, capsys):
     deadly = tmp_path / "deadly.jpg"
     deadly.write_bytes((scene / "images" / "clean_0.jpg").read_bytes())
-    monkeypatch.setattr(options, "Localizer", Deadly)
+    monkeypatch.setattr(settings, "Localizer", Deadly)
     panos = tmp_path / "list.txt"
     names = [str(scene / "images" / "clean_1.jpg"), str(deadly), str(scene / "images" / "clean_2.jpg")]
     panos.write_text("\n".join(names))

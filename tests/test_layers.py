@@ -17,6 +17,7 @@ LAYERS = [
     "research.datasets",
     "research.synthetic",
     "research.scene",
+    "__main__",
     "cli",
     "report",
     "export",

@@ -1,11 +1,13 @@
 """What may be taken of the memory, and that it is asked before much is."""
 
-import resource
+import os
 import tracemalloc
+from types import SimpleNamespace
 
 import av
 import cv2
 import numpy as np
+import psutil
 import pytest
 from PIL import Image
 from PIL.ExifTags import IFD, Base
@@ -16,7 +18,7 @@ from rooms import as_panorama, query, room, scan_map, stream
 from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
 from piccolo.errors import InputError
-from piccolo.jobs import memory
+from piccolo.jobs import memory, threads
 from piccolo.jobs.threads import Workers
 from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
@@ -30,11 +32,10 @@ from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 
 @pytest.fixture
 def system(tmp_path, monkeypatch):
-    """A made-up /proc and cgroup folder: 8 GB free, 1 GB taken."""
-    (tmp_path / "self").mkdir()
-    (tmp_path / "meminfo").write_text("MemTotal: 16000000 kB\nMemAvailable: 7812500 kB\n")
-    (tmp_path / "self/statm").write_text(f"500000 {10**9 // resource.getpagesize()} 9\n")
-    monkeypatch.setattr(memory, "PROC", tmp_path)
+    """A made-up machine and cgroup folder: 8 GB free, 1 GB taken."""
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=8 * 10**9))
+    monkeypatch.setattr(memory, "memory_taken", lambda: 1e9)
+    monkeypatch.setattr(memory, "OWN_CGROUPS", tmp_path / "own")
     monkeypatch.setattr(memory, "CGROUPS", tmp_path / "cgroup")
     monkeypatch.setattr(memory, "LIMIT", [])
     return tmp_path
@@ -61,7 +62,7 @@ V2 = "memory.max", "memory.current", "inactive_file"
     ("line", "folder", "names"), [("0::/a/b", "a", V2), ("4:cpu,memory:/a", "memory/a", V1)]
 )
 def test_a_container_leaves_its_limit_less_what_is_used_but_for_caches(system, line, folder, names):
-    (system / "self/cgroup").write_text(f"7:cpu:/a\n{line}\n")
+    (system / "own").write_text(f"7:cpu:/a\n{line}\n")
     assert memory.free_of_cgroup() == float("inf")
     limit, usage, stat = (system / "cgroup" / folder / name for name in (*names[:2], "memory.stat"))
     limit.parent.mkdir(parents=True)
@@ -74,8 +75,16 @@ def test_a_container_leaves_its_limit_less_what_is_used_but_for_caches(system, l
 
 
 def test_address_space_is_a_limit_too(monkeypatch):
-    monkeypatch.setattr(resource, "getrlimit", lambda what: (10**12, -1))
+    monkeypatch.setattr(memory, "limit_of_process", lambda: 1e12)
     assert 0.0 < memory.free_of_process() < 1e12
+
+
+def test_systems_without_a_limit_of_address_space_or_of_cores(monkeypatch):
+    """As macOS."""
+    monkeypatch.delattr(psutil, "RLIMIT_AS")
+    assert memory.free_of_process() == float("inf")
+    monkeypatch.setattr(threads, "this_process", object)
+    assert 1 <= threads.num_cores() <= os.cpu_count()
 
 
 def test_work_begins_only_where_errors_can_still_be_raised(monkeypatch):
@@ -133,8 +142,8 @@ def test_what_libraries_raise_when_memory_is_short(monkeypatch):
     for error in (MemoryError(), RuntimeError("can't start new thread"), opencv()):
         assert memory.is_shortage(error)
     assert not memory.is_shortage(RuntimeError("other"))
-    for most, is_one in ((10**9, True), (resource.RLIM_INFINITY, False)):  # C code that gives up
-        monkeypatch.setattr(memory.resource, "getrlimit", lambda _, most=most: (most, most))
+    for most, is_one in ((1e9, True), (float("inf"), False)):  # C code that gives up
+        monkeypatch.setattr(memory, "limit_of_process", lambda most=most: most)
         assert memory.is_shortage(SystemError("error return without exception set")) == is_one
         assert not memory.is_shortage(SystemError("other"))
 

@@ -13,9 +13,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, TextIO
 
+from ..arguments import EXIF, NAMES, ORDER, PICTURES
 from ..errors import InputError, printable
 from ..files.json_file import read_bytes, read_text
-from ..panorama.cube import SUFFIXES, is_cube
+from ..panorama.cube import is_cube
 from ..panorama.photo import read_photo_facts
 from ..photo import Photo, Prior, Vector
 from ..scan_map.scan_map import ScanMap, check_within
@@ -24,9 +25,6 @@ from ..walk.frames import check_times
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a photo's path on each line"
 MAX_KINDS = 5  # of files left out that are named
-EXIF = "exif"
-NAMES = "names"
-ORDER = "order"
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 WANTED_TIMES = "wanted a CSV file whose first line is name,time: frames by path or file name, and seconds"
 GRAVITY = ("gravity_x", "gravity_y", "gravity_z")
@@ -82,8 +80,8 @@ def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool])
             found.append(folder)
             continue
         files = [file for file in folder.iterdir() if file.name[0] != "." and not file.is_dir()]
-        found += [file for file in files if file.suffix.lower() in SUFFIXES]
-        others.update(file.suffix.lower() for file in files if file.suffix.lower() not in SUFFIXES)
+        found += [file for file in files if file.suffix.lower() in PICTURES]
+        others.update(file.suffix.lower() for file in files if file.suffix.lower() not in PICTURES)
     left_out.update(others)
     if not found:
         text = f"{path}: a folder without a JPEG, PNG, TIFF, WebP or HEIC picture"

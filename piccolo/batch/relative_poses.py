@@ -10,6 +10,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
+from ..arguments import PICTURES
 from ..arrays import Array
 from ..camera.foreign import read_binary_images
 from ..cloud.readers.text_columns import is_number
@@ -23,7 +24,6 @@ from ..geometry.pose import (
     rotation_from_quaternion_wxyz,
 )
 from ..localization.bundle_adjustment import RelativeScale
-from ..panorama.cube import SUFFIXES
 
 WANTED = (
     "wanted COLMAP's images.txt or .bin, hloc's poses, or in metres a transforms.json of nerfstudio, "
@@ -213,7 +213,7 @@ def _are_hloc(rows: Sequence[Sequence[str]]) -> bool:
     with np.errstate(over="ignore"):
         lengths = [np.linalg.norm(values[:, begin : begin + 4], axis=1) for begin in (0, 3)]
     is_first, is_last = (bool(np.all(np.abs(length - 1.0) < UNIT_LENGTH)) for length in lengths)
-    return is_first and (not is_last or Path(rows[0][0]).suffix.lower() in SUFFIXES)
+    return is_first and (not is_last or Path(rows[0][0]).suffix.lower() in PICTURES)
 
 
 def read_colmap_row(row: Sequence[str]) -> NamedPose:

@@ -1,7 +1,6 @@
 """Results of a batch, a line a panorama: on a stream, or in a file with which a stopped batch goes on."""
 
 import json
-import os
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -229,8 +228,7 @@ class FileOutput:
 
     def texts(self) -> list[str]:
         """Return the lines of the photos so far, in their order."""
-        with self._file.path.open("rb") as file:
-            return [os.pread(file.fileno(), end - begin, begin).decode() for begin, end in self._spans()]
+        return [self._file.read(*span).decode() for span in self._spans()]
 
     def replace(self, number: int, text: str) -> None:
         """Append a line that is to replace that of a photo, by its number in the order."""

@@ -22,7 +22,8 @@ from ..panorama import read_panorama
 from ..photo import Photo
 from ..scan_map.scan_map import prepare_map
 from .command import Arguments, check_outputs, check_suffix, checking_options, command, option
-from .options import add_cloud_options, cloud_settings_from
+from .options import add_cloud_options
+from .settings import cloud_settings_from
 
 EXIT_UNKNOWN = 1
 EPILOG = """\

@@ -7,7 +7,8 @@ from ..localization.settings import CoarseToFineSettings
 from ..opening import open_files
 from ..result import read_results
 from .command import Arguments, check_outputs, checking_options, command, option
-from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
+from .options import CACHE_TEXT, add_cloud_options
+from .settings import cache_from, cloud_settings_from
 
 EPILOG = """\
 examples:

@@ -10,19 +10,20 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
 
 from tqdm import tqdm
 
+from ..arguments import PICTURES
 from ..errors import InputError, printable, text_of
 from ..files.atomic import check_output, is_stdout, is_stream
 from ..jobs.memory import check_address_space, is_shortage
 from ..jobs.threads import Progress, Workers, num_cores
-from ..panorama.cube import SUFFIXES
-from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started, for_terminal
+from .start import EXIT_INTERRUPTED, EXIT_TERMINATED, as_started, for_terminal, load, quit_at_once
 from .terminal import LOG, progress_bar, showing_log
 
 KINDS: dict[str, type] = {  # of the values, by the first metavar; of others text
@@ -35,6 +36,8 @@ EXIT_BAD_INPUT = 3
 EXIT_INTERNAL = 4
 EXIT_BROKEN_PIPE = 141
 RETRY = 0.1  # [s] after which a signal is sent again
+# os.kill wakes the main thread, wherever it waits; on Windows it would end the process at once
+send_signal = signal.raise_signal if sys.platform == "win32" else partial(os.kill, os.getpid())
 SHORTAGE = "not enough memory ({}); lower --max-memory or --threads, or thin the scan"
 EXIT_CODES = "2 wrong usage, 3 bad input, 4 internal error, 130 interrupted, 143 terminated."
 Outputs = Mapping[str, Path | None]  # by option; None where it is not given
@@ -170,10 +173,12 @@ def command(
     epilog: str,
     add_options: Callable[[argparse.ArgumentParser], None],
     exit_codes: str = "0 done",
+    work: str = __name__,
 ) -> Callable[[Callable[[Arguments], int]], Main]:
     """Make a function of the options given, which returns an exit code, the `main` of a command.
 
-    The command is named after its source `file`; `exit_codes` are its own, below 2.
+    The command is named after its source `file`; `exit_codes` are its own, below 2. The module `work` is
+    imported when the options are right.
     """
 
     def decorate(run: Callable[[Arguments], int]) -> Main:
@@ -181,10 +186,12 @@ def command(
             parser = new_parser(Path(file).stem, description, epilog, exit_codes)
             add_options(parser)
             arguments = parse(parser, argv)
+            load(work)
             lost: list[KeyboardInterrupt] = []
             try:
                 with showing_log(arguments.quiet), raising_signals(lost):
                     check_address_space()
+                    warn_of_two_opencvs()
                     exit_code = run(arguments)
                     sys.stdout.flush()  # here, where a closed pipe is caught
                     return exit_code
@@ -194,6 +201,17 @@ def command(
         return main
 
     return decorate
+
+
+def warn_of_two_opencvs() -> None:
+    """Warn where two packages have written into one folder, of which each may be half overwritten."""
+    from importlib import metadata  # noqa: PLC0415  # --help need not wait for it
+
+    with suppress(metadata.PackageNotFoundError):
+        metadata.distribution("opencv-python")
+        metadata.distribution("opencv-python-headless")
+        both = "opencv-python and opencv-python-headless"
+        LOG.warning("found %s, which overwrite each other; uninstall both, then install one again", both)
 
 
 class Terminated(KeyboardInterrupt):
@@ -225,7 +243,7 @@ def report_error(
 
 @contextmanager
 def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
-    """Within this, SIGTERM raises Terminated in the main thread, as SIGINT raises KeyboardInterrupt.
+    """Within this, SIGTERM raises Terminated in the main thread, and SIGINT KeyboardInterrupt.
 
     Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: it is
     added to `lost`, and the signal is sent again a moment later.
@@ -239,12 +257,14 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
         if isinstance(unraisable.exc_value, KeyboardInterrupt):
             lost.append(unraisable.exc_value)
             number = signal.SIGTERM if isinstance(unraisable.exc_value, Terminated) else signal.SIGINT
-            timers.append(threading.Timer(RETRY, os.kill, (os.getpid(), number)))
+            timers.append(threading.Timer(RETRY, send_signal, (number,)))
             timers[-1].start()
         else:
             sys.__unraisablehook__(unraisable)
 
-    before = signal.signal(signal.SIGTERM, _terminate)
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, _terminate)}
+    if signal.getsignal(signal.SIGINT) is quit_at_once:
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
     hook = sys.unraisablehook
     sys.unraisablehook = send_again
     try:
@@ -252,7 +272,8 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
     finally:
         for timer in timers:
             timer.cancel()
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         sys.unraisablehook = hook
 
 
@@ -328,7 +349,7 @@ def _files_of(inputs: Iterable[Path]) -> Iterator[Path]:
     """Yield the inputs, of folders their pictures; those that can't be read are left to their readers."""
     for path in inputs:
         if os.path.isdir(path) and os.access(path, os.R_OK | os.X_OK):  # noqa: PTH112  # Path's raises for long
-            yield from (file for file in path.iterdir() if file.suffix.lower() in SUFFIXES)
+            yield from (file for file in path.iterdir() if file.suffix.lower() in PICTURES)
         else:
             yield path
 

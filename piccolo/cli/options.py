@@ -1,24 +1,13 @@
-"""The options of localize.py: what they are, and the settings that they ask for."""
+"""The options of localize.py, and of commands that share some. No library is imported that takes long."""
 
 import argparse
-from collections.abc import Sequence
-from dataclasses import fields
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import get_args
 
 from .. import __version__
-from ..batch.inputs import EXIF, NAMES, ORDER
-from ..batch.localizer import Localizer
-from ..cloud.settings import IN_METRES, METRES, RANGES, WITHOUT_COLORS, CloudSettings, UpAxis, check_crs
+from ..arguments import EXIF, MAX_SPEED, MAX_STEP, MIN_CONFIDENCE, NAMES, ORDER, Projection
+from ..cloud.settings import METRES, RANGES, UpAxis
 from ..errors import InputError
-from ..geometry.colors import Labels
-from ..localization.settings import CoarseToFineSettings
-from ..opened_scan import Settings
-from ..panorama import check_labels
-from ..paper.localize import PaperSettings
-from ..photo import Photo, Prior, Projection
-from ..scan_map.open_map import CachePolicy
-from ..walk.frames import MAX_SPEED, MAX_STEP
 from .command import Arguments, option
 
 DESCRIPTION = "Find the camera poses of photos, 360-degree panoramas or others, in a coloured point cloud."
@@ -38,8 +27,6 @@ examples:
 output: one JSON object per photo and line, in the order given (docs/RESULT.md); messages and progress go
 to stderr. Ctrl-C lets the current photo finish and then stops a batch; a second Ctrl-C stops it at once.
 """
-PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
-ONLY_DEFAULT = ("near", "height", "heading", "within", "gravity_vector", "refine_focal")
 NONE = "none"
 CACHE_TEXT = f"folder of prepared maps (default: in the user's cache); {NONE}: prepare the map again"
 PHOTOS_OF_A_JOB = 8  # as many are localized while a process starts and opens a map
@@ -149,7 +136,7 @@ def add_method_options(parser: argparse.ArgumentParser) -> None:
     text = "known: the camera was upright and z of the cloud is up; unknown: any rotation; auto: try both "
     text += "(default auto)"
     group.add_argument("--gravity", choices=["auto", "known", "unknown"], help=text)
-    text = f"confidence from which a pose is localized (default {CoarseToFineSettings().min_confidence})"
+    text = f"confidence from which a pose is localized (default {MIN_CONFIDENCE})"
     option(group, "--min-confidence X", text)
 
 
@@ -202,87 +189,6 @@ def add_execution_options(parser: argparse.ArgumentParser, default_jobs: int | N
     option(group, "--threads N", "threads of each process (default: the cores divided by --jobs)")
     text = "memory limit of all processes, or of each --dask worker (default 80 %% of the free memory)"
     option(group, "--max-memory GB", text)
-
-
-def cloud_settings_from(arguments: Arguments) -> CloudSettings:
-    """Return the options of add_cloud_reading_options."""
-    scale = METRES["m"] if arguments.units is None else arguments.units
-    crs = vars(arguments).get("crs")  # not of commands without photos
-    if crs == NONE:
-        crs = None
-    if crs:
-        check_crs(crs)
-    channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
-    labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
-    color_range = None if arguments.color_range == "auto" else float(arguments.color_range)
-    return CloudSettings(scale, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns))
-
-
-def cache_from(arguments: Arguments) -> CachePolicy:
-    """Return where prepared maps are kept."""
-    is_used = arguments.cache != Path(NONE)
-    return CachePolicy(is_used, arguments.cache if is_used else None)
-
-
-def localizer_from(arguments: Arguments, paths: tuple[Path, ...] = ()) -> Localizer:
-    """Return what localizes photos in the scan of some files as the options ask for."""
-    cloud_settings = cloud_settings_from(arguments)
-    names = {f.name for f in fields(Photo)}
-    photo = Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
-    check_labels(photo, cloud_settings.labels)
-    return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
-
-
-def settings_from(arguments: Arguments) -> Settings:
-    """Return the settings that the options ask for; an option of the other preset is refused."""
-    name, *words = arguments.preset
-    if name not in PRESETS:
-        raise InputError(f"--preset: found {name!r}, wanted {' or '.join(PRESETS)}")
-    given = parse_settings(name, words)
-    asked = {"gravity": arguments.gravity, "min_confidence": arguments.min_confidence}
-    given |= {name: value for name, value in asked.items() if value is not None}
-    options = vars(arguments)
-    if name == "paper":
-        foreign = [option for option in ONLY_DEFAULT if options.get(option) not in (None, False)]
-        foreign += ["up"] if arguments.up != "auto" else []
-        if foreign:
-            raise InputError(f"--{foreign[0].replace('_', '-')}: not an option of the preset paper")
-    else:
-        given["prior"] = prior_from(options)
-    return PRESETS[name](**given)
-
-
-def prior_from(options: dict[str, Any]) -> Prior:
-    """Return what the options say of the poses of all photos; nothing of a command without them."""
-    near = options.get("near") or []
-    return Prior(
-        near=tuple(near[:3]) or None,
-        radius=near[3] if near else None,
-        height=options.get("height"),
-        heading_deg=options.get("heading"),
-        within=options.get("within") or (),
-        use_gps=options.get("crs") != NONE,
-    )
-
-
-def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
-    """Return the settings of a preset that are written as NAME=VALUE."""
-    hints = {name: hint for name, hint in get_type_hints(PRESETS[preset]).items() if name != "prior"}
-    given: dict[str, Any] = {}
-    for word in words:
-        name, _, text = word.partition("=")
-        if name not in hints:
-            raise InputError(f"--preset {preset}: found {word!r}, wanted NAME=VALUE of {', '.join(hints)}")
-        hint = hints[name]
-        choices: dict[str, Any] = {choice: choice for choice in get_args(hint)}
-        if hint is bool:
-            choices = {"true": True, "false": False}
-        try:
-            given[name] = choices[text] if choices else hint(text)
-        except (KeyError, ValueError) as error:
-            wanted = f"one of {', '.join(choices)}" if choices else hint.__name__
-            raise InputError(f"--preset {preset}: found {word!r}, wanted {wanted}") from error
-    return given
 
 
 def check_arguments(arguments: Arguments) -> None:

@@ -6,7 +6,8 @@ from ..jobs.threads import Stopwatch
 from ..scan_map.open_map import CachePolicy, extend_map, open_map, write_map
 from ..scan_map.scan_map import check_name, name_scan
 from .command import Arguments, check_outputs, checking_options, command, option
-from .options import add_cloud_options, cloud_settings_from
+from .options import add_cloud_options
+from .settings import cloud_settings_from
 
 EPILOG = """\
 example:

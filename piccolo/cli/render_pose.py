@@ -22,7 +22,8 @@ from ..scan_map.open_map import open_points
 from ..views.pictures import cut_view, encode_image, fill_holes, sphere_width_for
 from ..views.surfels import render_points
 from .command import Arguments, check_distinct, check_suffix, checking_options, command, option
-from .options import add_cloud_options, cloud_settings_from
+from .options import add_cloud_options
+from .settings import cloud_settings_from
 
 EPILOG = """\
 examples:

@@ -13,7 +13,8 @@ from ..report.plan_file import DXF, SUFFIXES, write_plan_file
 from ..report.site import check_folder, collect_entries
 from ..scan_map.open_map import open_map
 from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options, command, option
-from .options import CACHE_TEXT, add_cloud_options, cache_from, cloud_settings_from
+from .options import CACHE_TEXT, add_cloud_options
+from .settings import cache_from, cloud_settings_from
 
 EPILOG = """\
 examples:
@@ -73,7 +74,7 @@ def check_files(arguments: Arguments) -> None:
     check_distinct({"--out": arguments.out, "--plan": arguments.plan}, inputs)
     if arguments.plan:
         check_output(arguments.plan)
-        import_optional("--plan", "ezdxf" if arguments.plan.suffix.lower() == DXF else "matplotlib", "tools")
+        import_optional("--plan", "ezdxf" if arguments.plan.suffix.lower() == DXF else "matplotlib", "plans")
     if arguments.out:
         (check_output if arguments.self_contained else check_folder)(arguments.out)
     if arguments.images and not arguments.images.is_dir():

@@ -5,15 +5,15 @@
 
 import os
 import re
-import resource
 import signal
 import sys
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module
 from types import FrameType
+from typing import Any
 
-from ..jobs.memory import share_arenas
+from ..jobs.memory import limit_of_process, share_arenas
 
 # Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
 COMMANDS = (
@@ -60,31 +60,27 @@ def as_started(text: str) -> str:
 
 
 def run(module: str) -> int:
-    """Import the `module` of a command and run its `main`; returns the exit code."""
+    """Import the `module` of a command and run its `main`; returns the exit code, or raises it as `load`."""
     open_closed_streams()
     share_arenas()
-    space, _ = resource.getrlimit(resource.RLIMIT_AS)
-    if 0 <= space < LEAST_ADDRESS_SPACE:
+    space = limit_of_process()
+    if space < LEAST_ADDRESS_SPACE:
         wanted = f"wanted {LEAST_ADDRESS_SPACE >> 10} or more on this machine"
-        print_line(f"found ulimit -v {space >> 10}, {wanted}")
+        print_line(f"found ulimit -v {int(space) >> 10}, {wanted}")
         return EXIT_CANNOT_START
-    handler = signal.getsignal(signal.SIGINT)
-    is_ignored = handler is not signal.default_int_handler  # by nohup, or a shell's &
-    signal.signal(signal.SIGINT, handler if is_ignored else _quit)
-    signal.signal(signal.SIGTERM, _quit)
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # not ignored by nohup, or a shell's &
+        signal.signal(signal.SIGINT, quit_at_once)
+    signal.signal(signal.SIGTERM, quit_at_once)
+    return int(load(module).main())
+
+
+def load(module: str) -> Any:
+    """Import a module with its libraries; SystemExit, after a line, without one or memory for it."""
     try:
-        main = import_module(module).main
-    except (ImportError, MemoryError, OSError) as error:  # a library is missing, or memory for it
+        return import_module(module)
+    except (ImportError, MemoryError, OSError) as error:
         print_line(f"the libraries cannot be loaded ({' '.join(str(error).split()) or 'not enough memory'})")
-        return EXIT_CANNOT_START
-    try:
-        signal.signal(signal.SIGINT, handler)
-        return int(main())
-    except KeyboardInterrupt:  # before or after the work
-        print_line("interrupted")
-    finally:
-        signal.signal(signal.SIGINT, handler if is_ignored else _quit)
-    return EXIT_INTERRUPTED
+        raise SystemExit(EXIT_CANNOT_START) from error
 
 
 def open_closed_streams() -> None:
@@ -109,8 +105,8 @@ def print_line(text: str) -> None:
     os.write(2, f"{os.path.basename(sys.argv[0])}: {text}\n".encode(errors="backslashreplace"))  # noqa: PTH119
 
 
-def _quit(signum: int, frame: FrameType | None) -> None:
-    """End at once: there is nothing to clean up, and an exception would pass through half-made modules."""
+def quit_at_once(signum: int, frame: FrameType | None) -> None:
+    """End before the work: nothing is to be cleaned up, an exception would pass through half-made modules."""
     is_interrupt = signum == signal.SIGINT
     print_line("interrupted" if is_interrupt else "terminated")
     os._exit(EXIT_INTERRUPTED if is_interrupt else EXIT_TERMINATED)

@@ -53,7 +53,7 @@ class CloudSettings:
 
 def check_crs(crs: str) -> Any:
     """Return pyproj's system of x and y that a text names; InputError if there is none."""
-    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    pyproj = import_optional("GPS in photos", "pyproj", "gps")
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()
     except pyproj.exceptions.CRSError as error:
@@ -64,7 +64,7 @@ def check_crs(crs: str) -> Any:
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
     """Return x and y of a place in a projected system, in its unit; None if there are none."""
     system = check_crs(crs)
-    pyproj = import_optional("GPS in photos", "pyproj", "tools")
+    pyproj = import_optional("GPS in photos", "pyproj", "gps")
     if not system.is_projected:
         return None
     transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)

@@ -227,7 +227,7 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
     header.scales = np.full(3, LAS_STEP / scale)
     header.offsets = np.floor(box.mean(axis=0))
     if crs:
-        pyproj = import_optional("a coordinate system in LAS", "pyproj", "tools")
+        pyproj = import_optional("a coordinate system in LAS", "pyproj", "gps")
         header.add_crs(pyproj.CRS.from_user_input(crs))
     is_packed = out.suffix.lower() == ".laz"
     how = {"mode": "w", "header": header, "do_compress": is_packed, "closefd": False}

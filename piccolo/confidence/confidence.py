@@ -13,7 +13,6 @@ from ..geometry.pose_gaussian import probability_within
 LOCALIZED = "localized"
 AMBIGUOUS = "ambiguous"
 NOT_LOCALIZED = "not_localized"
-MIN_CONFIDENCE = 0.9
 # the scan's shape; its coloured views; these, and local features of the scan drawn at the pose
 EvidenceKind = Literal["shape", "views", "drawn scan"]
 

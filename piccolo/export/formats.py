@@ -255,7 +255,7 @@ def write_gpx(images: Sequence[PosedImage], out: Path, options: Options) -> None
 
 def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tuple[Any, Any, str]:
     """Return the ellipsoid, what turns positions into longitude and latitude, and the system's name."""
-    pyproj = import_optional(what, "pyproj", "tools")
+    pyproj = import_optional(what, "pyproj", "gps")
     crs = str(options.crs)
     try:
         system = pyproj.CRS.from_user_input(crs)

@@ -1,10 +1,9 @@
-"""Files that are either whole or not there, and what else a path of the user's may lead to.
+"""Files that are either whole or not there, their locks, and what else a path of the user's may lead to.
 
 A later process removes temporary folders where a killed one left them.
 """
 
 import errno
-import fcntl
 import os
 import secrets
 import shutil
@@ -12,8 +11,10 @@ import stat
 import sys
 import tempfile
 import time
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import IO
 
@@ -23,15 +24,16 @@ STDOUT = Path("-")
 WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}  # that name no file
 PREFIX = "piccolo-temporary-"
 YOUNG_S = 10.0  # a folder is made a moment before it is locked
+IS_WINDOWS = sys.platform == "win32"
+WAITS_S = (0.01, 0.1, 0.5) if IS_WINDOWS else ()  # which replaces no file that somebody reads, for a moment
 
 
 def is_stdout(path: Path) -> bool:
     """Return True for -, /dev/stdout, and any other name of what stdout is; not for /dev/null."""
-    try:
-        is_same = sys.stdout is not None and os.path.samestat(path.stat(), os.fstat(1))
-    except OSError:  # there is no such file, or no stdout
-        is_same = False
-    return path == STDOUT or (is_same and os.path.realpath(path) != os.devnull)
+    with suppress(OSError):  # there is no such file, or no stdout
+        if sys.stdout is not None and os.path.samestat(path.stat(), os.fstat(1)):
+            return os.path.realpath(path) != os.devnull
+    return path == STDOUT
 
 
 def is_stream(path: Path) -> bool:
@@ -90,9 +92,25 @@ def temporary_prefix(name: str) -> str:
     return f".{name[:40]}."
 
 
-def _temporary_beside(target: Path) -> Path:
-    """Return a name in the target's folder that nobody else has."""
-    return target.with_name(temporary_prefix(target.name) + secrets.token_hex(8))
+@contextmanager
+def _in_place_of(path: Path) -> Iterator[tuple[Path, Path]]:
+    """Yield a path's target, and a name beside it, which takes its place at the end; gone after an error."""
+    target = _target_of(path)
+    temporary = target.with_name(temporary_prefix(target.name) + secrets.token_hex(8))
+    try:
+        with _naming(path, temporary):
+            yield target, temporary
+            for wait in WAITS_S:
+                with suppress(PermissionError):
+                    temporary.replace(target)
+                    return
+                time.sleep(wait)
+            temporary.replace(target)
+    except BaseException:
+        if temporary.is_dir():
+            shutil.rmtree(temporary)
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager
@@ -108,27 +126,19 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
             file.seek(0)
             _write_stream(path, file)
         return
-    target = _target_of(path)
-    temporary = _temporary_beside(target)
-    try:
-        with _naming(path, temporary):
-            old = target.stat() if target.exists() else None
-            mode = stat.S_IMODE(old.st_mode) if old else 0o666
-            handle = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL, mode)
-            with os.fdopen(handle, "w+b") as file:
-                yield file
-                file.flush()
-                if old:
-                    with suppress(PermissionError):  # where that is not allowed
-                        os.fchown(handle, old.st_uid, old.st_gid)
-                    os.fchmod(handle, mode)
-                # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
-                # no room, and after a power cut the new name might stand for an empty file.
-                os.fsync(handle)
-            temporary.replace(target)
-    except BaseException:
-        temporary.unlink(missing_ok=True)
-        raise
+    with _in_place_of(path) as (target, temporary):
+        old = target.stat() if target.exists() else None
+        mode = stat.S_IMODE(old.st_mode) if old else 0o666
+        with open(temporary, "x+b", opener=partial(os.open, mode=mode)) as file:
+            yield file
+            file.flush()
+            if old and not IS_WINDOWS:
+                with suppress(PermissionError):  # where that is not allowed
+                    os.fchown(file.fileno(), old.st_uid, old.st_gid)
+                os.fchmod(file.fileno(), mode)
+            # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
+            # no room, and after a power cut the new name might stand for an empty file.
+            os.fsync(file.fileno())
 
 
 def _write_stream(path: Path, file: IO[bytes]) -> None:
@@ -164,19 +174,12 @@ def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
 @contextmanager
 def replacing_folder(path: Path) -> Iterator[Path]:
     """Yield a folder that becomes `path`, new or empty, at the end; after an error nothing is left."""
-    target = _target_of(path)
-    temporary = _temporary_beside(target)
-    try:
-        with _naming(path, temporary):
-            temporary.mkdir()
-            yield temporary
-            if target.exists():
-                temporary.chmod(stat.S_IMODE(target.stat().st_mode))
-            temporary.replace(target)
-    except BaseException:
-        if temporary.exists():
-            shutil.rmtree(temporary)
-        raise
+    with _in_place_of(path) as (target, temporary):
+        temporary.mkdir()
+        yield temporary
+        if target.exists():
+            temporary.chmod(stat.S_IMODE(target.stat().st_mode))
+            target.rmdir()  # on Windows no folder takes the place of another
 
 
 def write_atomically(path: Path, content: bytes) -> None:
@@ -189,21 +192,36 @@ def write_atomically(path: Path, content: bytes) -> None:
 def temporary_folder() -> Iterator[Path]:
     """Make a folder that is removed at the end, or else by the next process that makes one."""
     for left in Path(tempfile.gettempdir()).glob(f"{PREFIX}????????"):
-        with suppress(OSError):  # it is in use, or not ours
+        with suppress(OSError, InputError):  # it is not ours, or in use
             status = left.lstat()
-            if status.st_uid == os.getuid() and time.time() - status.st_mtime > YOUNG_S:
-                with _hold_lock(left):
+            is_own = stat.S_ISDIR(status.st_mode) and (IS_WINDOWS or status.st_uid == os.getuid())
+            if is_own and time.time() - status.st_mtime > YOUNG_S:
+                with hold_lock(left):
                     shutil.rmtree(left)
-    with tempfile.TemporaryDirectory(prefix=PREFIX) as name, _hold_lock(Path(name)):
+    with tempfile.TemporaryDirectory(prefix=PREFIX) as name, hold_lock(Path(name)):
         yield Path(name)
 
 
 @contextmanager
-def _hold_lock(folder: Path) -> Iterator[None]:
-    """Hold a folder's lock, which ends with the process; OSError if another has it."""
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        yield
-    finally:
-        os.close(handle)
+def hold_lock(path: Path) -> Iterator[None]:
+    """Hold the lock of a path, which ends with the process. InputError if another has it.
+
+    What is locked is a file beside it, as on Windows nobody could read a locked one, nor remove it here.
+    """
+    from filelock import lock_descriptor  # noqa: PLC0415  # who writes whole files only need not wait for it
+
+    target = _target_of(path)
+    digest = zlib.crc32(os.fsencode(target.name))
+    beside = target.with_name(f"{temporary_prefix(target.name)}{digest:08x}.lock")
+    while True:
+        with beside.open("ab") as file:
+            if not lock_descriptor(file.fileno(), blocking=False):
+                raise InputError(f"{path}: another process is writing it; wait for its end")
+            if not beside.exists() or not os.path.samestat(os.fstat(file.fileno()), beside.stat()):
+                continue  # whoever had the lock before has removed its file
+            try:
+                yield
+            finally:
+                if not IS_WINDOWS:
+                    beside.unlink(missing_ok=True)
+            return

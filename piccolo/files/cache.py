@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .atomic import temporary_prefix, write_atomically
+from .atomic import IS_WINDOWS, temporary_prefix, write_atomically
 
 STALE_AFTER_S = 30 * 24 * 3600.0
 MARKED_FOR_S = 24 * 3600.0
@@ -51,13 +51,14 @@ def digest_of_sources(folders: tuple[str, ...]) -> str:
 
 @cache
 def cache_root() -> Path:
-    """Return the folder for what is kept between runs (XDG base directory specification), made now.
+    """Return the user's folder for what is kept between runs (on Linux $XDG_CACHE_HOME/piccolo), made now.
 
     Where it can't be written, or others may write to it, a folder of the user's own among the temporary files
     takes its place; what lies there may hold code. OSError where that can't be trusted either.
     """
-    home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111  # never raises
-    root = Path(home) / "piccolo"
+    from platformdirs import user_cache_path  # noqa: PLC0415  # who keeps nothing need not wait for it
+
+    root = user_cache_path("piccolo", appauthor=False)
     temporary = Path(tempfile.gettempdir())
     with suppress(OSError):
         if not root.is_absolute():
@@ -65,10 +66,11 @@ def cache_root() -> Path:
         if is_own(make_writable(root).stat(), WRITABLE):
             return root
         log.warning("%s: other users may write to it, so it is not used; run chmod go-w on it", root)
-    fallback = temporary / f"piccolo-{os.getuid()}"
+    fallback = temporary / f"piccolo-{'user' if IS_WINDOWS else os.getuid()}"
     fallback.mkdir(PRIVATE, exist_ok=True)
     # One look, at the entry itself: where only its owner may rename it, what is found stays true.
-    if not is_own(fallback.lstat(), OPEN) or temporary.stat().st_mode & (WRITABLE | stat.S_ISVTX) == WRITABLE:
+    is_open = not IS_WINDOWS and temporary.stat().st_mode & (WRITABLE | stat.S_ISVTX) == WRITABLE
+    if is_open or not is_own(fallback.lstat(), OPEN):
         raise PermissionError(errno.EACCES, "other users may write to it", str(fallback))
     return make_writable(fallback)
 
@@ -81,8 +83,9 @@ def make_writable(folder: Path) -> Path:
 
 
 def is_own(status: os.stat_result, forbidden: int) -> bool:
-    """Return True for the user's own folder without the `forbidden` permissions."""
-    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & forbidden
+    """Return True for the user's own folder without the `forbidden` permissions; on Windows all are."""
+    is_safe = IS_WINDOWS or (status.st_uid == os.getuid() and not status.st_mode & forbidden)
+    return stat.S_ISDIR(status.st_mode) and is_safe
 
 
 def own_names(ending: str) -> re.Pattern[str]:

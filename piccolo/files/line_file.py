@@ -3,18 +3,17 @@
 A journal is such a file of the steps of a job, so that a stopped job goes on where it was.
 """
 
-import fcntl
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
+from mmap import ACCESS_READ, mmap
 from pathlib import Path
 from typing import Any, TypeVar
 
 from ..errors import InputError
-from .atomic import replacing
+from .atomic import hold_lock, replacing
 
-BLOCK = 1 << 20  # [byte] read at a time
 LINE_BEGINS = b'["'
 Kept = TypeVar("Kept")
 KEY = "job"  # name of the first step, which tells what job it is
@@ -26,20 +25,14 @@ def whole_size(path: Path, begins: bytes, what: str) -> int:
     A last line that is torn, as it was being written, begins with `begins`. Raises InputError if the end of
     the file is no beginning of such a line: it is not `what`.
     """
-    if not path.exists():
+    if not path.exists() or path.stat().st_size == 0:
         return 0
-    with path.open("rb") as file:
-        size = end = file.seek(0, os.SEEK_END)
-        torn = b""
-        while end > 0 and b"\n" not in torn:
-            begin = max(end - BLOCK, 0)
-            file.seek(begin)
-            torn = file.read(end - begin) + torn
-            end = begin
-    torn = torn[torn.rfind(b"\n") + 1 :]
-    if torn[: len(begins)] != begins[: len(torn)]:
+    with path.open("rb") as file, mmap(file.fileno(), 0, access=ACCESS_READ) as content:
+        size = content.rfind(b"\n") + 1
+        torn = content[size : size + len(begins)]
+    if torn != begins[: len(torn)]:
         raise InputError(f"{path}: its last line does not belong to {what}")
-    return size - len(torn)
+    return size
 
 
 def whole_lines(path: Path, size: int, begin: int = 0) -> Iterator[bytes]:
@@ -64,32 +57,30 @@ def write_line(handle: int, path: Path, line: str) -> None:
 class LineFile:
     """A file of lines that this process alone may write."""
 
-    def __init__(self, path: Path, handle: int) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._handle = handle
+        self.stream = path.open("a+b", buffering=0)
 
     @property
     def size(self) -> int:
         """Bytes in the file."""
-        return os.fstat(self._handle).st_size
-
-    @property
-    def is_in_place(self) -> bool:
-        """False if the file was removed or replaced since it was opened."""
-        with suppress(FileNotFoundError):
-            return os.path.samestat(os.fstat(self._handle), self.path.stat())
-        return False
+        return os.fstat(self.stream.fileno()).st_size
 
     def cut(self, size: int) -> None:
         """Keep the first `size` bytes."""
-        os.ftruncate(self._handle, size)
+        self.stream.truncate(size)
+
+    def read(self, begin: int, end: int) -> bytes:
+        """Return a span of bytes."""
+        self.stream.seek(begin)
+        return self.stream.read(end - begin)
 
     def append(self, line: str) -> None:
         """Append a line at once; one that does not fit on the disk is taken back, the others stay whole."""
         begin = self.size
         try:
-            write_line(self._handle, self.path, line)
-            os.fsync(self._handle)
+            write_line(self.stream.fileno(), self.path, line)
+            os.fsync(self.stream.fileno())
         except OSError:
             self.cut(begin)
             raise
@@ -101,7 +92,9 @@ class LineFile:
             return
         with replacing(self.path) as file:
             for begin, end in spans:
-                file.write(os.pread(self._handle, end - begin, begin))
+                file.write(self.read(begin, end))
+            self.stream.close()  # Windows replaces no open file
+        self.stream = self.path.open("a+b", buffering=0)
 
 
 @contextmanager
@@ -110,22 +103,15 @@ def open_locked(path: Path) -> Iterator[LineFile]:
 
     Raises InputError if another process is writing the file.
     """
-    is_new = not path.exists()
-    with path.open("a+b", buffering=0) as stream:
+    with hold_lock(path):
+        is_new = not path.exists()
+        file = LineFile(path)
         try:
-            fcntl.flock(stream.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise InputError(f"{path}: another process is writing it; wait for its end") from error
-        file = LineFile(path, stream.fileno())
-        if file.is_in_place:
-            try:
-                yield file
-            finally:
-                if is_new and file.size == 0 and file.is_in_place:
-                    path.resolve().unlink()
-            return
-    with open_locked(path) as file:  # as it was removed or replaced by whoever had the lock before
-        yield file
+            yield file
+        finally:
+            file.stream.close()
+            if is_new and path.exists() and path.stat().st_size == 0:
+                path.resolve().unlink()
 
 
 class Journal:
@@ -183,15 +169,11 @@ class Journal:
         """Keep the text of a step that is done."""
         if self._file is None:
             return
-        if not self._earlier:
-            self._append(KEY, self._key)
-        self._append(step, text)
-
-    def _append(self, step: str, text: str) -> None:
-        assert self._file is not None
-        self._file.append(json.dumps([step, text]))
-        self._earlier.append((step, "", self._file.size))
-        self._num_recalled += 1
+        first = [] if self._earlier else [(KEY, self._key)]
+        for line in (*first, (step, text)):
+            self._file.append(json.dumps(line))
+            self._earlier.append((line[0], "", self._file.size))
+            self._num_recalled += 1
 
 
 @contextmanager

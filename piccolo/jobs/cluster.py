@@ -32,8 +32,8 @@ def connect(address: str) -> Iterator["Cluster"]:
 
     Raises InputError if dask.distributed is missing, or no scheduler or worker of this version answers.
     """
-    import_optional("`dask`", "dask", "distributed").config.set({"logging": LOGGING})
-    distributed = import_optional("`dask`", "distributed", "distributed")
+    import_optional("`dask`", "dask", "cluster").config.set({"logging": LOGGING})
+    distributed = import_optional("`dask`", "distributed", "cluster")
     scheduler = _scheduler_at(address)
     try:
         client = distributed.Client(scheduler, timeout=TIMEOUT, set_as_default=False)
@@ -134,7 +134,7 @@ class Cluster:
 
 def find_sent_file(name: str) -> Path:
     """Return where a worker has what `Cluster.send_file` has sent it."""
-    worker = import_optional("`dask`", "distributed", "distributed").get_worker()
+    worker = import_optional("`dask`", "distributed", "cluster").get_worker()
     return Path(worker.local_directory) / name
 
 

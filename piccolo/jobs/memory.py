@@ -1,19 +1,23 @@
 """Memory that may still be taken, asked before much is: a refusal in one line, not the kernel's kill.
 
-This imports no library, as `share_arenas` comes before these are.
+psutil knows it of each system, but for containers, which only Linux has, and tells of in files. No library of
+numbers is imported here, as `share_arenas` comes before these are.
 """
 
 import ctypes
 import os
-import resource
+import sys
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
+
+import psutil
 
 from ..errors import InputError, ResourceError
 
 GB = 1e9
 DEFAULT_FRACTION = 0.8  # of what is free, where the user sets no limit
-PROC = Path("/proc")
+OWN_CGROUPS = Path("/proc/self/cgroup")  # of this process, by which CGROUPS has their limits
 CGROUPS = Path("/sys/fs/cgroup")
 V2 = ("", "memory.max", "memory.current", "inactive_file")
 V1 = ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
@@ -22,6 +26,7 @@ LEAST_LEFT = 200e6  # [byte] of address space: with less, Python may abort where
 M_ARENA_MAX = -8  # of glibc's mallopt(3)
 MOST_ARENAS = 2  # each keeps what was freed in it
 LIMIT: list[float] = []  # [byte] of this process, if the user sets one
+this_process = cache(psutil.Process)
 
 
 def limit_memory(gigabytes: float | None) -> None:
@@ -42,32 +47,34 @@ def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
 
 def memory_left() -> float:
     """Bytes that this process may still take: of the user's limit, or a part of what is free."""
-    free = min(free_of_machine(), free_of_cgroup(), free_of_process())
+    free = min(float(psutil.virtual_memory().available), free_of_cgroup(), free_of_process())
     return min(LIMIT[0] - memory_taken(), free) if LIMIT else DEFAULT_FRACTION * free
 
 
 def memory_taken() -> float:
     """Bytes of memory that this process has."""
-    return _of_process(1)
+    return float(this_process().memory_info().rss)
 
 
 def check_address_space() -> None:
     """Raise a MemoryError where `ulimit -v` leaves too little for errors to be raised as they should."""
-    left = free_of_process()
+    left = max(free_of_process(), 0.0)
     if left < LEAST_LEFT:
-        wanted = f"wanted {LEAST_LEFT / GB:g} or more"
-        raise MemoryError(f"ulimit -v leaves {max(left, 0.0) / GB:.2g} GB, {wanted}")
+        raise MemoryError(f"ulimit -v leaves {left / GB:.2g} GB, wanted {LEAST_LEFT / GB:g} or more")
 
 
-def free_of_machine() -> float:
-    """Bytes free, or held by caches that can be dropped; infinite where the system does not tell."""
-    return _number_after(PROC / "meminfo", "MemAvailable:") * 1024.0 or float("inf")
+def limit_of_process() -> float:
+    """Bytes of address space that `ulimit -v` allows; infinite without, and on systems that have none."""
+    if not hasattr(psutil, "RLIMIT_AS"):
+        return float("inf")
+    soft, _ = this_process().rlimit(psutil.RLIMIT_AS)
+    return float("inf") if soft == psutil.RLIM_INFINITY else float(soft)
 
 
 def free_of_process() -> float:
     """Bytes of address space that `ulimit -v` leaves; infinite without."""
-    soft, _ = resource.getrlimit(resource.RLIMIT_AS)
-    return float("inf") if soft == resource.RLIM_INFINITY else soft - _of_process(0)
+    limit = limit_of_process()
+    return limit if limit == float("inf") else limit - this_process().memory_info().vms
 
 
 def free_of_cgroup() -> float:
@@ -77,7 +84,7 @@ def free_of_cgroup() -> float:
 
 def _free_of_cgroups() -> Iterator[float]:
     """Bytes that each limited cgroup leaves, of version 2 and 1, from this process's own up to the root."""
-    for line in _text(PROC / "self/cgroup").splitlines():
+    for line in _text(OWN_CGROUPS).splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers and "memory" not in controllers.split(","):
             continue
@@ -87,7 +94,8 @@ def _free_of_cgroups() -> Iterator[float]:
             most = _text(folder / limit).strip()
             used = _text(folder / usage).strip()
             if most.isdigit() and used.isdigit():
-                yield int(most) - int(used) + _number_after(folder / "memory.stat", cache)
+                stats = dict(line.split() for line in _text(folder / "memory.stat").splitlines())
+                yield float(int(most) - int(used) + int(stats.get(cache, 0)))
             folder = folder.parent
 
 
@@ -96,20 +104,8 @@ def is_shortage(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or getattr(error, "code", None) == OPENCV_NO_MEMORY:
         return True
     if isinstance(error, SystemError):  # C code that gave up without saying why, under `ulimit -v`
-        is_limited = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
-        return is_limited and "without exception set" in str(error)
+        return limit_of_process() < float("inf") and "without exception set" in str(error)
     return isinstance(error, RuntimeError) and "can't start new thread" in str(error)
-
-
-def _of_process(column: int) -> float:
-    """Bytes of address space (0) or of memory (1) that this process has."""
-    return float((_text(PROC / "self/statm") or "0 0").split()[column]) * os.sysconf("SC_PAGE_SIZE")
-
-
-def _number_after(path: Path, name: str) -> float:
-    """Return the number in the line of a file that begins with `name`; 0 without."""
-    lines = (line.split() for line in _text(path).splitlines())
-    return next((float(words[1]) for words in lines if words[:1] == [name]), 0.0)
 
 
 def _text(path: Path) -> str:
@@ -125,7 +121,6 @@ def share_arenas() -> None:
 
     Unless MALLOC_ARENA_MAX or GLIBC_TUNABLES in the environment say how many. Other C libraries have none.
     """
-    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     is_told = "MALLOC_ARENA_MAX" in os.environ or "arena_max" in os.environ.get("GLIBC_TUNABLES", "")
-    if mallopt is not None and not is_told:
-        mallopt(M_ARENA_MAX, MOST_ARENAS)
+    if sys.platform == "linux" and not is_told and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        libc.mallopt(M_ARENA_MAX, MOST_ARENAS)

@@ -10,12 +10,12 @@ import os
 import pickle
 import signal
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.process import BaseProcess
@@ -27,11 +27,12 @@ from .memory import share_arenas
 ATTEMPTS = 2  # to work on an item, or to open
 IN_FLIGHT = 4  # items a process, so that none waits for a slow one before
 PARENT_LOST = 1  # exit code
-POLL_S = 0.001
-MAX_POLLS = 1000
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
 CONTEXT = multiprocessing.get_context("spawn")
 SIGNALS = {signal.SIGINT, signal.SIGTERM}  # are for this process, which ends the others
+HAS_MASKS = hasattr(signal, "pthread_sigmask")  # not on Windows
+# in a thread, and so, from their first moment on, in the processes that it starts
+block_signals = partial(signal.pthread_sigmask, signal.SIG_BLOCK, SIGNALS) if HAS_MASKS else None
 Worker = tuple[ProcessPoolExecutor, BaseProcess]  # a pool of one process, and this
 LIBRARIES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OPENCV_FOR_THREADS_NUM")
 Function = Callable[[Any], Any]  # of an item
@@ -44,12 +45,12 @@ class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
 
 
+@dataclass
 class Here:
     """Works on one item after another in this process, on each when its value is asked for."""
 
-    def __init__(self, function: Function, items: Iterable[Any] = ()) -> None:
-        self.function = function
-        self.items = items
+    function: Function
+    items: Iterable[Any] = ()
 
     def values(self, items: Iterator[Any]) -> "Here":
         """Begin with the items."""
@@ -120,11 +121,9 @@ class Processes:
         self._children: list[BaseProcess] = []
         self._starting = threading.Lock()
         self._is_closed = False
-        resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
-        # What a thread blocks, its processes do from their first moment on.
-        self._threads = ThreadPoolExecutor(
-            num_processes, initializer=signal.pthread_sigmask, initargs=(signal.SIG_BLOCK, SIGNALS)
-        )
+        if block_signals:
+            resource_tracker.ensure_running()  # which unblocks signals in the thread that begins it
+        self._threads = ThreadPoolExecutor(num_processes, initializer=block_signals)
 
     def values(self, items: Iterator[Any]) -> InFlight:
         """Begin with the items."""
@@ -148,7 +147,7 @@ class Processes:
             try:
                 return pool.submit(_value_of, item).result()
             except BrokenProcessPool:
-                end = self._end_of(child)
+                end = self._end_of(pool, child)
         raise WorkerLostError(f"each of {ATTEMPTS} processes at work on it {end}")
 
     def _worker(self) -> Worker:
@@ -157,42 +156,33 @@ class Processes:
         if own:
             return own
         for _ in range(ATTEMPTS):
-            pool = ProcessPoolExecutor(1, CONTEXT, initializer=_begin, initargs=(self.opening,))
+            pool = ProcessPoolExecutor(1, CONTEXT, initializer=_begin)
             with self._starting, library_threads(self.num_threads):
                 if self._is_closed:
                     raise CancelledError
-                opened = pool.submit(_open)
+                opened = pool.submit(_open, self.opening)
                 (child,) = pool._processes.values()
                 self._children.append(child)
             try:
                 opened.result()
             except BrokenProcessPool:
-                end = self._end_of(child)
+                end = self._end_of(pool, child)
                 continue
             self._own.worker = pool, child
             return pool, child
         advice = "use fewer processes or more memory"
         raise InputError(f"`jobs`: a process {end} while it opened the scan; {advice}")
 
-    def _end_of(self, child: BaseProcess) -> str:
+    def _end_of(self, pool: ProcessPoolExecutor, child: BaseProcess) -> str:
         """Return how a process ended; raises CancelledError if that was by `close`."""
         with self._starting:
             if self._is_closed:
                 raise CancelledError
             self._children.remove(child)
         vars(self._own).pop("worker", None)
-        code = _exit_code_of(child)
+        pool.shutdown()  # whose thread waits for the process, and then has its exit code
+        code = child.exitcode or 0
         return f"was killed by {signal.Signals(-code).name}" if code < 0 else f"ended with exit code {code}"
-
-
-def _exit_code_of(child: BaseProcess) -> int:
-    """Wait for a process; its pool's thread, which waits too, may have its exit code a moment earlier."""
-    child.join()
-    for _ in range(MAX_POLLS):
-        if child.exitcode is not None:
-            return child.exitcode
-        time.sleep(POLL_S)
-    return 0
 
 
 @contextmanager
@@ -208,21 +198,21 @@ def library_threads(count: int) -> Iterator[None]:
 
 
 class _Own:
-    """The opening and the function of this process."""
+    """The function of this process."""
 
-    opening: Opening
     function: Function
 
 
-def _begin(opening: Opening) -> None:
+def _begin() -> None:
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
     share_arenas()
-    _Own.opening = opening
 
 
-def _open() -> None:
+def _open(opening: Opening) -> None:
     with _raising_what_can_be_sent():
-        _Own.function = _Own.opening()
+        _Own.function = opening()
 
 
 def _value_of(item: object) -> Any:

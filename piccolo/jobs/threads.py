@@ -17,7 +17,7 @@ from typing import Any, Generic, TypeVar
 from threadpoolctl import OpenBLASController, ThreadpoolController
 
 from ..errors import InputError
-from .memory import check_address_space
+from .memory import check_address_space, this_process
 
 Item = TypeVar("Item")
 Value = TypeVar("Value")
@@ -26,12 +26,15 @@ MAX_THREADS = 512  # each has arrays of 0.1 GB for views
 
 def num_cores() -> int:
     """Cores that this process may use, at most as many as threads are allowed."""
-    return min(len(os.sched_getaffinity(0)), MAX_THREADS)
+    process = this_process()
+    cores = process.cpu_affinity() if hasattr(process, "cpu_affinity") else None  # macOS has no such limit
+    return min(len(cores) if cores else os.cpu_count() or 1, MAX_THREADS)
 
 
 _thread = threading.local()  # has `is_of_pool` in the threads of a pool
 _idle: dict[int, list[ThreadPoolExecutor]] = {}  # pools by their number of threads
-os.register_at_fork(after_in_child=_idle.clear)  # a child has none of its parent's threads
+if hasattr(os, "register_at_fork"):  # not on Windows, which has no fork
+    os.register_at_fork(after_in_child=_idle.clear)  # a child has none of its parent's threads
 
 
 @contextmanager

@@ -3,8 +3,8 @@
 from dataclasses import asdict, dataclass
 from typing import Literal, NamedTuple
 
-from ..arguments import check_fields
-from ..confidence.confidence import MIN_CONFIDENCE, check_confidence
+from ..arguments import MIN_CONFIDENCE, check_fields
+from ..confidence.confidence import check_confidence
 from ..errors import InputError
 from ..geometry.pose import Gravity
 from ..optimize.refine import Solver

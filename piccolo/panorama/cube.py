@@ -15,6 +15,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from ..arguments import PICTURES
 from ..arrays import Array32, Bytes, Mask
 from ..errors import InputError
 from ..geometry.sphere import pixel_rays
@@ -35,7 +36,6 @@ R_FACE_FROM_CAM = {
     }.items()
 }
 Faces = dict[str, Bytes]  # by letter, (size, size, 4): RGB and 255 where valid
-SUFFIXES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".webp", ".heic", ".heif", ".insp")
 MIN_FACE = 32  # [px]
 MAX_FACE = MAX_WIDTH // 4
 MAX_CUBE_FILES = 64  # a folder with more pictures is a folder of panoramas
@@ -119,7 +119,7 @@ def read_cube_folder(folder: Path) -> Picture:
 
 def is_cube(folder: Path) -> bool:
     """Return True if a folder holds few pictures, and among them the six faces of one cube."""
-    if sum(path.suffix.lower() in SUFFIXES for path in folder.iterdir()) > MAX_CUBE_FILES:
+    if sum(path.suffix.lower() in PICTURES for path in folder.iterdir()) > MAX_CUBE_FILES:
         return False
     try:
         return len(face_paths(folder)) == len(R_FACE_FROM_CAM)
@@ -130,7 +130,7 @@ def is_cube(folder: Path) -> bool:
 def face_paths(folder: Path) -> dict[str, Path]:
     """Return a folder's one complete cube, by letters of faces; the rest of its files' names is the same."""
     try:
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() in PICTURES)
     except OSError as error:
         raise InputError(f"{folder}: cannot be read ({error.strerror or error}), {WANTED}") from error
     cubes = []

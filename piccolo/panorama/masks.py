@@ -14,9 +14,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from ..arguments import PICTURES
 from ..arrays import Array32, Bytes, Int64s, Mask
 from ..errors import InputError
-from .cube import SUFFIXES
 from .gpano import ASPECT_TOLERANCE
 from .picture import read_picture
 
@@ -211,7 +211,7 @@ def find_mask(mask: Path, pano: Path) -> Path | None:
     """
     if not mask.is_dir():
         return mask
-    names = (f"{stem}{suffix}" for stem in (pano.stem, pano.name, f"{pano.stem}_mask") for suffix in SUFFIXES)
+    names = (f"{stem}{suffix}" for stem in (pano.stem, pano.name, f"{pano.stem}_mask") for suffix in PICTURES)
     return next((file for name in names if (file := mask / name).is_file()), None)
 
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_fields
+from ..arguments import MIN_CONFIDENCE, check_fields
 from ..arrays import Array, Array32, Mask
 from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
@@ -15,7 +15,6 @@ from ..confidence.confidence import (
     AMBIGUOUS,
     LEAST_SCORE,
     LOCALIZED,
-    MIN_CONFIDENCE,
     NOT_LOCALIZED,
     check_confidence,
 )

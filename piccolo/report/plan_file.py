@@ -113,7 +113,7 @@ def draw_figure(document: dict[str, Any], folder: Path, form: str) -> bytes:
     sides = [np.array([s["plan"]["width"], s["plan"]["height"]]) / DPI + MARGIN for _, s in plans]
     heights = [float(side[1]) for side in sides] or [1.0]
     size = max([float(side[0]) for side in sides] or [1.0]), sum(heights)
-    figure = import_optional("`plan`", "matplotlib.figure", "tools").Figure(figsize=size, dpi=DPI)
+    figure = import_optional("`plan`", "matplotlib.figure", "plans").Figure(figsize=size, dpi=DPI)
     top = sum(heights)
     for (k, storey), (width, height) in zip(plans, sides, strict=True):
         top -= height
@@ -127,7 +127,7 @@ def draw_figure(document: dict[str, Any], folder: Path, form: str) -> bytes:
     file = io.BytesIO()
     how = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(form, {})
     options = {"svg.fonttype": "none", "svg.hashsalt": "piccolo"}  # texts stay texts, the same each time
-    with import_optional("`plan`", "matplotlib", "tools").rc_context(options):
+    with import_optional("`plan`", "matplotlib", "plans").rc_context(options):
         figure.savefig(file, format=form, metadata=how)
     return file.getvalue()
 
@@ -192,7 +192,7 @@ def _fraction(color: tuple[int, int, int]) -> tuple[float, ...]:
 
 def make_dxf(document: dict[str, Any]) -> bytes:
     """Points, headings, 95 % ellipses and names in metres of the scan's coordinates."""
-    ezdxf = import_optional("`plan`", "ezdxf", "tools")
+    ezdxf = import_optional("`plan`", "ezdxf", "plans")
     drawing = ezdxf.new("R2010", setup=True)
     drawing.header["$INSUNITS"] = 6
     drawing.header["$PDMODE"] = 34

@@ -27,7 +27,7 @@ from ..cloud.readers.npz import naming_damage
 from ..cloud.voxels import NUM_LEVELS, PHASE, QUANTUM_BITS, WINDOW
 from ..errors import InputError
 from ..files.array_archive import ArrayArchive, write_archive
-from ..files.atomic import replacing
+from ..files.atomic import IS_WINDOWS, replacing
 from ..files.cache import WRITABLE, is_own, make_key, mark_used, own_names, private_folder, recall, remember
 from ..geometry.pose import check_rotation
 from ..geometry.sphere import make_grid
@@ -275,8 +275,11 @@ def hold_unchanged(path: Path, is_copied: bool) -> Iterator[Path | None]:
 
     A file in the cache, where only the user may write, is only ever replaced whole. Any other may be
     truncated or overwritten in place at any time, which would kill, or mislead, a process that has mapped it.
-    A copy in which the caller finds damage is removed.
+    A copy in which the caller finds damage is removed. On Windows no file that is mapped could be replaced.
     """
+    if IS_WINDOWS:
+        yield None
+        return
     if NAME.fullmatch(path.name) and is_own(path.parent.stat(), WRITABLE):
         yield path
         return

@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arguments import check_fields
+from ..arguments import MAX_SPEED, MAX_STEP, check_fields
 from ..arrays import Array
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Localization
@@ -28,9 +28,7 @@ from ..scan_map.scan_map import ScanMap
 How = Literal["alone", "near", "tracked", "none"]
 MOST_EXPECTED = 3.0  # [log] that a frame gains at most by being where it was to be expected
 MOST_ODDS = 8.0  # [log] that one frame may add: errors outside the model allow no more certainty
-MAX_SPEED = 2.0  # [m/s] of a walking person with a camera
 MAX_ACCELERATION = 2.0  # [m/s^2]
-MAX_STEP = 5.0  # [m] from one frame without time to the next
 REACH_SLACK = COARSE_SPACING / 2.0  # [m] beyond what a person walks: places are as rough as their grid
 JUMP_LOG = -9.0  # log odds of a jump to any place: lift, cut, pocket, a place that was not scanned
 

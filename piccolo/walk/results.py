@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import MIN_CONFIDENCE
 from ..arrays import Array
 from ..confidence.alternatives import MAX_ALTERNATIVES
-from ..confidence.confidence import LOCALIZED, MIN_CONFIDENCE
+from ..confidence.confidence import LOCALIZED
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Alternative, Localization

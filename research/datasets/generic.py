@@ -8,10 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
+from piccolo.arguments import PICTURES
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_json, read_text
 from piccolo.geometry.pose import Pose, rotation_from_quaternion_wxyz
-from piccolo.panorama.cube import SUFFIXES
 
 from . import model
 
@@ -86,7 +86,7 @@ def _trajectory(path: Path, options: model.ConvertOptions, notes: list[str]) -> 
     folder = options.images or options.folder / "images"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, wanted pictures named by the times in {path.name}")
-    pictures = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in SUFFIXES}
+    pictures = {file.stem: file for file in sorted(folder.iterdir()) if file.suffix.lower() in PICTURES}
     lines = [line.split() for line in read_text(path, WANTED).splitlines()]
     lines = [fields for fields in lines if fields and not fields[0].startswith("#")]
     rows = []

@@ -13,11 +13,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from piccolo.arguments import PICTURES
 from piccolo.arrays import Uint16s
 from piccolo.errors import InputError
 from piccolo.files.json_file import read_json
 from piccolo.geometry.pose import Pose, move, yaw_rotation
-from piccolo.panorama.cube import SUFFIXES
 
 from . import model
 
@@ -153,7 +153,7 @@ def list_omniscenes(options: model.ConvertOptions) -> model.SceneList:
     for split in _glob(options.folder, PANORAMAS):
         for sequence in sorted(split.iterdir()):
             if match := SEQUENCE.match(sequence.name):
-                files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in SUFFIXES)
+                files = sorted(path for path in sequence.iterdir() if path.suffix.lower() in PICTURES)
                 pictures[match[1], split.parent / "pcd" / f"{match[1]}.txt"] += files
     specs = [
         model.SceneSpec(OMNISCENES, room, (model.CloudPart(cloud),), _omniscenes_panoramas(options, files))
@@ -193,7 +193,7 @@ def list_mpo(options: model.ConvertOptions) -> model.SceneList:
     num_alone = 0
     for stem, found in files.items():
         clouds = [path for path in found if model.is_cloud(path)]
-        pictures = [path for path in found if path.suffix.lower() in SUFFIXES]
+        pictures = [path for path in found if path.suffix.lower() in PICTURES]
         picture = min(pictures, key=lambda path: path.suffix.lower() not in (".jpg", ".jpeg"), default=None)
         if not clouds or picture is None:
             num_alone += len(clouds[:1])

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from piccolo.batch.localizer import Localizer
-from piccolo.cli import execution, options
+from piccolo.cli import execution, options, settings as cli_settings
 from piccolo.cli.command import (
     EXIT_BAD_INPUT,
     Arguments,
@@ -159,7 +159,7 @@ def check_clouds(scenes: Sequence[Scene], rows: Sequence[QueryResult], arguments
     for scene in scenes:
         results = [row.result for row in rows if row.scene == scene.name and row.result.source.cloud_sha256]
         if results and scene.cloud.is_file():
-            digest = scan_sha256_of([scene.cloud], options.cache_from(arguments))
+            digest = scan_sha256_of([scene.cloud], cli_settings.cache_from(arguments))
             if note := check_scan(results, digest, str(scene.cloud), arguments.force):
                 arguments.note(f"warning: {note}")
 
@@ -263,7 +263,7 @@ def main(arguments: Arguments) -> int:
     check_usage(arguments)
     with checking_options():
         limit_memory(arguments.max_memory)
-        config = options.localizer_from(arguments)
+        config = cli_settings.localizer_from(arguments)
     thresholds = Thresholds(arguments.max_distance, float(np.radians(arguments.max_angle)))
     scenes = find_scenes(arguments.scenes or [])
     check_files(arguments, input_files(scenes))

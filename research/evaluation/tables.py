@@ -292,7 +292,7 @@ def alone_table(walks: dict[str, list[Frame]], thresholds: Thresholds) -> Table:
 
 def new_figure(**options: Any) -> Figure:
     """Return an empty figure that belongs to no window, by matplotlib, whose import takes half a second."""
-    return import_optional("a plot", "matplotlib.figure", "tools").Figure(**options)
+    return import_optional("a plot", "matplotlib.figure", "plans").Figure(**options)
 
 
 def figure_png(figure: Figure) -> bytes:

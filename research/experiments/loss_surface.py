@@ -19,7 +19,8 @@ from scipy.ndimage import minimum_filter
 from piccolo import InputError, Pose
 from piccolo.arrays import Array, Int64s, Mask
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
-from piccolo.cli.options import add_cloud_options, cloud_settings_from
+from piccolo.cli.options import add_cloud_options
+from piccolo.cli.settings import cloud_settings_from
 from piccolo.cloud.soa import LocalCloud, PackedPoints
 from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import uniform_rotations, uniform_yaws

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import minimize
 from scipy.stats import chi2
 
+from piccolo.arguments import MIN_CONFIDENCE
 from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, option
 from piccolo.confidence import confidence
@@ -173,7 +174,7 @@ def run(arguments: Arguments) -> int:
             continue
         stated = [o.probabilities(models.get(o.evidence)) for o in outcomes]
         right = [np.arange(len(p)) == o.right for p, o in zip(stated, outcomes, strict=True)]
-        called = [confidence.classify(p, confidence.MIN_CONFIDENCE) for p in stated]
+        called = [confidence.classify(p, MIN_CONFIDENCE) for p in stated]
         rows = [(o.case, status, o.right == 0) for o, status in zip(outcomes, called, strict=True)]
         print_cases(f"case, {name}", rows)
         all_stated = np.concatenate(stated).tolist()

@@ -1,0 +1,22 @@
+# The public names: type checkers read them here, and at run time each is imported from here at its first use.
+from .confidence.covariance import PoseCovariance as PoseCovariance
+from .confidence.localization import (
+    Alternative as Alternative,
+    Evidence as Evidence,
+    FocalLength as FocalLength,
+)
+from .errors import InputError as InputError
+from .geometry.pose import Pose as Pose
+from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
+from .opening import Cloud as Cloud, open_scan as open_scan
+from .paper.localize import PaperSettings as PaperSettings
+from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
+from .report.build import ReportSettings as ReportSettings, write_report as write_report
+from .result import Result as Result, Source as Source
+from .scan import Scan as Scan
+from .scan_walk import Walk as Walk
+from .walk.frames import Motion as Motion
+from .walk.path import Gap as Gap
+from .walk.results import Alone as Alone, WalkFrame as WalkFrame
+
+__version__: str

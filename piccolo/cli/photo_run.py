@@ -1,0 +1,357 @@
+"""The work of localize.py: its photos, one by one or together, and its results."""
+
+import itertools
+import os
+import sys
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..batch.inputs import describe_left_out, is_from_stdin, list_panoramas, read_priors
+from ..batch.localizer import LISTINGS, Answer, Localizer, Look, list_changed_by_consensus
+from ..batch.results_file import FileOutput, Output, Records, StreamOutput
+from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
+from ..errors import InputError
+from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
+from ..files.line_file import LineFile, open_locked, write_line
+from ..jobs.memory import limit_memory
+from ..jobs.threads import Stopwatch, num_cores
+from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import OpenedScan
+from ..panorama import read_panorama
+from ..panorama.cube import is_cube
+from ..panorama.masks import find_mask
+from ..panorama.photo import sha256_of
+from ..result import FAILED, UNREADABLE
+from ..scan_map.open_map import scan_sha256_of
+from ..scan_map.scan_map import ScanMap
+from ..scan_walk import Walk
+from ..views.pictures import encode_image
+from . import execution, terminal, together
+from .command import Arguments, UsageError, check_distinct, check_suffix, checking_options
+from .execution import Executor, Interruption
+from .options import check_arguments
+from .settings import localizer_from
+
+MAX_STEM = 255 - len(".png")  # [byte] of a file name
+STATUSES = (LOCALIZED, AMBIGUOUS, NOT_LOCALIZED, UNREADABLE, FAILED)
+NUM_MIRRORED = 2  # of the photos that were not localized
+LEFT_HANDED = (
+    "the photos fit the scan mirrored, left for right: its axes are left-handed, which `up` can't mend; "
+    "negate one of its coordinates, or export it with right-handed axes"
+)
+JOINT = ("walk", "video", "relative", "color_scan")  # options of photos that help each other
+Write = Callable[[str], object]
+
+
+@dataclass
+class Run:
+    """A command's batch, and what it has done so far."""
+
+    arguments: Arguments
+    localizer: Localizer
+    panoramas: Iterable[Path]
+    total: int | None  # of the panoramas; None if they come on standard input
+    left_out: Counter[str]  # files in the folders named that are no panoramas, by suffix
+    counts: Counter[str]  # results written, by status
+    cloud_sha256: str | None = None  # of the scan, when it has been opened
+    doubtful: list[str] = field(default_factory=list)  # spheres that were not localized
+
+    @property
+    def looks_again(self) -> bool:
+        """True if photos that are not sure are looked at again beside others."""
+        is_default = isinstance(self.localizer.settings, CoarseToFineSettings)
+        return is_default and self.total not in (None, 1) and not self.localizer.sends_photos
+
+
+def check_files(arguments: Arguments, panoramas: list[Path], total: int | None) -> None:
+    """Refuse, before any work, what could not be written, or would replace an input or another output."""
+    a = arguments
+    given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative, a.odometry))
+    lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
+    pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
+    outputs = {"--out": a.out or STDOUT, "--color-scan": a.color_scan, **pictures}
+    check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
+    mask = arguments.mask and Path(arguments.mask)
+    if mask and mask.is_dir() and panoramas and total and not any(find_mask(mask, p) for p in panoramas):
+        raise InputError(f"{mask}: found no mask of {panoramas[0].name} or another photo, wanted NAME.png")
+    check_output(arguments.out or STDOUT)
+    if arguments.color_scan:
+        check_output(arguments.color_scan)
+    for option, path in pictures.items():
+        if path is None or path.is_dir():
+            continue
+        if total != 1:
+            found = "names on stdin" if total is None else f"{total} photos"
+            raise UsageError(f"{option}: found {found}, wanted one photo or a folder that exists")
+        check_suffix(option, path, (".png",))
+        check_output(path)
+
+
+def prepare_run(arguments: Arguments) -> Run:
+    """Return what is to be done: the options, the panoramas, and how many there are."""
+    with checking_options():
+        check_arguments(arguments)
+        together.check_joint_options(arguments)
+        execution.check_execution(arguments)
+        limit_memory(arguments.max_memory)
+        localizer = localizer_from(arguments, tuple(arguments.cloud))
+    priors = None
+    if arguments.priors:
+        if not isinstance(localizer.settings, CoarseToFineSettings):
+            raise UsageError("--priors: not an option of the preset paper")
+        priors = read_priors(arguments.priors, localizer.settings.prior)
+    masks = arguments.occlusion_mask is not None
+    overlays = arguments.overlay is not None
+    localizer = replace(localizer, priors=priors, makes_overlays=overlays, makes_occlusion_masks=masks)
+    rig = localizer.photo.instant
+    is_one = rig.is_instant if rig else is_cube
+    left_out = Counter[str]()
+    named = list_panoramas(arguments.pano, sys.stdin, left_out, is_one)
+    if is_from_stdin(arguments.pano):
+        check_files(arguments, [], None)
+        return Run(arguments, localizer, named, None, left_out, Counter())
+    known = list(named)
+    check_files(arguments, known, len(known))
+    for pano in known:
+        localizer.ask(pano)
+    note_unused_priors(arguments, localizer)
+    return Run(arguments, localizer, known, len(known), left_out, Counter())
+
+
+def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
+    """Warn of names in the table of priors that no panorama has had."""
+    if localizer.priors and (names := localizer.priors.names_without_panorama):
+        note = f"{len(names)} names without a photo, such as {names[0]}"
+        arguments.note(f"warning: {localizer.priors.path}: {note}")
+
+
+def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
+    """Read and prepare the scan."""
+    arguments = run.arguments
+    workers = arguments.workers(num_threads)
+    scan = localizer.open_scan(workers)
+    for warning in scan.warnings:  # those of a map prepared earlier; others have been written
+        workers.warn(warning)
+    run.cloud_sha256 = scan.prepared.scan_sha256 or None
+    if localizer.priors and isinstance(scan.prepared, ScanMap):
+        localizer.priors.check_scans(scan.prepared)
+    return scan
+
+
+@contextmanager
+def open_output(run: Run) -> Iterator[tuple[Output, Records]]:
+    """Yield where the results go, and which an earlier run has left there."""
+    out = run.arguments.out or STDOUT
+    if is_stdout(out):
+        with closing(StreamOutput(lambda line: print(line, flush=True), run.looks_again)) as output:
+            yield output, Records()
+    elif is_stream(out):
+        with out.open("wb", buffering=0) as stream:
+            write = partial(write_line, stream.fileno(), out)
+            with closing(StreamOutput(write, run.looks_again)) as output:
+                yield output, Records()
+    else:
+        with open_locked(out) as file:
+            records = take_up_results(run, file)
+            yield FileOutput(file, records), records
+
+
+def take_up_results(run: Run, file: LineFile) -> Records:
+    """Return the results of earlier runs in the output, which are to be as those of this run would be."""
+    records = Records(file.path)
+    if file.size and not run.arguments.overwrite:
+        expected = run.localizer.expect(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
+        records.read(expected, None if run.total is None else run.panoramas)
+    return records
+
+
+def record(run: Run, answer: Answer, write: Write) -> None:
+    """Write the pictures asked for and the result, and say what was found."""
+    arguments = run.arguments
+    result = answer.result
+    name = Path(result.pano).stem
+    while len(os.fsencode(name)) > MAX_STEM:
+        name = name[:-1]
+    pictures = (arguments.overlay, answer.overlay), (arguments.occlusion_mask, answer.occlusion_mask)
+    for path, png in pictures:
+        if path and png is not None:
+            write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
+    execution.print_result(arguments, result, answer.warnings)
+    write(result.to_json())
+    run.counts[result.status] += 1
+    if result.best_pose is not None and result.pose is None and not result.cameras:
+        run.doubtful.append(result.pano)
+
+
+def localize_all(
+    run: Run, records: Records, left: Iterable[Path], executor: Executor, write: Write
+) -> Interruption:
+    """Localize the panoramas that are left, write each result as it comes, until a signal ends it."""
+    is_one = run.total == 1
+    bar: dict[str, Any] = {"desc": "photos", "total": run.total, "unit": ""}
+    bar["initial"] = records.counts.total()
+    show = partial(terminal.show_progress, is_quiet=run.arguments.quiet or is_one, **bar)
+    tasks = map(run.localizer.task, left)
+    with execution.interruptible() as interruption:
+        signals = None if is_one else interruption
+        for answer in execution.answer_all(executor, run.localizer, tasks, show, signals, run.cloud_sha256):
+            record(run, answer, write)
+    return interruption
+
+
+def follow_consensus(run: Run, output: Output) -> Sequence[str]:
+    """Change results by what all photos of a camera say of its focal length; return the lines."""
+    settings = run.localizer.settings
+    if not isinstance(settings, CoarseToFineSettings):
+        return output.texts()
+    for number, status, result in list_changed_by_consensus(output.texts(), settings.min_confidence):
+        replace_line = partial(output.replace, number)
+        if result.status == status:
+            replace_line(result.to_json())
+        else:
+            run.counts[status] -= 1
+            record(run, Answer(result, result.warnings), replace_line)
+    return output.texts()
+
+
+def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
+    """Look again at photos, with what others say of their camera, then beside others, until a signal."""
+    localizer = run.localizer
+    for list_looks in LISTINGS:
+        looks = list_looks(follow_consensus(run, output))
+        tasks = (localizer.task(Path(look.pano))._replace(look=look) for look in looks)
+        bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
+        show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
+        with execution.interruptible() as interruption:
+            digest = run.cloud_sha256
+            answers = execution.answer_all(executor, localizer, tasks, show, interruption, digest)
+            for look, answer in zip(looks, answers, strict=False):
+                record_second(run, look, answer, output)
+        if interruption.number:
+            return interruption
+    follow_consensus(run, output)
+    return interruption
+
+
+def record_second(run: Run, look: Look, answer: Answer, output: Output) -> None:
+    """Replace a result by that of a second look; if that failed, say why."""
+    result = answer.result
+    replace_line = partial(output.replace, look.number)
+    is_other = not look.first or (result.beside is not None and result.beside.photos)
+    if result.error is not None:
+        run.arguments.error(result.error)
+    elif is_other:
+        run.counts[look.status] -= 1
+        record(run, answer, replace_line)
+    else:
+        replace_line(result.to_json())
+
+
+def note_left_handed(run: Run, records: Records, executor: Executor, interruption: Interruption) -> None:
+    """Say so if no photo was localized, but most of the first spheres are when they are mirrored."""
+    is_over = interruption.number or run.counts[LOCALIZED] or records.counts[LOCALIZED]
+    if is_over or run.arguments.quiet or len(run.doubtful) < NUM_MIRRORED:
+        return
+    localizer = run.localizer
+    # the results are written: it is only a hint
+    with suppress(OSError, InputError), temporary_folder() as folder:
+        paths = [folder / f"{k}.png" for k in range(NUM_MIRRORED)]
+        for path, photo in zip(paths, run.doubtful, strict=False):
+            photo_asked, _ = localizer.ask(Path(photo))
+            panorama = read_panorama(photo_asked, localizer.cloud_settings.labels)
+            shown = np.dstack([panorama.rgb, np.uint8(255) * panorama.is_valid])
+            path.write_bytes(encode_image(shown[:, ::-1], ".png"))
+        answers = execution.answer_all(executor, localizer, map(localizer.task, paths))
+        found = [answer.result.status for answer in answers]
+        if 2 * found.count(LOCALIZED) >= NUM_MIRRORED:
+            run.arguments.note(LEFT_HANDED)
+
+
+def finish(run: Run, records: Records, output: Output, interruption: Interruption, seconds: float) -> int:
+    """Put the results in order, say what was done, and how to go on; return the exit code."""
+    arguments = run.arguments
+    counts = Counter(run.counts)
+    counts.update(records.counts)
+    num_dropped = 0
+    if isinstance(output, FileOutput) and not interruption.number:
+        num_dropped = output.finish(keeps_others=run.total is None)
+    if run.total != 1 or run.left_out or num_dropped:
+        words = ", ".join(f"{counts[status]} {status.replace('_', ' ')}" for status in STATUSES)
+        again = ", which the same command will try again" if counts[FAILED] else ""
+        note = f"{counts.total()} photos in {seconds:.0f} s: {words}{again}"
+        dropped = f"dropped {num_dropped} results of photos that are no longer given" if num_dropped else ""
+        parts = note, dropped, describe_left_out(run.left_out)
+        arguments.note("; ".join(filter(None, parts)))
+    if interruption.number:
+        return interruption.stop(arguments, f"{counts.total()} results", isinstance(output, FileOutput))
+    if run.total is None:
+        note_unused_priors(arguments, run.localizer)
+    return execution.choose_exit_code(+counts)
+
+
+def run_jointly(run: Run) -> int:
+    """Localize photos that help each other, return the exit code."""
+    arguments = run.arguments
+    settings = run.localizer.settings
+    if not isinstance(settings, CoarseToFineSettings):
+        option = next(name for name in JOINT if getattr(arguments, name))
+        raise UsageError(f"--{option.replace('_', '-')}: not an option of the preset paper")
+    photos = list(run.panoramas)
+    opening = partial(open_scan, run, run.localizer, arguments.threads or num_cores())
+    if arguments.walk or arguments.video:
+        with together.walk_frames(arguments, run.localizer.photo, photos) as (frames, motion):
+            if run.left_out:
+                arguments.note(describe_left_out(run.left_out))
+            walk = Walk(opening(), settings, motion)
+            return together.run_together(arguments, together.make_walk_job(arguments, frames, walk))
+    make_job = together.make_bundle_job if arguments.relative else together.make_coloring_job
+    return together.run_together(arguments, make_job(arguments, photos, run.localizer, opening()))
+
+
+def localize_photos(arguments: Arguments) -> int:
+    """Localize every panorama, write the results, return the exit code."""
+    watch = Stopwatch()
+    run = prepare_run(arguments)
+    if any(getattr(arguments, name) for name in JOINT):
+        return run_jointly(run)
+    rig = run.localizer.photo.instant
+    with open_output(run) as (output, records):
+        panoramas = iter(run.panoramas)
+        if run.total is not None:
+            show = arguments.progress()
+            panoramas = show(panoramas, run.total, "check what is finished")
+        left = records.remaining(panoramas, lambda pano: sha256_of(pano, rig))
+        num_left = None
+        if run.total is not None:
+            known = list(left)
+            left = iter(known)
+            num_left = len(known)
+        first = next(left, None)
+        texts = follow_consensus(run, output) if first is None and run.looks_again else []
+        looks = [look for list_looks in LISTINGS for look in list_looks(texts)]
+        if first is None and not looks:
+            arguments.note(f"{arguments.out or 'nothing'}: nothing is left to do")
+            return finish(run, records, output, Interruption(), 0.0)
+        num_jobs = execution.count_jobs(arguments, num_left or len(looks) or None)
+        opening = partial(open_scan, run)
+        with (
+            execution.connecting(arguments) as cluster,
+            execution.executing(arguments, run.localizer, num_jobs, cluster, opening) as place,
+            watch.stage("all"),
+        ):
+            executor, run.localizer = place
+            if isinstance(output, FileOutput):
+                output.begin()
+            rest = itertools.chain([first] if first else [], left)
+            interruption = localize_all(run, records, rest, executor, output.write)
+            if run.looks_again and not interruption.number:
+                interruption = look_again(run, executor, output)
+            note_left_handed(run, records, executor, interruption)
+        return finish(run, records, output, interruption, watch.seconds["all"])

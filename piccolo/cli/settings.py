@@ -1,0 +1,103 @@
+"""The settings that options of a command ask for."""
+
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+from ..batch.localizer import Localizer
+from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, check_crs
+from ..errors import InputError
+from ..geometry.colors import Labels
+from ..localization.settings import CoarseToFineSettings
+from ..opened_scan import Settings
+from ..panorama import check_labels
+from ..paper.localize import PaperSettings
+from ..photo import Photo, Prior
+from ..scan_map.open_map import CachePolicy
+from .command import Arguments
+from .options import NONE
+
+PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
+ONLY_DEFAULT = ("near", "height", "heading", "within", "gravity_vector", "refine_focal")
+
+
+def cloud_settings_from(arguments: Arguments) -> CloudSettings:
+    """Return the options of add_cloud_reading_options."""
+    scale = METRES["m"] if arguments.units is None else arguments.units
+    crs = vars(arguments).get("crs")  # not of commands without photos
+    if crs == NONE:
+        crs = None
+    if crs:
+        check_crs(crs)
+    channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
+    labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
+    color_range = None if arguments.color_range == "auto" else float(arguments.color_range)
+    return CloudSettings(scale, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns))
+
+
+def cache_from(arguments: Arguments) -> CachePolicy:
+    """Return where prepared maps are kept."""
+    is_used = arguments.cache != Path(NONE)
+    return CachePolicy(is_used, arguments.cache if is_used else None)
+
+
+def localizer_from(arguments: Arguments, paths: tuple[Path, ...] = ()) -> Localizer:
+    """Return what localizes photos in the scan of some files as the options ask for."""
+    cloud_settings = cloud_settings_from(arguments)
+    names = {f.name for f in fields(Photo)}
+    photo = Photo(Path(), **{name: value for name, value in vars(arguments).items() if name in names})
+    check_labels(photo, cloud_settings.labels)
+    return Localizer(paths, settings_from(arguments), cloud_settings, photo, cache_from(arguments))
+
+
+def settings_from(arguments: Arguments) -> Settings:
+    """Return the settings that the options ask for; an option of the other preset is refused."""
+    name, *words = arguments.preset
+    if name not in PRESETS:
+        raise InputError(f"--preset: found {name!r}, wanted {' or '.join(PRESETS)}")
+    given = parse_settings(name, words)
+    asked = {"gravity": arguments.gravity, "min_confidence": arguments.min_confidence}
+    given |= {name: value for name, value in asked.items() if value is not None}
+    options = vars(arguments)
+    if name == "paper":
+        foreign = [option for option in ONLY_DEFAULT if options.get(option) not in (None, False)]
+        foreign += ["up"] if arguments.up != "auto" else []
+        if foreign:
+            raise InputError(f"--{foreign[0].replace('_', '-')}: not an option of the preset paper")
+    else:
+        given["prior"] = prior_from(options)
+    return PRESETS[name](**given)
+
+
+def prior_from(options: dict[str, Any]) -> Prior:
+    """Return what the options say of the poses of all photos; nothing of a command without them."""
+    near = options.get("near") or []
+    return Prior(
+        near=tuple(near[:3]) or None,
+        radius=near[3] if near else None,
+        height=options.get("height"),
+        heading_deg=options.get("heading"),
+        within=options.get("within") or (),
+        use_gps=options.get("crs") != NONE,
+    )
+
+
+def parse_settings(preset: str, words: Sequence[str]) -> dict[str, Any]:
+    """Return the settings of a preset that are written as NAME=VALUE."""
+    hints = {name: hint for name, hint in get_type_hints(PRESETS[preset]).items() if name != "prior"}
+    given: dict[str, Any] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        if name not in hints:
+            raise InputError(f"--preset {preset}: found {word!r}, wanted NAME=VALUE of {', '.join(hints)}")
+        hint = hints[name]
+        choices: dict[str, Any] = {choice: choice for choice in get_args(hint)}
+        if hint is bool:
+            choices = {"true": True, "false": False}
+        try:
+            given[name] = choices[text] if choices else hint(text)
+        except (KeyError, ValueError) as error:
+            wanted = f"one of {', '.join(choices)}" if choices else hint.__name__
+            raise InputError(f"--preset {preset}: found {word!r}, wanted {wanted}") from error
+    return given
