@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from test_cloud_morton import whole
 
 from piccolo.cloud.readers import mesh as mesh_module, mesh_files
-from piccolo.cloud.readers.mesh import compute_weights, linear_to_srgb, look_up, open_mesh, srgb_to_linear
+from piccolo.cloud.readers.mesh import compute_weights, look_up, open_mesh
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_cloud

@@ -172,16 +172,18 @@ def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> Exif
         cut = film / FILM_DIAGONAL * _largest_diagonal(size)
         if cut == focal:
             return ExifFocal(focal, math.hypot(lens, rounding), source)
-        source += f" ({focal:.0f} px for this shape of sensor, up to {cut:.0f} if a wider or higher one was cut)"
+        source += (
+            f" ({focal:.0f} px for this shape of sensor, up to {cut:.0f} if a wider or higher one was cut)"
+        )
         deviation = math.hypot(lens, rounding, math.log(cut / focal) / 2.0)
         return ExifFocal(math.sqrt(focal * cut), deviation, source)
     return None
 
 
 def _largest_diagonal(size: tuple[int, int]) -> float:
-    """Return the diagonal [px] of the largest sensor of a usual shape of which a picture has the whole width
-    or height; of a picture of such a shape its own."""
-    longer, shorter = max(size), min(size)
+    """Return the diagonal [px] of the largest usual sensor whose whole width or height a picture has."""
+    longer = max(size)
+    shorter = min(size)
     if any(abs(longer / shorter / shape - 1.0) <= ASPECT_TOLERANCE for shape in SENSOR_SHAPES):
         return math.hypot(size[0], size[1])
     sensors = [(max(longer, shorter * shape), max(shorter, longer / shape)) for shape in SENSOR_SHAPES]

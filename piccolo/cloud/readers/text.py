@@ -22,7 +22,7 @@ from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
-from .text_columns import COMMENT_MARKS, is_number, split, text_blocks
+from .text_columns import COMMENT_MARKS, Spelling, is_number, split, text_blocks
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
@@ -48,7 +48,7 @@ class LineLayout(NamedTuple):
     num_columns: int | None = None  # of each line; None: there may be any more than those read
     start: int = 0  # [byte] of the first line
     delimiter: str | None = None  # None: blanks and tabs
-    has_decimal_commas: bool = False
+    spelling: Spelling = Spelling()
     has_counts: bool = False  # a lone whole number counts the lines that follow, and is skipped
 
 
@@ -177,7 +177,7 @@ class NumberLines:
 def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
     """Strip lines of blanks; return the lines of numbers."""
     return [
-        line.replace(b",", b".") if layout.has_decimal_commas else line
+        layout.spelling.plain(line)
         for line in filter(None, map(bytes.strip, lines))
         if not line.startswith(COMMENT_MARKS) and not (layout.has_counts and line.isdigit())
     ]
@@ -204,8 +204,7 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
 def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_counts: bool) -> PointSource:
     wanted = PTS_WANTED if has_counts else WANTED
     fields = text_columns.read_fields(path, wanted)
-    first = fields.first.replace(b",", b".") if fields.has_decimal_commas else fields.first
-    num_columns = len(split(first, fields.delimiter))
+    num_columns = len(split(fields.spelling.plain(fields.first), fields.delimiter))
     rows = text_columns.read_samples(path, fields, num_columns)
     header = fields.names if channel == "shape" or len(fields.names) == num_columns else ()
     header = header or (fields.names if reader.find_fields(fields.names, channel) else ())
@@ -224,7 +223,7 @@ def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_count
         raise error(f"{path}: {found}, {wanted}")
     exact = num_columns if has_counts else None
     columns = tuple(names.index(name) for name in chosen)
-    layout = LineLayout(columns, exact, fields.start, fields.delimiter, fields.has_decimal_commas, has_counts)
+    layout = LineLayout(columns, exact, fields.start, fields.delimiter, fields.spelling, has_counts)
     is_fraction = path.suffix.lower() == ".xyzrgb" or text_columns.has_names_of_fractions(chosen)
     if len(columns) == NUM_WITH_INTENSITY and channel == "colors":  # packed
 

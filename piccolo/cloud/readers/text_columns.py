@@ -22,6 +22,9 @@ MAX_COLUMNS = 64
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 UNIT = re.compile(r"[\[(].*")  # behind a name
+HEX_COLOR = re.compile(
+    rb"(?<=[\s;,])[\"']?(?:#|0[xX]ff|0[xX])([0-9a-fA-F]{6})(?![0-9a-fA-F])[\"']?"
+)  # behind a number
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 SKIP = "-"
 POSITION = ("x", "y", "z")
@@ -39,6 +42,18 @@ USUAL = (POSITION, BARE, (*POSITION, *RGB))
 USUAL_OF_PTS = ((*BARE, *RGB),)
 
 
+class Spelling(NamedTuple):
+    """The way in which a file's lines write numbers."""
+
+    has_decimal_commas: bool = False
+    has_hex_colors: bool = False  # #rrggbb or 0xrrggbb
+
+    def plain(self, line: bytes) -> bytes:
+        """Return a line with decimal points, and colours as whole numbers."""
+        line = line.replace(b",", b".") if self.has_decimal_commas else line
+        return HEX_COLOR.sub(lambda found: b"%d" % int(found[1], 16), line) if self.has_hex_colors else line
+
+
 class Fields(NamedTuple):
     """The fields of the lines of numbers, and what is known of them."""
 
@@ -46,7 +61,7 @@ class Fields(NamedTuple):
     num_lines: int  # before it
     first: bytes  # that line
     delimiter: str | None  # None: blanks and tabs
-    has_decimal_commas: bool
+    spelling: "Spelling"
     names: tuple[str, ...]  # of all, in lower case; empty without a header
     header: str
 
@@ -87,10 +102,11 @@ def read_fields(path: Path, wanted: str) -> Fields:
         delimiter = next((mark for mark in ";," if mark in text), None)
         has_commas = _has_decimal_commas(text, delimiter)
         delimiter = None if has_commas and delimiter == "," else delimiter
-        fields = split(line.replace(b",", b".") if has_commas else line, delimiter)
+        spelling = Spelling(has_commas, HEX_COLOR.search(line) is not None)
+        fields = split(spelling.plain(line), delimiter)
         is_count = len(fields) == 1 and text.isdecimal()
         if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
-            return Fields(start, num_lines, line, delimiter, has_commas, names, header)
+            return Fields(start, num_lines, line, delimiter, spelling, names, header)
         found = tuple(
             UNIT.sub("", name).strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter) if name
         )
@@ -132,7 +148,7 @@ def read_samples(path: Path, fields: Fields, num_columns: int) -> Array:
         blocks = [next(text_blocks(path, HEAD_SIZE), b"")[fields.start :].splitlines()[:-1]]
     rows = []
     for line in (line for block in blocks for line in block):
-        numbers = split(line.replace(b",", b".") if fields.has_decimal_commas else line, fields.delimiter)
+        numbers = split(fields.spelling.plain(line), fields.delimiter)
         if len(numbers) == num_columns and not line.strip().startswith(COMMENT_MARKS):
             rows.append([float(field) if is_number(field) else np.nan for field in numbers[:MAX_COLUMNS]])
     found = np.array(rows, np.float64).reshape(-1, min(num_columns, MAX_COLUMNS))
