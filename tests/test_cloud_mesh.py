@@ -13,6 +13,7 @@ from piccolo.cloud.readers.mesh import compute_weights, look_up, open_mesh
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_cloud
+from piccolo.geometry.colors import linear_to_srgb, srgb_to_linear
 
 
 def test_an_obj_texture_stands_upright_in_any_encoding(tmp_path):

@@ -277,29 +277,35 @@ class Table(NamedTuple):
         for columns in self.read_columns():
             points = points_of(columns)
             values = columns[3]
-            if values.dtype.itemsize == np.dtype(self.types[3]).itemsize:
-                bits = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="))).view(np.uint32)
-            else:
-                values = np.where(np.isfinite(points).all(axis=1), values, 0.0)
-                bits, is_right = _bits_of_text(values, self.types[3])
-                if not is_right.all():
-                    wrong = int(np.argmin(is_right))
-                    place = point_label(self.path, num_before + wrong)
-                    raise InputError(
-                        f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {self.types[3]}"
-                    )
+            is_text = values.dtype.itemsize != np.dtype(self.types[3]).itemsize
+            values = np.where(np.isfinite(points).all(axis=1), values, 0) if is_text else values
+            bits, is_right = _find_bits(values, self.types[3], is_text)
+            if not is_right.all():
+                wrong = int(np.argmin(is_right))
+                place = point_label(self.path, num_before + wrong)
+                raise InputError(
+                    f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {self.types[3]}"
+                )
             num_before += len(bits)
             yield points, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
 
 
-def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
-    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits."""
-    if type_ == "f4":
-        # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
-        is_right = np.abs(values) <= LARGEST
-        return np.where(is_right, values, 0.0).astype(np.float32).view(np.uint32), is_right
-    is_right = (values >= -(2.0**31)) & (values < 2.0**32) & (values == np.floor(values))
-    return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right
+def _find_bits(values: NDArray[Any], type_: str, is_text: bool) -> tuple[NDArray[np.uint32], Mask]:
+    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits.
+
+    A whole number is meant as such though the field is declared a float, as scripts write it: in the bits of
+    that float alpha would be neither 0 nor 255.
+    """
+    with np.errstate(invalid="ignore"):
+        is_whole = (values >= 1 if type_ == "f4" else values >= -(2.0**31)) & (values < 2.0**32)
+        is_whole &= values == np.floor(values)
+    whole = np.where(is_whole, values, 0).astype(np.int64).astype(np.uint32)
+    if type_ != "f4":
+        return whole, is_whole
+    # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
+    is_right = (np.abs(values) <= LARGEST) if is_text else np.ones(len(values), np.bool_)
+    floats = np.where(is_right, values, 0).astype(np.float32) if is_text else np.ascontiguousarray(values, "=f4")
+    return np.where(is_whole, whole, floats.view(np.uint32)), is_right
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:

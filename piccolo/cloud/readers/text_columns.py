@@ -107,9 +107,8 @@ def read_fields(path: Path, wanted: str) -> Fields:
         is_count = len(fields) == 1 and text.isdecimal()
         if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
             return Fields(start, num_lines, line, delimiter, spelling, names, header)
-        found = tuple(
-            UNIT.sub("", name).strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter) if name
-        )
+        words = split(line.strip().lstrip(b"#/ "), delimiter)
+        found = tuple(UNIT.sub("", word).strip(' "').lower() for word in words)
         if any({*some} <= {*found} for some in POINT_NAMES):
             names = found
             header = text
