@@ -109,7 +109,7 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
     [
         (crop_fields(0, 0, 300, 200, (70_000, 35_000)), "found 300 x 200 of a sphere 70000 wide, wanted"),
         (crop_fields(0, 0, 300, 200, (9000, 4500)), "found 300 x 200, 0.15 % of the sphere, wanted at least"),
-        (crop_fields(0, 0, 300, 200, (900, 200)), "of a sphere of 900 x 200, wanted that width = 2 x height"),
+        (crop_fields(0, 0, 300, 200, (900, 250)), "of a sphere of 900 x 250, wanted that width = 2 x height"),
         ({"ProjectionType": "Cylin\ndrical"}, "names the projection .cylin.+ndrical., wanted equirect"),
     ],
 )

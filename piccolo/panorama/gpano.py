@@ -101,9 +101,9 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     """Return the part of the sphere that a picture of `aspect` (width / height) shows.
 
     All of it if there are no fields. These count pixels of the picture as it was made: only their ratios are
-    used, so that a picture made smaller later is placed right. Some phones give a strip's own height as that of
-    the sphere: its middle is on the horizon. None if the fields make no sense or are of a
-    picture of another shape.
+    used, so that a picture made smaller later is placed right. Some phones give a strip's own height as that
+    of the sphere: its middle is on the horizon. None if the fields make no sense or are of a picture of
+    another shape.
     """
     if not fields.keys() & set(CROP_FIELDS):
         return CropRegion()

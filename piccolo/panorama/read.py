@@ -206,7 +206,7 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
     if region is None or (region.is_full and not is_two_to_one):
         wrong = "no field of view is given" if photo.projection else "no focal length in EXIF"
         wrong = "a crop in the metadata that does not fit it" if region is None else wrong
-        wrong = f"no {missing[-1]} in its metadata" if missing else wrong
+        wrong = f"a crop in the metadata without {missing[-1]}" if missing else wrong
         found = f"found a picture of {width} x {height}, which is no full panorama (2:1), and {wrong}"
         raise InputError(f"{photo.path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
     if region.is_full and is_dual_fisheye(picture.rgb):

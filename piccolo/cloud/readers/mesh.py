@@ -207,7 +207,10 @@ def _clouds(loaded: Loaded, is_bare: bool) -> list[RawCloud]:
         return []
     clouds = []
     for matrix, name in _nodes(loaded):
-        points = transform_points(np.array(parts[name].vertices, np.float64), np.array(matrix, np.float64))
+        vertices = np.array(parts[name].vertices, np.float64)
+        if vertices.shape[1:] != (3,):
+            raise InputError(f"{loaded.path}: vertices of shape {vertices.shape}, wanted three numbers each")
+        points = transform_points(vertices, np.array(matrix, np.float64))
         raw = parts[name].metadata.get("color")
         if raw is None and not is_bare:
             raise MissingChannelError(f"{loaded.path}: points without colours, {WANTED}")

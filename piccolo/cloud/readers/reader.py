@@ -35,7 +35,7 @@ USUAL = {"u2": 65535.0, "f2": 1.0, "f4": 1.0, "f8": 1.0}
 BYTE_RANGE = 255.0
 EXCESS = 1.001  # of full brightness, up to which a value is rounded to it
 STRAY = 4.0  # times full brightness is a wrong colour, which is refused, not one of a wider range
-PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
+PACKED_NAMES = ("rgb", "rgba", "color")  # 0xAARRGGBB in one number
 SPLAT_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussian splats
 FRACTION_NAMES = ("rf", "gf", "bf")  # CloudCompare's for colours 0-1
 COLOR_NAMES = (
@@ -304,7 +304,9 @@ def _find_bits(values: NDArray[Any], type_: str, is_text: bool) -> tuple[NDArray
         return whole, is_whole
     # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
     is_right = (np.abs(values) <= LARGEST) if is_text else np.ones(len(values), np.bool_)
-    floats = np.where(is_right, values, 0).astype(np.float32) if is_text else np.ascontiguousarray(values, "=f4")
+    floats = (
+        np.where(is_right, values, 0).astype(np.float32) if is_text else np.ascontiguousarray(values, "=f4")
+    )
     return np.where(is_whole, whole, floats.view(np.uint32)), is_right
 
 
