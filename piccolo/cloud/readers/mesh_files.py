@@ -40,7 +40,6 @@ MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
 BYTES_OF_TYPE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 NUM_OF_SHAPE = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 FLOAT = 5126
-LARGEST = {5120: 127, 5121: 255, 5122: 32767, 5123: 65535}  # whole numbers, that stand for 1
 POINTS = 0
 TRIANGLES = 4
 STRIP = 5
@@ -332,20 +331,14 @@ def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes
 def _split_meshes(tree: Json) -> None:
     """Place each primitive by a node of its own: trimesh names those of one mesh by chance, some alike."""
     parts: list[Json] = []
-    scales: list[Json] = []  # of whole numbers that stand for fractions
-    accessors = tree.get("accessors", [])
     nodes: list[Json] = tree.get("nodes", [])
     splits: list[list[int]] = []
     for mesh in tree.get("meshes", []):
         splits.append([*range(len(parts), len(parts) + len(mesh["primitives"]))])
         parts += [{"primitives": [primitive]} for primitive in mesh["primitives"]]
-    for part in parts:
-        positions = accessors[part["primitives"][0]["attributes"]["POSITION"]]
-        largest = LARGEST[positions["componentType"]] if positions.get("normalized") else 1
-        scales.append({"scale": [1.0 / largest] * 3} if largest > 1 else {})
     for node in nodes[:]:
         if "mesh" in node:
-            added = [{"mesh": part, **scales[part]} for part in splits[node.pop("mesh")]]
+            added = [{"mesh": part} for part in splits[node.pop("mesh")]]
             node["children"] = [*node.get("children", []), *range(len(nodes), len(nodes) + len(added))]
             nodes += added
     tree["meshes"] = parts
@@ -365,8 +358,10 @@ def _primitive(path: Path, accessors: list[Json], materials: list[Material], pri
     counts = {accessors[i]["count"] for i in attributes.values()}
     if len(counts) > 1:
         raise InputError(f"{path}: a primitive with {sorted(counts)} rows, wanted as many of each")
-    if "TEXCOORD_0" in attributes and accessors[attributes["TEXCOORD_0"]]["componentType"] != FLOAT:
-        raise InputError(f"{path}: TEXCOORD_0 of whole numbers, wanted floats")
+    for name in attributes.keys() - {"COLOR_0"}:
+        data = accessors[attributes[name]]
+        if data["componentType"] != FLOAT and (name != "POSITION" or data.get("normalized")):
+            raise InputError(f"{path}: {name} of whole numbers for fractions, wanted floats")
     kept = {name: _count(primitive[name]) for name in ("mode", "indices") if name in primitive}
     return kept | {"attributes": attributes, "material": row}
 

@@ -64,8 +64,6 @@ class ArrayInFile(NamedTuple):
 def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a .npy file: an array (N, 6) of x y z r g b, or others as in a text file."""
     array = _open_array(path, None, path.stat().st_size)
-    if array.dtype.names and len(array.shape) == 1 and not array.is_fortran:
-        return _open_table(array, options, channel)
     num_columns = array.shape[-1] if len(array.shape) == 2 else 0
     if not 3 <= num_columns <= MAX_COLUMNS or array.dtype.kind not in "fiu":
         raise InputError(f"{path}: {array}, {WANTED}")
@@ -87,20 +85,6 @@ def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     types = ["i8" if len(chosen) == reader.NUM_COLORED else "u4"] * len(chosen)
     source = reader.Table(path, read_columns, chosen, types, array.shape[0]).source(channel, options)
     return source._replace(warnings=(*filter(None, [note]), *source.warnings))
-
-
-def _open_table(array: ArrayInFile, options: CloudSettings, channel: Channel) -> PointSource:
-    """Return the points of an array of records, whose fields have names, as of PDAL."""
-    kinds = {name: array.dtype[name] for name in array.dtype.names or ()}
-    chosen = reader.find_fields([name for name, kind in kinds.items() if kind.kind in "fiu"], channel)
-    if not chosen:
-        raise MissingChannelError(f"{array.path}: {array}, {WANTED}")
-
-    def read_columns() -> Iterator[reader.Columns]:
-        return ([rows[name] for name in chosen] for rows in array.read_rows())
-
-    types = [kinds[name].str[1:] for name in chosen]
-    return reader.Table(array.path, read_columns, chosen, types, array.shape[0]).source(channel, options)
 
 
 def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:

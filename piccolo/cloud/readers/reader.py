@@ -199,6 +199,20 @@ def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
         return points.astype(np.float32 if points.dtype == np.float32 else np.float64, copy=False)
 
 
+def color_source(
+    path: Path,
+    read: PartReader,
+    settings: CloudSettings,
+    usual: float,
+    samples: Iterable[Part] | None = None,
+    locate: Callable[[int], str] | None = None,
+) -> PointSource:
+    """Return points with colours from 0 to a usual value, or to what the samples, else all points, tell."""
+    brightest, notes = find_brightest(path, read() if samples is None else samples, settings, usual)
+    place = locate or partial(point_label, path)
+    return PointSource(path, lambda: color_chunks(read(), brightest, place), warnings=notes)
+
+
 def make_source(
     path: Path,
     read: PartReader,
@@ -214,13 +228,9 @@ def make_source(
     if settings.labels:
         return PointSource(path, partial(_read_labels, path, read, settings.labels), num_points)
     if types and channel == "colors":
-        brightest = settings.color_range or BYTE_RANGE
-        notes: tuple[str, ...] = ()
-        if {*types} != {"u1"}:
-            usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
-            brightest, notes = find_brightest(path, read(), settings, usual)
-        locate = partial(point_label, path)
-        return PointSource(path, lambda: color_chunks(read(), brightest, locate), num_points, notes)
+        usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
+        samples: list[Part] | None = [] if {*types} == {"u1"} else None
+        return color_source(path, read, settings, usual, samples)._replace(num_points=num_points)
     limits = functools.cache(lambda: _limits(read()))
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: (RawCloud(*part) for part in read()),

@@ -139,9 +139,9 @@ class NumberLines:
         rows = self.read_rows(count)
         return ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
 
-    def locate(self, index: int) -> str:
-        """Return the file, and the number in it of the line that follows `index` lines of numbers."""
-        for number, _ in islice(self._number_lines(), index, None):
+    def locate(self, index: int, num_before: int = 0) -> str:
+        """Return the file, and the number in it of the line behind so many lines of numbers."""
+        for number, _ in islice(self._number_lines(), index + num_before, None):
             return f"{self.path}: line {number}"
         raise InputError(f"{self.path}: {reader.CUT}")
 
@@ -224,7 +224,7 @@ def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_count
     exact = num_columns if has_counts else None
     columns = tuple(names.index(name) for name in chosen)
     layout = LineLayout(columns, exact, fields.start, fields.delimiter, fields.spelling, has_counts)
-    is_fraction = path.suffix.lower() == ".xyzrgb" or text_columns.has_names_of_fractions(chosen)
+    is_fraction = path.suffix.lower() == ".xyzrgb" or chosen[3:] == reader.FRACTION_NAMES
     if len(columns) == NUM_WITH_INTENSITY and channel == "colors":  # packed
 
         def read_columns() -> Iterator[reader.Columns]:
@@ -232,32 +232,19 @@ def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_count
 
         source = reader.Table(path, read_columns, chosen, ["f8", "f8", "f8", "u4"]).source(channel, settings)
     else:
-        known = rows[:, columns] if max(columns) < rows.shape[1] else rows[:0, :6]
-        usual = 1.0 if is_fraction else reader.BYTE_RANGE
-        source = line_source(path, layout, channel, wanted, settings, known, usual)
+        lines = NumberLines(path, layout, wanted)
+
+        def read() -> Iterator[reader.Part]:
+            return NumberLines(path, layout, wanted).read_points()
+
+        if channel == "colors":
+            known = rows[:, columns] if max(columns) < rows.shape[1] else rows[:0, :6]
+            parts = chain([(known[:, :3], known[:, 3:])], read())
+            usual = 1.0 if is_fraction else reader.BYTE_RANGE
+            source = reader.color_source(path, read, settings, usual, parts, lines.locate)
+        else:
+            source = reader.make_source(path, read, channel, settings)
     return source._replace(warnings=(*filter(None, [note]), *source.warnings))
-
-
-def line_source(
-    path: Path,
-    layout: LineLayout,
-    channel: Channel,
-    wanted: str,
-    settings: CloudSettings,
-    samples: Array,
-    usual: float,
-) -> PointSource:
-    """Return points of lines x y z r g b, whose usual range is given; or of x y z intensity, or of x y z."""
-
-    def read() -> Iterator[reader.Part]:
-        return NumberLines(path, layout, wanted).read_points()
-
-    if channel != "colors":
-        return reader.make_source(path, read, channel, settings)
-    parts = chain([(samples[:, :3], samples[:, 3:])], read())
-    brightest, notes = find_brightest(path, parts, settings, usual)
-    lines = NumberLines(path, layout, wanted)
-    return PointSource(path, lambda: reader.color_chunks(read(), brightest, lines.locate), warnings=notes)
 
 
 class PtxScan(NamedTuple):
@@ -367,14 +354,12 @@ def _read_scans(
         if is_colored and scan.num_columns == NUM_WITH_INTENSITY:
             lines.skip(scan.num_points)
             continue
-        locate = partial(_locate_after, lines, lines.num_taken)
+        num_before = lines.num_taken
         parts: Iterator[reader.Part] = lines.read_points(scan.num_points)
-        for points, values in reader.color_chunks(parts, brightest, locate) if brightest else parts:
+        if brightest:
+            parts = reader.color_chunks(parts, brightest, partial(lines.locate, num_before=num_before))
+        for points, values in parts:
             is_return = np.any(points != 0.0, axis=1)
             returned: Array = points[is_return].astype(np.float64, copy=False)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
                 yield transform_points(returned, scan.T_world_from_scanner), values[is_return]
-
-
-def _locate_after(lines: NumberLines, num_before: int, index: int) -> str:
-    return lines.locate(num_before + index)

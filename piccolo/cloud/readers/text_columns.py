@@ -3,7 +3,7 @@
 import codecs
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ..settings import COLUMNS, CloudSettings
-from .reader import COLOR_NAMES, CUT, FRACTION_NAMES, NUM_COLORED, POINT_NAMES
+from .reader import COLOR_NAMES, CUT, NUM_COLORED, POINT_NAMES
 
 COMMENT_MARKS = (b"#", b"//")
 MARKS = b"\"'[](){}"
@@ -239,11 +239,6 @@ def _are_colors(rows: Array) -> bool:
     is_whole = np.all(rows % 1.0 == 0.0, axis=0)
     largest = float(np.max(rows, initial=0.0))
     return largest <= 1.0 or bool(is_whole.all()) or (not is_whole.any() and largest <= MAX_BYTE)
-
-
-def has_names_of_fractions(names: Sequence[str]) -> bool:
-    """Return True if a header says that colours are 0 to 1."""
-    return {*FRACTION_NAMES} <= {*names}
 
 
 def note_names(path: Path, names: tuple[str, ...], line: str, is_pts: bool = False) -> str:
