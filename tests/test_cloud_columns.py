@@ -138,3 +138,24 @@ def test_utf_16(tmp_path, encoding):
     path.write_bytes(path.read_bytes()[:-100] + b"\xd8" * 40)
     with pytest.raises(InputError, match="line 1"):
         whole(open_source, path)
+
+
+@pytest.mark.parametrize(
+    ("line", "header", "num_warnings"),
+    [
+        ("{x:.4f} {y:.4f} {z:.4f} #{r:02x}{g:02x}{b:02x}", "", 1),
+        ("{x:.4f},{y:.4f},{z:.4f},0x{r:02X}{g:02X}{b:02X}", "X,Y,Z,Color", 0),
+        ('"{x:.4f}","{y:.4f}","{z:.4f}","{r}","{g}","{b}"', '"x","y","z","r","g","b"', 0),
+        ("[{x:.4f}, {y:.4f}, {z:.4f}, {r}, {g}, {b}]", "", 0),
+        ("{k},{x:.4f},{y:.4f},{z:.4f},{r},{g},{b}", ",x,y,z,r,g,b", 0),
+        ("{k}\t{x:.4f}\t{y:.4f}\t{z:.4f}\t{r}\t{g}\t{b}", "", 1),
+    ],
+)
+def test_other_spellings_of_numbers_and_an_index_in_front(tmp_path, line, header, num_warnings):
+    rows = [
+        line.format(k=k, x=p[0], y=p[1], z=p[2], r=c[0], g=c[1], b=c[2])
+        for k, (p, c) in enumerate(zip(XYZ.tolist(), RGB.tolist(), strict=True))
+    ]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join([header, *rows, ""]))
+    assert_read(path, num_warnings=num_warnings)

@@ -1,4 +1,3 @@
-import re
 import struct
 import sys
 
@@ -88,8 +87,8 @@ def test_8_bit_colors_in_16_bit_fields_are_told_of(tmp_path, is_compressed):
     content = las_bytes(RAW, colors=EIGHT_BIT)
     path = write(tmp_path, laz_bytes(content, 100) if is_compressed else content)
     assert open_source(path).warnings == (
-        f"{path}: the colours are read as 8-bit values in 16-bit fields (largest value {RAW.colors.max()} in "
-        "1200 points checked)",
+        f"{path}: colours are read as 0 to 255 instead of 0 to 65535 (largest value {RAW.colors.max()}); "
+        "`color_range` overrules it",
     )
     assert_read_as_written(path)
 
@@ -106,13 +105,13 @@ def test_the_sample_is_spread_over_the_file(tmp_path, monkeypatch, is_compressed
         content = las_bytes(RAW, colors=colors)
         return write(tmp_path, laz_bytes(content, 30) if is_compressed else content)
 
-    assert open_source(written(0, 300)).warnings == ()
-    assert open_source(written(1199, 300)).warnings == ()
+    assert open_source(written(0, 2000)).warnings == ()
+    assert open_source(written(1199, 2000)).warnings == ()
     path = written(25 if is_compressed else 20, 255)
-    assert "8-bit values in 16-bit fields" in open_source(path).warnings[0]
+    assert "read as 0 to 255 instead of 0 to 65535" in open_source(path).warnings[0]
     path = written(100, 40_000)  # outside of the sample
-    assert re.search("in 12[08] points", open_source(path).warnings[0])
-    assert_refused("a colour of 40000 in a file whose other colours are 8-bit", read, path)
+    assert "largest value" in open_source(path).warnings[0]
+    assert_refused("point 101 has the colour 40000 .*, wanted 0 to 255", read, path)
 
 
 @pytest.mark.parametrize("point_format", [1, 3, 6, 7])

@@ -9,10 +9,11 @@ from scipy.spatial.transform import Rotation
 from test_cloud_morton import whole
 
 from piccolo.cloud.readers import mesh as mesh_module, mesh_files
-from piccolo.cloud.readers.mesh import compute_weights, linear_to_srgb, look_up, open_mesh, srgb_to_linear
+from piccolo.cloud.readers.mesh import compute_weights, look_up, open_mesh
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.stream import open_cloud
+from piccolo.geometry.colors import linear_to_srgb, srgb_to_linear
 
 
 def test_an_obj_texture_stands_upright_in_any_encoding(tmp_path):
@@ -359,3 +360,33 @@ def test_a_texture_of_many_surfaces_is_decoded_once(tmp_path, monkeypatch):
     raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
     assert len(raw.colors) == 50_000
     assert len(calls) == 2
+
+
+def test_points_of_gltf_are_read_as_they_are_and_whole_numbers_by_the_scale_of_their_node(tmp_path):
+    gltf = made.Gltf()
+    colors = np.array([[10, 20, 30], [40, 50, 60], [70, 80, 90]], np.uint8)
+    mesh = gltf.mesh(np.eye(3), None, np.rint(255 * srgb_to_linear(colors)).astype(np.uint8))
+    gltf.tree["meshes"][mesh]["primitives"][0] |= {"mode": 0}
+    del gltf.tree["meshes"][mesh]["primitives"][0]["indices"]
+    gltf.node(mesh=mesh, scale=[2.0, 2.0, 2.0], translation=[1.0, 0.0, 0.0])
+    raw = whole(open_mesh, gltf.glb(tmp_path / "a.glb"))
+    np.testing.assert_allclose(raw.points_world, 2.0 * np.eye(3) + [1, 0, 0])
+    assert np.abs(raw.colors.astype(int) - colors).max() <= 6, "of 8 bits of linear light"
+    gltf = made.Gltf()
+    mesh = gltf.mesh(made.SQUARE, None, np.arange(3 * len(made.SQUARE), dtype=np.uint8).reshape(-1, 3))
+    row = gltf.accessor(np.rint(100 * made.SQUARE).astype(np.uint16))
+    gltf.tree["meshes"][mesh]["primitives"][0]["attributes"]["POSITION"] = row
+    gltf.tree["extensionsRequired"] = ["KHR_mesh_quantization"]
+    gltf.node(mesh=mesh, scale=[0.01] * 3)
+    assert_refused("POSITION of whole numbers for fractions", open_mesh, gltf.glb(tmp_path / "b.glb"))
+    del gltf.tree["accessors"][row]["normalized"]
+    found = whole(open_mesh, gltf.glb(tmp_path / "c.glb")).points_world
+    np.testing.assert_allclose(np.ptp(found, axis=0), np.ptp(made.SQUARE, axis=0), atol=0.02)
+
+
+def test_vertices_of_an_obj_without_faces_are_points(tmp_path):
+    path = tmp_path / "a.obj"
+    path.write_text("v 0 0 0 1 0 0\nv 1 2 3 0 0.2 1\n")
+    raw = whole(open_mesh, path)
+    np.testing.assert_array_equal(raw.points_world, [[0, 0, 0], [1, 2, 3]])
+    np.testing.assert_array_equal(raw.colors, [[255, 0, 0], [0, 51, 255]])

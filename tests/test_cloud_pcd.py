@@ -276,3 +276,9 @@ def test_lzf_copies_far_and_long():
 def test_any_bytes_are_lzf_of_that_size_or_broken(data, size):
     found = decompress_lzf(data, size)
     assert found is None or len(found) == size
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary"])
+def test_whole_numbers_in_a_field_declared_a_float_are_colors(tmp_path, encoding):
+    fields = [*XYZ, ("rgb", "f4", 1, (PACKED & np.uint32(0xFFFFFF)).astype(np.float32))]
+    assert_read_as_written(write(tmp_path / "a.pcd", fields, encoding))

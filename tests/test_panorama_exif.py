@@ -1,5 +1,7 @@
 """Photos read by their metadata and options: which camera is taken, and what goes before what."""
 
+import math
+
 import cv2
 import numpy as np
 import pytest
@@ -56,7 +58,7 @@ def test_a_photo_twice_as_wide_as_high_is_read_as_a_sphere_with_a_warning(tmp_pa
     assert panorama.cameras == ()
     (note,) = panorama.warnings
     assert note.startswith("read as a full sphere, as it is 2:1; if it is a photo, add `projection` pinhole")
-    assert note.endswith("EXIF's 35 mm equivalent of 26 mm")
+    assert "EXIF's 35 mm equivalent of 26 mm (" in note
     assert len(read_panorama(Photo(path, projection="pinhole")).cameras) == 1
     for quiet in (Photo(path, projection="equirectangular"), Photo(path, fov_deg=360.0)):
         assert read_panorama(quiet).warnings == ()
@@ -210,3 +212,21 @@ def test_the_elevation_in_exif_is_the_pitch(tmp_path):
     tags = {**FILM, 0x9405: 12.5}
     assert read_panorama(photo(tmp_path / "a.jpg", tags)).gpano == GPano(12.5, None)
     assert read_panorama(photo(tmp_path / "a.jpg", {**FILM, 0x9405: 99.0})).gpano is None
+
+
+@pytest.mark.parametrize(
+    ("size", "most"), [((480, 270), 600), ((270, 480), 600), ((360, 360), 360 * 3.25**0.5)]
+)
+def test_the_equivalent_of_a_cropped_picture_may_be_that_of_the_whole_sensor(size, most):
+    found = read_focal_length(FILM, size)
+    ends = np.log([26.0 / 43.2666 * np.hypot(*size), 26.0 / 43.2666 * most])
+    assert np.log(found.focal) == pytest.approx(ends.mean(), abs=1e-5)
+    assert np.ptp(ends) / 2.0 < found.deviation < np.ptp(ends) / 2.0 + 0.01
+    assert f"({np.exp(ends[0]):.0f} px for this shape of sensor, up to {np.exp(ends[1]):.0f}" in found.source
+
+
+def test_pictures_of_the_shape_of_a_sensor_have_one_reading():
+    for size in ((480, 360), (360, 480), (480, 320)):
+        found = read_focal_length(FILM, size)
+        assert found.focal == 26.0 / math.hypot(36.0, 24.0) * math.hypot(*size)
+        assert found.source == "EXIF's 35 mm equivalent of 26 mm"

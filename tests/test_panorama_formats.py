@@ -301,3 +301,21 @@ def test_mutated_masks_are_read_or_refused(data, tmp_path_factory):
     path = write(folder / "a.png", FILES["png"])
     panorama, message = read_or_refused(lambda _: read_panorama(Photo(path, mask=mask)), mask)
     assert (panorama is None) == bool(message)
+
+
+def test_a_radiance_picture_is_exposed_by_its_mean_and_a_broken_one_refused(tmp_path):
+    light = np.full((64, 128, 3), 0.02, np.float32)
+    light[:, 64:] = 2.0
+    light[0, 0] = 0.0
+    path = tmp_path / "a.hdr"
+    cv2.imwrite(str(path), light)
+    picture = read_picture(path)
+    low, high = picture.rgb[1, 0], picture.rgb[1, 127]  # 0.018 and 1.8 of white
+    assert (np.abs(low.astype(int) - 36) <= 1).all()
+    assert (high == 255).all()
+    assert "exposed so that the geometric mean" in picture.warnings[0]
+    path.write_bytes(path.read_bytes()[:-99])
+    assert_refused("the HDR is cut off, damaged", read_picture, path)
+    assert_refused(
+        "no line '-Y height", read_picture, write(tmp_path / "b.hdr", b"#?RADIANCE\n\n+X 4 -Y 4\n")
+    )

@@ -109,7 +109,7 @@ def test_a_crop_that_makes_no_sense_is_refused_or_left_aside(tmp_path, fields):
     [
         (crop_fields(0, 0, 300, 200, (70_000, 35_000)), "found 300 x 200 of a sphere 70000 wide, wanted"),
         (crop_fields(0, 0, 300, 200, (9000, 4500)), "found 300 x 200, 0.15 % of the sphere, wanted at least"),
-        (crop_fields(0, 0, 300, 200, (900, 200)), "of a sphere of 900 x 200, wanted that width = 2 x height"),
+        (crop_fields(0, 0, 300, 200, (900, 250)), "of a sphere of 900 x 250, wanted that width = 2 x height"),
         ({"ProjectionType": "Cylin\ndrical"}, "names the projection .cylin.+ndrical., wanted equirect"),
     ],
 )
@@ -177,3 +177,12 @@ def test_many_prefixes_of_the_namespace_cost_no_time():
     begin = time.perf_counter()
     assert gpano_fields(xmp) == {"PosePitchDegrees": "0"}
     assert time.perf_counter() - begin < 2.0
+
+
+def test_a_strip_with_its_own_height_as_that_of_the_sphere_lies_on_the_horizon(tmp_path):
+    panorama = read_panorama(
+        write(tmp_path / "a", file_of(RGB[50:150], crop_fields(0, 0, 400, 100, (400, 100))))
+    )
+    assert panorama.is_valid[50:150].all()
+    assert panorama.is_valid.sum() == 100 * 400
+    np.testing.assert_array_equal(panorama.rgb[50:150], RGB[50:150])

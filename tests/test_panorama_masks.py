@@ -221,3 +221,11 @@ def test_a_folder_of_masks_is_looked_up_by_name(tmp_path):
     assert panorama.warnings == (f"found no mask b in {folder}",)
     with pytest.raises(InputError, match=r"none.png: cannot be read"):
         read(tmp_path / "a.jpg", room(), mask=tmp_path / "none.png")
+
+
+def test_true_written_as_1_is_ignored(tmp_path):
+    mask = (checker_mask(WIDTH, HEIGHT) > 0).astype(np.uint8)
+    is_valid = read(
+        tmp_path / "a.jpg", room(), mask=write(tmp_path / "m.png", encoded(mask, ".png"))
+    ).is_valid
+    np.testing.assert_array_equal(is_valid, mask == 0)

@@ -296,3 +296,17 @@ def test_photos_beside_support_a_narrow_photo_where_they_agree(seen):
     assert near.assess_end(replace(taken, beside=(others,)), here).num_matches > alone
     away = others._replace(points=others.points + np.float32(0.5))
     assert near.assess_end(replace(taken, beside=(away,)), here).num_matches == alone
+
+
+@pytest.mark.parametrize(("odds", "is_narrow"), [(3.5, True), (2.0, True), (3.5, False)])
+def test_a_narrow_photo_is_tried_last_where_views_do_not_expect_it(seen, monkeypatch, odds, is_narrow):
+    query, true = seen
+    elsewhere = _off(true, 1.0, 0.0)
+    taken = _narrow(query) if is_narrow else query
+    monkeypatch.setattr(tracker, "list_places", lambda *_: [(elsewhere, 0.0)])
+    monkeypatch.setattr(tracker, "log_behind", lambda *_: -9.0)
+    monkeypatch.setattr(
+        tracker, "track", lambda query, start: State(start, odds, 0.5) if start is true else None
+    )
+    found = find_near(taken, _expected(true, 2.0))
+    assert (found is not None) == (odds > 3.0 and is_narrow)

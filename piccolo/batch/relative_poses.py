@@ -1,5 +1,6 @@
 """Relative poses of photos, as other tools write them."""
 
+import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
@@ -237,7 +238,7 @@ def read_tum_row(row: Sequence[str]) -> NamedPose:
 
 
 def read_quaternion(wxyz: Array) -> Array:
-    """Return the rotation (3, 3) of a quaternion (4,); ValueError if it has no length that can be squared."""
-    if not 1e-100 < np.abs(wxyz).max() < 1e100:
-        raise ValueError("a quaternion without a length")
+    """Return the rotation (3, 3) of a quaternion (4,); ValueError if its length is not 1."""
+    if not abs(math.hypot(*wxyz) - 1.0) <= UNIT_LENGTH:
+        raise ValueError("a quaternion whose length is not 1")
     return rotation_from_quaternion_wxyz(wxyz)

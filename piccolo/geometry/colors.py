@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from ..arrays import Bytes, Floats, Int32s, Integers, Mask
+from ..arrays import Array, Bytes, Floats, Int32s, Integers, Mask
 
 NUM_LEVELS = 16  # of a channel that colours are made of
 NUM_COLORS = 4093  # a prime: labels that count in steps of 256 or 65,536 do not fall together
@@ -21,6 +21,23 @@ class Labels:
     def are_kept(self, labels: Integers) -> Mask:
         """Return True for the labels (...) that are not ignored."""
         return np.isin(labels, self.ignored, invert=True)
+
+
+def srgb_to_linear(colors: Bytes) -> Array:
+    """Convert sRGB bytes to linear light in [0, 1] (IEC 61966-2-1)."""
+    levels = np.arange(256) / 255.0
+    return np.asarray(np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)[colors])
+
+
+def linear_to_srgb(linear: Array) -> Array:
+    """Convert linear light in [0, 1] to sRGB in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
+
+
+def to_bytes(colors: Array, is_linear: bool = True) -> Bytes:
+    """Convert colours (..., 3) in [0, 1], of linear light or else sRGB, to sRGB bytes; others are clipped."""
+    levels = linear_to_srgb(colors) if is_linear else colors
+    return np.rint(np.clip(levels, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 @functools.cache

@@ -31,6 +31,7 @@ MAX_PREFIXES = 4  # of one namespace: each is a search of its own
 CROP_NAMES = "CroppedAreaLeft CroppedAreaTop CroppedAreaImageWidth CroppedAreaImageHeight"
 CROP_FIELDS = tuple(f"{name}Pixels" for name in f"{CROP_NAMES} FullPanoWidth FullPanoHeight".split())
 ASPECT_TOLERANCE = 0.01
+MIN_STRIP = 2.0 * (1.0 + ASPECT_TOLERANCE)  # times as wide as high is no whole sphere
 MIN_REGION = 0.02  # of the sphere's picture: less would take much memory to show nearly nothing
 JPEG_MAGIC = b"\xff\xd8"
 APP0 = 0xE0
@@ -100,8 +101,9 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     """Return the part of the sphere that a picture of `aspect` (width / height) shows.
 
     All of it if there are no fields. These count pixels of the picture as it was made: only their ratios are
-    used, so that a picture made smaller later is placed right. None if the fields make no sense or are of a
-    picture of another shape.
+    used, so that a picture made smaller later is placed right. Some phones give a strip's own height as that
+    of the sphere: its middle is on the horizon. None if the fields make no sense or are of a picture of
+    another shape.
     """
     if not fields.keys() & set(CROP_FIELDS):
         return CropRegion()
@@ -109,6 +111,9 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     if len(numbers) < len(CROP_FIELDS) or min(numbers[2:]) < 1.0:
         return None
     left, top, width, height, full_width, full_height = numbers
+    if full_height == height and full_width > MIN_STRIP * height:
+        full_height = full_width / 2.0
+        top = (full_height - height) / 2.0
     is_inside = width <= full_width and -1.0 <= top <= full_height - height + 1.0 and abs(left) <= full_width
     # a pixel more or less by rounding, or one per cent
     is_same_shape = abs(width / height / aspect - 1.0) <= max(0.01, 1.5 / width, 1.5 / height)

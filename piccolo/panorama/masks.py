@@ -226,7 +226,8 @@ def read_mask(path: Path, sizes: list[tuple[int, int]], is_black_ignored: bool =
     height, width = rgb.shape[:2]
     for k, size in enumerate(sizes):
         if abs(width * size[1] - height * size[0]) <= ASPECT_TOLERANCE * height * size[0]:
-            is_white = ((rgb.max(axis=2) >= WHITE) != is_black_ignored).astype(np.float32)
+            white = WHITE if rgb.max() > 1 else 1  # scripts write True as 1
+            is_white = ((rgb.max(axis=2) >= white) != is_black_ignored).astype(np.float32)
             # averages of a larger mask are above 0 where any pixel is white
             method = cv2.INTER_AREA if width > size[0] else cv2.INTER_NEAREST
             return k, np.asarray(cv2.resize(is_white, size, interpolation=method) == 0)

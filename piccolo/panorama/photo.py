@@ -3,7 +3,8 @@
 Damaged fields count as missing. The focal length in pixels is the more exact of two:
 - FocalLength with FocalPlaneXResolution and its unit, at the size at which the picture was taken;
 - FocalLengthIn35mmFilm, the focal length that shows the same angle over the diagonal of 36 x 24 mm, 43.27 mm,
-  as CIPA DCG-001 defines it: a phone's 4:3 picture is compared with film of 3:2, so widths can't be.
+  as CIPA DCG-001 defines it: a phone's 4:3 picture is compared with film of 3:2, so widths can't be. Of a
+  picture of another shape, as 16:9, some cameras mean its own diagonal, others that of the whole sensor.
 """
 
 import hashlib
@@ -24,6 +25,7 @@ from ..files.cache import sha256_of_arrays
 from ..files.json_file import read_bytes, reading_once
 from ..photo import File, Photo, as_photo
 from .cube import face_paths
+from .gpano import ASPECT_TOLERANCE
 from .picture import PNG_MAGIC, WANTED, open_picture
 
 TIME = re.compile(r"(\d{4}):(\d\d):(\d\d) (\d\d:\d\d:\d\d)")
@@ -34,6 +36,7 @@ MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}  # of FocalPlaneResolutionUni
 MIN_FILM, MAX_FILM = 8.0, 800.0  # [mm] what is wider is no photo by a plain lens
 BREATHING = 0.01  # of a focal length: what focusing changes
 ZOOMING = 0.03  # what a zoom rounds
+SENSOR_SHAPES = 4 / 3, 3 / 2
 MAX_DISAGREEMENT = 0.25  # of the two: one of them is of the picture before it was cropped
 CAMERA_ELEVATION = 0x9405  # CameraElevationAngle of EXIF 2.31 [deg]
 
@@ -164,9 +167,27 @@ def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> Exif
         return ExifFocal(plane, lens, "EXIF's focal length and the resolution of its sensor")
     if film:
         rounding = 1.0 / math.sqrt(12.0) / film  # whole millimetres
+        source = f"EXIF's 35 mm equivalent of {film:g} mm"
         focal = film / FILM_DIAGONAL * diagonal
-        return ExifFocal(focal, math.hypot(lens, rounding), f"EXIF's 35 mm equivalent of {film:g} mm")
+        cut = film / FILM_DIAGONAL * _largest_diagonal(size)
+        if cut == focal:
+            return ExifFocal(focal, math.hypot(lens, rounding), source)
+        source += (
+            f" ({focal:.0f} px for this shape of sensor, up to {cut:.0f} if a wider or higher one was cut)"
+        )
+        deviation = math.hypot(lens, rounding, math.log(cut / focal) / 2.0)
+        return ExifFocal(math.sqrt(focal * cut), deviation, source)
     return None
+
+
+def _largest_diagonal(size: tuple[int, int]) -> float:
+    """Return the diagonal [px] of the largest usual sensor whose whole width or height a picture has."""
+    longer = max(size)
+    shorter = min(size)
+    if any(abs(longer / shorter / shape - 1.0) <= ASPECT_TOLERANCE for shape in SENSOR_SHAPES):
+        return math.hypot(size[0], size[1])
+    sensors = [(max(longer, shorter * shape), max(shorter, longer / shape)) for shape in SENSOR_SHAPES]
+    return max(math.hypot(*sensor) for sensor in sensors)
 
 
 def _is_zoom(exif: Mapping[int, object]) -> bool:

@@ -1,4 +1,4 @@
-"""The pixels in a JPEG, PNG, TIFF, WebP or HEIC file, 8 bits a channel, oriented by EXIF, read with Pillow.
+"""The pixels in a JPEG, PNG, TIFF, WebP, HEIC, AVIF or HDR file, 8 bits a channel, turned as EXIF says.
 
 Sizes are checked before anything is decoded. Each format's class is called directly, as Image.open has a
 limit that large panoramas exceed and that can be lifted for the whole process only.
@@ -29,8 +29,10 @@ from ..errors import InputError, ResourceError, import_optional
 from ..files.json_file import read_bytes
 from ..geometry.colors import Labels, label_colors
 from ..jobs.memory import check_memory
+from . import radiance
+from .radiance import RadianceFile
 
-WANTED = "wanted a whole JPEG, PNG, TIFF, WebP, HEIC or AVIF picture"
+WANTED = "wanted a whole JPEG, PNG, TIFF, WebP, HEIC, AVIF or Radiance HDR picture"
 MIN_WIDTH = 128
 MIN_HEIGHT = 64
 MAX_WIDTH = 32768
@@ -44,12 +46,14 @@ FORMATS: dict[bytes, type[ImageFile]] = {
     b"\xff\xd8": JpegImageFile,
     **dict.fromkeys((b"II*\0", b"MM\0*", b"II+\0", b"MM\0+"), TiffImageFile),
     b"RIFF": WebPImageFile,
+    radiance.MAGIC: RadianceFile,
 }
 # of still pictures, behind a box's size and "ftyp"
 HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"mif1")
-# at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing
+# at best: a bit a block of 8 x 8; 1040 bytes of 8 pixels by zlib; 3840 by LZW; a plain WebP packs to nothing;
+# 127 pixels in four runs
 MAX_PIXELS_PER_BYTE = {"JPEG": 512, "PNG": 8 * 1040, "TIFF": 8 * 3840}
-MAX_PIXELS_PER_BYTE |= dict.fromkeys(("WEBP", "HEIF", "AVIF"), 1 << 30)
+MAX_PIXELS_PER_BYTE |= dict.fromkeys(("WEBP", "HEIF", "AVIF"), 1 << 30) | {"HDR": 16}
 # what a viewer does to the stored picture, by EXIF's number
 TURNS: dict[object, Transpose] = {
     2: Transpose.FLIP_LEFT_RIGHT,
@@ -272,5 +276,7 @@ def _xmp(image: ImageFile) -> bytes:
 
 
 def _warnings(image: ImageFile) -> tuple[str, ...]:
+    if image.format == "HDR":
+        return (radiance.EXPOSED,)
     is_several = image.format == "TIFF" and getattr(image, "is_animated", False)
     return ("found more than one picture in the TIFF, the first was read",) if is_several else ()

@@ -199,12 +199,14 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
     notes = []
     region = gpano.crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
+    missing = [name for name in gpano.CROP_FIELDS if fields and name not in fields]
     if region is None and is_two_to_one:
         region = CropRegion()
         notes = ["the crop in the metadata is invalid or has another shape; read as a full sphere"]
     if region is None or (region.is_full and not is_two_to_one):
         wrong = "no field of view is given" if photo.projection else "no focal length in EXIF"
         wrong = "a crop in the metadata that does not fit it" if region is None else wrong
+        wrong = f"a crop in the metadata without {missing[-1]}" if missing else wrong
         found = f"found a picture of {width} x {height}, which is no full panorama (2:1), and {wrong}"
         raise InputError(f"{photo.path}: {found}. {CHOICES.format(PHOTO_FOV_DEG[width < height])}")
     if region.is_full and is_dual_fisheye(picture.rgb):

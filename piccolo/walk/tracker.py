@@ -286,7 +286,9 @@ def find_near(query: Query, expected: Expected) -> Followed | None:
     """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 
     Else, or if that fails, it is tracked from that place. An end away from the expected pose counts only if
-    the photo is sure of it by itself. None if neither holds, or if the mirrored photo fits better.
+    the photo is sure of it by itself; and so does an end at an expected pose that looks worse, which is tried
+    last with a narrow photo, of which views tell little. None if none holds, or if the mirrored photo fits
+    better.
     """
     near = query_near(query, expected.last, expected.reach)
     ends = descend_briefly(near)
@@ -300,6 +302,10 @@ def find_near(query: Query, expected: Expected) -> Followed | None:
     starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
     found = (track(query, start) for start in starts)
     end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
+    if end is None and not is_alike and query.is_narrow:
+        last = track(query, expected.pose)
+        is_sure = last is not None and last.log_odds >= MOST_EXPECTED and is_acceptable(last, expected)
+        end = last if is_sure else None
     if end is None:
         return None
     how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"

@@ -59,7 +59,6 @@ GEOGRAPHIC_KEY = 2048
 USER_DEFINED = 32767
 MAX_SAMPLES = 1 << 20
 NUM_SAMPLE_RUNS = 64
-TO_8_BIT = ((np.arange(1 << 16, dtype=np.uint32) * 255 + 32767) // 65535).astype(np.uint8)
 BROKEN = "the file is cut off or broken"
 
 Records = NDArray[np.void]
@@ -303,34 +302,29 @@ def _refusing(path: Path, lazrs: ModuleType) -> Iterator[None]:
 def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a LAS or LAZ file; withheld ones are left out.
 
-    Colours are 16-bit, as the format says. They are read as 8-bit if none of a million points, spread evenly
-    over the file, exceeds 255; the source then has a warning, and a larger value met later is refused. If all
-    of these points are black, the file counts as one without colours.
+    Colours are 16-bit, as the format says, unless a million points, spread evenly over the file, tell of
+    another range. If all of these points are black, the file counts as one without colours.
     """
     header = read_header(path)
     layout = read_laz_layout(header) if header.is_compressed else _plain_layout(header)
-    if options.labels or channel == "shape":
-        read = partial(_read, header, layout, "class")
+    field = "class" if options.labels or channel == "shape" else {"colors": "rgb"}.get(channel, "intensity")
+    read = partial(_read, header, layout, field)
+    if field == "class":
         return reader.make_source(path, read, channel, options, header.num_points)
-    if channel == "colors" and not header.has_colors:
+    if field == "rgb" and not header.has_colors:
         raise MissingChannelError(
             f"{path}: has no colours: point format {header.point_format} has none, {WANTED}"
         )
-    field = "rgb" if channel == "colors" else "intensity"
-    found = [(int(chunk[field].max()), len(chunk)) for chunk in _chunks(header, layout, is_sample=True)]
-    largest = max(value for value, _ in found)
-    num_samples = sum(count for _, count in found)
-    if largest == 0:
-        is_zero = f"0 in all {num_samples} points checked"
+    samples = [part for part in _read(header, layout, field, is_sample=True) if len(part[1])]
+    if not any(values.any() for _, values in samples):
+        is_zero = f"0 in all {sum(len(values) for _, values in samples)} points checked"
         what = f"has no colours: red green blue are {is_zero}, {WANTED}"
         raise MissingChannelError(f"{path}: {what if field == 'rgb' else f'the intensity is {is_zero}'}")
-    is_8_bit = field == "rgb" and (options.color_range or largest) <= 255
-    read = partial(_read, header, layout, field, is_8_bit)
-    source = reader.make_source(path, read, channel, options, header.num_points)
-    checked = f"(largest value {largest} in {num_samples} points checked)"
-    note = f"{path}: the colours are read as 8-bit values in 16-bit fields {checked}"
-    notes = (note,) if is_8_bit and options.color_range is None else ()
-    return source._replace(warnings=(*header.warnings, *notes))
+    if field == "intensity":
+        source = reader.make_source(path, read, channel, options, header.num_points)
+        return source._replace(warnings=header.warnings)
+    source = reader.color_source(path, read, options, reader.USUAL["u2"], samples)
+    return source._replace(num_points=header.num_points, warnings=(*header.warnings, *source.warnings))
 
 
 def _plain_layout(header: LasHeader) -> LasLayout:
@@ -368,25 +362,14 @@ def _chunks(header: LasHeader, layout: LasLayout, is_sample: bool = False) -> It
                 yield records[begin : begin + CHUNK]
 
 
-def _read(header: LasHeader, layout: LasLayout, field: str, is_8_bit: bool = False) -> Iterator[reader.Part]:
+def _read(header: LasHeader, layout: LasLayout, field: str, is_sample: bool = False) -> Iterator[reader.Part]:
     """Yield the points that are not withheld, and their colours, intensity or class."""
     withheld, class_bits = OLD_BITS if header.point_format < 6 else BITS
-    for chunk in _chunks(header, layout):
+    for chunk in _chunks(header, layout, is_sample):
         records = chunk[chunk["flags"] & withheld == 0]
         with np.errstate(over="ignore"):  # to infinity, and such points are dropped
             points_world = records["xyz"] * header.scales + header.offsets
         values = records[field]
-        if field == "rgb":
-            yield points_world, _colors(header, values, is_8_bit)
-        else:
-            yield points_world, (values & class_bits if field == "class" else values).astype(np.float64)
-
-
-def _colors(header: LasHeader, rgb: NDArray[np.uint16], is_8_bit: bool) -> Bytes:
-    """Return colours (N, 3) of 16 bits, or of 8 in 16, as 8 bits."""
-    if not is_8_bit:
-        return TO_8_BIT[rgb]
-    if (rgb > 255).any():
-        found = f"a colour of {rgb.max()} in a file whose other colours are 8-bit"
-        raise InputError(f"{header.path}: {found}; if they are not, set `color_range`")
-    return rgb.astype(np.uint8)
+        if field != "rgb":
+            values = (values & class_bits if field == "class" else values).astype(np.float64)
+        yield points_world, values

@@ -19,10 +19,12 @@ import numpy as np
 
 from ...arrays import Array, Bytes, Int64s, Mask
 from ...errors import InputError
+from ...geometry.colors import srgb_to_linear, to_bytes
+from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
-from .reader import CHUNK, GRAY, USUAL, MissingChannelError, PointSource, RawCloud, find_brightest
+from .reader import CHUNK, GRAY, USUAL, MissingChannelError, PointSource, RawCloud, find_brightest, in_chunks
 
 # 1 / p and 1 / p^2 of the plastic number p, the root of p^3 = p + 1
 R2_STEPS = (0.7548776662466927, 0.5698402909980532)
@@ -104,12 +106,12 @@ def _points(surface: Surface, k: Int64s, rows: Int64s, texels: Bytes | None) -> 
         factors = _blend(surface.colors, surface.corners[rows], weights)
     if texels is None or surface.uv is None:
         gray = np.full(points_world.shape, GRAY, np.uint8)
-        return RawCloud(points_world, gray if factors is None else _bytes(factors, surface.is_linear))
+        return RawCloud(points_world, gray if factors is None else to_bytes(factors, surface.is_linear))
     found = look_up(texels, _blend(surface.uv, triangles, weights))
     colors = found[:, :3]
     is_visible = found[:, 3] > 0
     if factors is not None:
-        colors = _bytes(srgb_to_linear(colors) * factors, is_linear=True)
+        colors = to_bytes(srgb_to_linear(colors) * factors, is_linear=True)
     return RawCloud(points_world[is_visible], np.ascontiguousarray(colors[is_visible]))
 
 
@@ -127,22 +129,6 @@ def look_up(texels: Bytes, uv: Array) -> Bytes:
     columns = np.minimum((turned[:, 0] * width).astype(np.int64), width - 1)  # 1 - 1e-17 is 1
     rows = np.minimum((turned[:, 1] * height).astype(np.int64), height - 1)
     return np.asarray(texels[rows, columns])
-
-
-def srgb_to_linear(colors: Bytes) -> Array:
-    """Convert sRGB bytes to linear light in [0, 1] (IEC 61966-2-1)."""
-    levels = np.arange(256) / 255.0
-    return np.asarray(np.where(levels <= 0.04045, levels / 12.92, ((levels + 0.055) / 1.055) ** 2.4)[colors])
-
-
-def linear_to_srgb(linear: Array) -> Array:
-    """Convert linear light in [0, 1] to sRGB in [0, 1]."""
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1.0 / 2.4) - 0.055)
-
-
-def _bytes(colors: Array, is_linear: bool) -> Bytes:
-    levels = linear_to_srgb(colors) if is_linear else colors
-    return np.rint(np.clip(levels, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def open_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
@@ -165,12 +151,21 @@ def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Chann
 
 
 def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSource:
-    path = loaded.path
     if channel == "intensity":
-        raise MissingChannelError(f"{path}: has no intensity")
-    scale = options.scale
+        raise MissingChannelError(f"{loaded.path}: has no intensity")
     loaded = replace(loaded, settings=options)
-    surfaces, notes = _surfaces(loaded, channel == "shape")
+    up: UpAxis = "y" if loaded.is_gltf else "z"  # by the specification of glTF
+    if clouds := _clouds(loaded, channel == "shape"):
+        num_points = sum(len(cloud.colors) for cloud in clouds)
+        return PointSource(loaded.path, lambda: iter(clouds), num_points, tuple(loaded.notes), up=up)
+    return _sample(loaded, channel == "shape")._replace(up=up)
+
+
+def _sample(loaded: Loaded, is_bare: bool) -> PointSource:
+    """Return points on the triangles of a file."""
+    path = loaded.path
+    scale = loaded.settings.scale
+    surfaces, notes = _surfaces(loaded, is_bare)
     notes += loaded.notes
     num_triangles = sum(len(surface.triangles) for surface in surfaces)
     if num_triangles > MAX_TRIANGLES:
@@ -195,8 +190,35 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
         density = f"{num_points / area:.3g} points on each instead of {DENSITY:.0f}"
         notes.append(f"{path}: {area:.3g} square metres of surface, sampled with {density}")
     read_chunks = partial(sample_points, surfaces, ends, num_points)
-    up: UpAxis = "y" if loaded.is_gltf else "z"  # by the specification of glTF
-    return PointSource(path, read_chunks, num_points, tuple(notes), up=up)
+    return PointSource(path, read_chunks, num_points, tuple(notes))
+
+
+def _nodes(loaded: Loaded) -> list[tuple[Array, str]]:
+    """Return the matrices (4, 4) with which the scene places its parts, and these parts' names."""
+    nodes = [loaded.scene.graph.get(node) for node in loaded.scene.graph.nodes_geometry]
+    # not by the nodes' names: trimesh makes some up by chance
+    return sorted(nodes, key=lambda node: (node[1], node[0].tobytes()))
+
+
+def _clouds(loaded: Loaded, is_bare: bool) -> list[RawCloud]:
+    """Return the points of a file that has no triangles, where the scene places them."""
+    parts = loaded.scene.geometry
+    if any(hasattr(part, "faces") for part in parts.values()):
+        return []
+    clouds = []
+    for matrix, name in _nodes(loaded):
+        vertices = np.array(parts[name].vertices, np.float64)
+        if vertices.shape[1:] != (3,):
+            raise InputError(f"{loaded.path}: vertices of shape {vertices.shape}, wanted three numbers each")
+        points = transform_points(vertices, np.array(matrix, np.float64))
+        raw = parts[name].metadata.get("color")
+        if raw is None and not is_bare:
+            raise MissingChannelError(f"{loaded.path}: points without colours, {WANTED}")
+        colors = np.full(points.shape, GRAY, np.uint8)
+        if not is_bare:
+            colors = to_bytes(_fractions(loaded, raw, len(points)), loaded.is_gltf)
+        clouds += [RawCloud(*some) for some in in_chunks([points, colors])]
+    return clouds
 
 
 def _surfaces(loaded: Loaded, is_bare: bool) -> tuple[list[Surface], list[str]]:
@@ -207,9 +229,7 @@ def _surfaces(loaded: Loaded, is_bare: bool) -> tuple[list[Surface], list[str]]:
     by_name = {name: _surface(loaded, mesh) for name, mesh in meshes.items()}
     surfaces = []
     num_bare = 0
-    nodes = [scene.graph.get(node) for node in scene.graph.nodes_geometry]
-    # not by the nodes' names: trimesh makes some up by chance
-    for matrix, name in sorted(nodes, key=lambda node: (node[1], node[0].tobytes())):
+    for matrix, name in _nodes(loaded):
         surface = by_name.get(name)
         if surface is None:
             continue

@@ -29,7 +29,9 @@ FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF", "TGA", "GIF")
 MODES = frozenset({"1", "L", "LA", "P", "PA", "RGB", "RGBA", "CMYK", "YCbCr"})  # 8 bits a channel or less
 GLB_MAGIC = b"glTF"
 WANTED = "wanted a whole glTF 2.0 mesh"
-KNOWN_EXTENSIONS = frozenset({"KHR_materials_unlit", "EXT_texture_webp"})  # of those a file may require
+KNOWN_EXTENSIONS = frozenset(
+    {"KHR_materials_unlit", "EXT_texture_webp", "KHR_mesh_quantization"}
+)  # of those a file may require
 UNREAD_EXTENSIONS = frozenset({"KHR_materials_pbrSpecularGlossiness", "KHR_texture_transform"})
 MAX_DEPTH = 200  # nodes below each other: a chain of n costs n^2
 MAX_ROWS = 20_000_000  # vertices and indices of all primitives; more only in a file of more bytes
@@ -38,6 +40,7 @@ MAX_SHARING = 4  # times that a byte may be part of an accessor, on average
 BYTES_OF_TYPE = {5120: 1, 5121: 1, 5122: 2, 5123: 2, 5125: 4, 5126: 4}
 NUM_OF_SHAPE = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
 FLOAT = 5126
+POINTS = 0
 TRIANGLES = 4
 STRIP = 5
 FAN = 6
@@ -305,12 +308,18 @@ def _keep_base_colors(tree: Json, materials: list[Material]) -> None:
 
 
 def _keep_triangles(path: Path, tree: Json, materials: list[Material], num_bytes: int) -> None:
-    """Remove all primitives but those of triangles; refuse data that too many of them share."""
+    """Remove all primitives but those of triangles, or points if there are no triangles.
+
+    Data that too many of them share are refused.
+    """
     accessors = tree.get("accessors", [])
     num_rows = 0
-    for mesh in tree.get("meshes", []):
-        triangles = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in (TRIANGLES, STRIP, FAN)]
-        kept = [_primitive(path, accessors, materials, primitive) for primitive in triangles]
+    meshes = tree.get("meshes", [])
+    modes = {p.get("mode", TRIANGLES) for mesh in meshes for p in mesh["primitives"]}
+    wanted = modes & {TRIANGLES, STRIP, FAN} or {POINTS}
+    for mesh in meshes:
+        shown = [p for p in mesh["primitives"] if p.get("mode", TRIANGLES) in wanted]
+        kept = [_primitive(path, accessors, materials, primitive) for primitive in shown]
         mesh.clear()
         mesh["primitives"] = kept
         rows = [p["attributes"]["POSITION"] for p in kept] + [p["indices"] for p in kept if "indices" in p]
@@ -350,8 +359,9 @@ def _primitive(path: Path, accessors: list[Json], materials: list[Material], pri
     if len(counts) > 1:
         raise InputError(f"{path}: a primitive with {sorted(counts)} rows, wanted as many of each")
     for name in attributes.keys() - {"COLOR_0"}:
-        if accessors[attributes[name]]["componentType"] != FLOAT:
-            raise InputError(f"{path}: {name} of whole numbers, wanted floats")
+        data = accessors[attributes[name]]
+        if data["componentType"] != FLOAT and (name != "POSITION" or data.get("normalized")):
+            raise InputError(f"{path}: {name} of whole numbers for fractions, wanted floats")
     kept = {name: _count(primitive[name]) for name in ("mode", "indices") if name in primitive}
     return kept | {"attributes": attributes, "material": row}
 

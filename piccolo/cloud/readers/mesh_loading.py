@@ -121,7 +121,7 @@ def _with_raw_colors(parsed: dict[str, Any]) -> dict[str, Any]:
         for kind in ("vertex", "face"):
             colors = mesh.pop(f"{kind}_colors", None)
             if colors is not None:
-                mesh[f"{kind}_attributes"] = {"color": colors}
+                mesh[f"{kind}_attributes" if "faces" in mesh else "metadata"] = {"color": colors}
     return parsed
 
 

@@ -35,7 +35,7 @@ USUAL = {"u2": 65535.0, "f2": 1.0, "f4": 1.0, "f8": 1.0}
 BYTE_RANGE = 255.0
 EXCESS = 1.001  # of full brightness, up to which a value is rounded to it
 STRAY = 4.0  # times full brightness is a wrong colour, which is refused, not one of a wider range
-PACKED_NAMES = ("rgb", "rgba")  # 0xAARRGGBB in one number
+PACKED_NAMES = ("rgb", "rgba", "color")  # 0xAARRGGBB in one number
 SPLAT_NAMES = ("f_dc_0", "f_dc_1", "f_dc_2")  # of Gaussian splats
 FRACTION_NAMES = ("rf", "gf", "bf")  # CloudCompare's for colours 0-1
 COLOR_NAMES = (
@@ -199,6 +199,20 @@ def points_of(columns: Columns) -> NDArray[np.floating[Any]]:
         return points.astype(np.float32 if points.dtype == np.float32 else np.float64, copy=False)
 
 
+def color_source(
+    path: Path,
+    read: PartReader,
+    settings: CloudSettings,
+    usual: float,
+    samples: Iterable[Part] | None = None,
+    locate: Callable[[int], str] | None = None,
+) -> PointSource:
+    """Return points with colours from 0 to a usual value, or to what the samples, else all points, tell."""
+    brightest, notes = find_brightest(path, read() if samples is None else samples, settings, usual)
+    place = locate or partial(point_label, path)
+    return PointSource(path, lambda: color_chunks(read(), brightest, place), warnings=notes)
+
+
 def make_source(
     path: Path,
     read: PartReader,
@@ -214,13 +228,9 @@ def make_source(
     if settings.labels:
         return PointSource(path, partial(_read_labels, path, read, settings.labels), num_points)
     if types and channel == "colors":
-        brightest = settings.color_range or BYTE_RANGE
-        notes: tuple[str, ...] = ()
-        if {*types} != {"u1"}:
-            usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
-            brightest, notes = find_brightest(path, read(), settings, usual)
-        locate = partial(point_label, path)
-        return PointSource(path, lambda: color_chunks(read(), brightest, locate), num_points, notes)
+        usual = USUAL.get(types[0], BYTE_RANGE) if len({*types}) == 1 else BYTE_RANGE
+        samples: list[Part] | None = [] if {*types} == {"u1"} else None
+        return color_source(path, read, settings, usual, samples)._replace(num_points=num_points)
     limits = functools.cache(lambda: _limits(read()))
     readers: dict[Channel, ChunkReader] = {
         "colors": lambda: (RawCloud(*part) for part in read()),
@@ -277,29 +287,37 @@ class Table(NamedTuple):
         for columns in self.read_columns():
             points = points_of(columns)
             values = columns[3]
-            if values.dtype.itemsize == np.dtype(self.types[3]).itemsize:
-                bits = np.ascontiguousarray(values.astype(values.dtype.newbyteorder("="))).view(np.uint32)
-            else:
-                values = np.where(np.isfinite(points).all(axis=1), values, 0.0)
-                bits, is_right = _bits_of_text(values, self.types[3])
-                if not is_right.all():
-                    wrong = int(np.argmin(is_right))
-                    place = point_label(self.path, num_before + wrong)
-                    raise InputError(
-                        f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {self.types[3]}"
-                    )
+            is_text = values.dtype.itemsize != np.dtype(self.types[3]).itemsize
+            values = np.where(np.isfinite(points).all(axis=1), values, 0) if is_text else values
+            bits, is_right = _find_bits(values, self.types[3], is_text)
+            if not is_right.all():
+                wrong = int(np.argmin(is_right))
+                place = point_label(self.path, num_before + wrong)
+                raise InputError(
+                    f"{place} has the colour {values[wrong]:g}, wanted 32 bits of type {self.types[3]}"
+                )
             num_before += len(bits)
             yield points, np.stack([bits >> 16, bits >> 8, bits], axis=1).astype(np.uint8)
 
 
-def _bits_of_text(values: Array, type_: str) -> tuple[NDArray[np.uint32], Mask]:
-    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits."""
-    if type_ == "f4":
-        # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
-        is_right = np.abs(values) <= LARGEST
-        return np.where(is_right, values, 0.0).astype(np.float32).view(np.uint32), is_right
-    is_right = (values >= -(2.0**31)) & (values < 2.0**32) & (values == np.floor(values))
-    return np.where(is_right, values, 0.0).astype(np.int64).astype(np.uint32), is_right
+def _find_bits(values: NDArray[Any], type_: str, is_text: bool) -> tuple[NDArray[np.uint32], Mask]:
+    """Return the 32 bits (N,) of each number, and a mask (N,) of the numbers that have 32 bits.
+
+    A whole number is meant as such though the field is declared a float, as scripts write it: in the bits of
+    that float alpha would be neither 0 nor 255.
+    """
+    with np.errstate(invalid="ignore"):
+        is_whole = (values >= 1 if type_ == "f4" else values >= -(2.0**31)) & (values < 2.0**32)
+        is_whole &= values == np.floor(values)
+    whole = np.where(is_whole, values, 0).astype(np.int64).astype(np.uint32)
+    if type_ != "f4":
+        return whole, is_whole
+    # alpha 255 and a red above 127 make a NaN, which in text has lost its bits
+    is_right = (np.abs(values) <= LARGEST) if is_text else np.ones(len(values), np.bool_)
+    floats = (
+        np.where(is_right, values, 0).astype(np.float32) if is_text else np.ascontiguousarray(values, "=f4")
+    )
+    return np.where(is_whole, whole, floats.view(np.uint32)), is_right
 
 
 def as_gray(intensity: Array, low: float, high: float) -> Bytes:

@@ -22,7 +22,7 @@ from ...geometry.pose import transform_points
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
-from .text_columns import COMMENT_MARKS, is_number, split, text_blocks
+from .text_columns import COMMENT_MARKS, Spelling, is_number, split, text_blocks
 
 BLOCK = 1 << 20  # [byte] read at once; no line is longer
 NUM_WITH_INTENSITY = 4  # columns of a line without colours: x y z intensity
@@ -48,7 +48,7 @@ class LineLayout(NamedTuple):
     num_columns: int | None = None  # of each line; None: there may be any more than those read
     start: int = 0  # [byte] of the first line
     delimiter: str | None = None  # None: blanks and tabs
-    has_decimal_commas: bool = False
+    spelling: Spelling = Spelling()
     has_counts: bool = False  # a lone whole number counts the lines that follow, and is skipped
 
 
@@ -139,9 +139,9 @@ class NumberLines:
         rows = self.read_rows(count)
         return ((some[:, :3], some[:, 3:] if is_colored else some[:, -1]) for some in rows)
 
-    def locate(self, index: int) -> str:
-        """Return the file, and the number in it of the line that follows `index` lines of numbers."""
-        for number, _ in islice(self._number_lines(), index, None):
+    def locate(self, index: int, num_before: int = 0) -> str:
+        """Return the file, and the number in it of the line behind so many lines of numbers."""
+        for number, _ in islice(self._number_lines(), index + num_before, None):
             return f"{self.path}: line {number}"
         raise InputError(f"{self.path}: {reader.CUT}")
 
@@ -177,7 +177,7 @@ class NumberLines:
 def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
     """Strip lines of blanks; return the lines of numbers."""
     return [
-        line.replace(b",", b".") if layout.has_decimal_commas else line
+        layout.spelling.plain(line)
         for line in filter(None, map(bytes.strip, lines))
         if not line.startswith(COMMENT_MARKS) and not (layout.has_counts and line.isdigit())
     ]
@@ -204,8 +204,7 @@ def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
 def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_counts: bool) -> PointSource:
     wanted = PTS_WANTED if has_counts else WANTED
     fields = text_columns.read_fields(path, wanted)
-    first = fields.first.replace(b",", b".") if fields.has_decimal_commas else fields.first
-    num_columns = len(split(first, fields.delimiter))
+    num_columns = len(split(fields.spelling.plain(fields.first), fields.delimiter))
     rows = text_columns.read_samples(path, fields, num_columns)
     header = fields.names if channel == "shape" or len(fields.names) == num_columns else ()
     header = header or (fields.names if reader.find_fields(fields.names, channel) else ())
@@ -224,8 +223,8 @@ def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_count
         raise error(f"{path}: {found}, {wanted}")
     exact = num_columns if has_counts else None
     columns = tuple(names.index(name) for name in chosen)
-    layout = LineLayout(columns, exact, fields.start, fields.delimiter, fields.has_decimal_commas, has_counts)
-    is_fraction = path.suffix.lower() == ".xyzrgb" or text_columns.has_names_of_fractions(chosen)
+    layout = LineLayout(columns, exact, fields.start, fields.delimiter, fields.spelling, has_counts)
+    is_fraction = path.suffix.lower() == ".xyzrgb" or chosen[3:] == reader.FRACTION_NAMES
     if len(columns) == NUM_WITH_INTENSITY and channel == "colors":  # packed
 
         def read_columns() -> Iterator[reader.Columns]:
@@ -233,32 +232,19 @@ def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_count
 
         source = reader.Table(path, read_columns, chosen, ["f8", "f8", "f8", "u4"]).source(channel, settings)
     else:
-        known = rows[:, columns] if max(columns) < rows.shape[1] else rows[:0, :6]
-        usual = 1.0 if is_fraction else reader.BYTE_RANGE
-        source = line_source(path, layout, channel, wanted, settings, known, usual)
+        lines = NumberLines(path, layout, wanted)
+
+        def read() -> Iterator[reader.Part]:
+            return NumberLines(path, layout, wanted).read_points()
+
+        if channel == "colors":
+            known = rows[:, columns] if max(columns) < rows.shape[1] else rows[:0, :6]
+            parts = chain([(known[:, :3], known[:, 3:])], read())
+            usual = 1.0 if is_fraction else reader.BYTE_RANGE
+            source = reader.color_source(path, read, settings, usual, parts, lines.locate)
+        else:
+            source = reader.make_source(path, read, channel, settings)
     return source._replace(warnings=(*filter(None, [note]), *source.warnings))
-
-
-def line_source(
-    path: Path,
-    layout: LineLayout,
-    channel: Channel,
-    wanted: str,
-    settings: CloudSettings,
-    samples: Array,
-    usual: float,
-) -> PointSource:
-    """Return points of lines x y z r g b, whose usual range is given; or of x y z intensity, or of x y z."""
-
-    def read() -> Iterator[reader.Part]:
-        return NumberLines(path, layout, wanted).read_points()
-
-    if channel != "colors":
-        return reader.make_source(path, read, channel, settings)
-    parts = chain([(samples[:, :3], samples[:, 3:])], read())
-    brightest, notes = find_brightest(path, parts, settings, usual)
-    lines = NumberLines(path, layout, wanted)
-    return PointSource(path, lambda: reader.color_chunks(read(), brightest, lines.locate), warnings=notes)
 
 
 class PtxScan(NamedTuple):
@@ -368,14 +354,12 @@ def _read_scans(
         if is_colored and scan.num_columns == NUM_WITH_INTENSITY:
             lines.skip(scan.num_points)
             continue
-        locate = partial(_locate_after, lines, lines.num_taken)
+        num_before = lines.num_taken
         parts: Iterator[reader.Part] = lines.read_points(scan.num_points)
-        for points, values in reader.color_chunks(parts, brightest, locate) if brightest else parts:
+        if brightest:
+            parts = reader.color_chunks(parts, brightest, partial(lines.locate, num_before=num_before))
+        for points, values in parts:
             is_return = np.any(points != 0.0, axis=1)
             returned: Array = points[is_return].astype(np.float64, copy=False)
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
                 yield transform_points(returned, scan.T_world_from_scanner), values[is_return]
-
-
-def _locate_after(lines: NumberLines, num_before: int, index: int) -> str:
-    return lines.locate(num_before + index)

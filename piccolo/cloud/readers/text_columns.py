@@ -3,7 +3,7 @@
 import codecs
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,9 +12,10 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ..settings import COLUMNS, CloudSettings
-from .reader import COLOR_NAMES, CUT, FRACTION_NAMES, POINT_NAMES
+from .reader import COLOR_NAMES, CUT, NUM_COLORED, POINT_NAMES
 
 COMMENT_MARKS = (b"#", b"//")
+MARKS = b"\"'[](){}"
 HEAD_SIZE = 1 << 16  # [byte] in which the header is looked for
 NUM_SAMPLES = 16  # places in the file whose lines are looked at
 SAMPLE_SIZE = 1 << 13  # [byte]
@@ -22,6 +23,9 @@ MAX_COLUMNS = 64
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 UTF_16 = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 UNIT = re.compile(r"[\[(].*")  # behind a name
+HEX_COLOR = re.compile(
+    rb"(?<=[\s;,])[\"']?(?:#|0[xX]ff|0[xX])([0-9a-fA-F]{6})(?![0-9a-fA-F])[\"']?"
+)  # behind a number
 DECIMAL_COMMA = re.compile(r"[-+]?\d*,\d+(?:[eE][-+]?\d+)?")
 SKIP = "-"
 POSITION = ("x", "y", "z")
@@ -33,10 +37,24 @@ MOST_ROWS = 0.95  # of them are normals
 FAR = 4.0  # times as far from each other are an intensity and two colours as three colours
 MAX_BYTE = 255.0
 MAX_VALUE = 65535.0
-BEFORE = 2  # columns that FARO writes in front: row, column
+BEFORE = 2  # columns that may be in front: an index, or FARO's row and column
 BARE = (*POSITION, "intensity")
 USUAL = (POSITION, BARE, (*POSITION, *RGB))
 USUAL_OF_PTS = ((*BARE, *RGB),)
+
+
+class Spelling(NamedTuple):
+    """The way in which a file's lines write numbers."""
+
+    has_decimal_commas: bool = False
+    has_hex_colors: bool = False  # #rrggbb or 0xrrggbb
+    marks: bytes = b""  # around numbers or lines
+
+    def plain(self, line: bytes) -> bytes:
+        """Return a line with decimal points, and colours as whole numbers."""
+        line = line.translate(None, self.marks) if self.marks else line
+        line = line.replace(b",", b".") if self.has_decimal_commas else line
+        return HEX_COLOR.sub(lambda found: b"%d" % int(found[1], 16), line) if self.has_hex_colors else line
 
 
 class Fields(NamedTuple):
@@ -46,7 +64,7 @@ class Fields(NamedTuple):
     num_lines: int  # before it
     first: bytes  # that line
     delimiter: str | None  # None: blanks and tabs
-    has_decimal_commas: bool
+    spelling: "Spelling"
     names: tuple[str, ...]  # of all, in lower case; empty without a header
     header: str
 
@@ -83,20 +101,21 @@ def read_fields(path: Path, wanted: str) -> Fields:
     names: tuple[str, ...] = ()
     header = ""
     for num_lines, line in enumerate(head[start:].splitlines(keepends=True)):
-        text = line.decode("latin-1").strip()
+        marks = bytes({*line} & {*MARKS})
+        text = line.translate(None, marks).decode("latin-1").strip()
         delimiter = next((mark for mark in ";," if mark in text), None)
         has_commas = _has_decimal_commas(text, delimiter)
         delimiter = None if has_commas and delimiter == "," else delimiter
-        fields = split(line.replace(b",", b".") if has_commas else line, delimiter)
+        spelling = Spelling(has_commas, HEX_COLOR.search(line) is not None, marks)
+        fields = split(spelling.plain(line), delimiter)
         is_count = len(fields) == 1 and text.isdecimal()
         if not line.strip().startswith(COMMENT_MARKS) and not is_count and any(map(is_number, fields)):
-            return Fields(start, num_lines, line, delimiter, has_commas, names, header)
-        found = tuple(
-            UNIT.sub("", name).strip(' "').lower() for name in text.lstrip("#/ ").split(delimiter) if name
-        )
+            return Fields(start, num_lines, line, delimiter, spelling, names, header)
+        words = split(line.strip().lstrip(b"#/ "), delimiter)
+        found = tuple(UNIT.sub("", word).strip(' "').lower() for word in words)
         if any({*some} <= {*found} for some in POINT_NAMES):
             names = found
-            header = text
+            header = line.decode("latin-1").strip()
         start += len(line)
     raise InputError(f"{path}: no line of numbers at its beginning, {wanted}")
 
@@ -132,7 +151,7 @@ def read_samples(path: Path, fields: Fields, num_columns: int) -> Array:
         blocks = [next(text_blocks(path, HEAD_SIZE), b"")[fields.start :].splitlines()[:-1]]
     rows = []
     for line in (line for block in blocks for line in block):
-        numbers = split(line.replace(b",", b".") if fields.has_decimal_commas else line, fields.delimiter)
+        numbers = split(fields.spelling.plain(line), fields.delimiter)
         if len(numbers) == num_columns and not line.strip().startswith(COMMENT_MARKS):
             rows.append([float(field) if is_number(field) else np.nan for field in numbers[:MAX_COLUMNS]])
     found = np.array(rows, np.float64).reshape(-1, min(num_columns, MAX_COLUMNS))
@@ -159,7 +178,7 @@ def name_columns(rows: Array) -> tuple[str, ...]:
     num_columns = rows.shape[1]
     names = [SKIP] * num_columns
     with np.errstate(invalid="ignore", over="ignore"):
-        first = BEFORE if num_columns >= BEFORE + 6 and _are_grid_indices(rows) else 0
+        first = _count_indices(rows)
         names[first : first + 3] = POSITION
         free = [*range(first + 3, num_columns)]
         normals = next((k for k in free[:-2] if _are_normals(rows[:, k : k + 3], len(free))), None)
@@ -178,11 +197,14 @@ def name_columns(rows: Array) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _are_grid_indices(rows: Array) -> bool:
-    """Return True if the first two columns are whole numbers, and the three behind them are not."""
-    is_whole = np.all(rows % 1.0 == 0.0, axis=0)
-    has_index = bool(is_whole[:BEFORE].all()) and bool((rows[:, :BEFORE] >= 0.0).all())
-    return len(rows) > 0 and has_index and not is_whole[BEFORE : BEFORE + 3].any()
+def _count_indices(rows: Array) -> int:
+    """Return how many of the first columns are indices: whole numbers, and the three behind them are not."""
+    is_whole = np.all((rows % 1.0 == 0.0) & (rows >= 0.0), axis=0)
+    for count in range(1, BEFORE + 1):
+        is_right = is_whole[:count].all() and (rows[:, count : count + 3] % 1.0 != 0.0).any(axis=0).all()
+        if len(rows) and rows.shape[1] >= count + NUM_COLORED and is_right:
+            return count
+    return 0
 
 
 def _are_normals(rows: Array, num_free: int) -> bool:
@@ -217,11 +239,6 @@ def _are_colors(rows: Array) -> bool:
     is_whole = np.all(rows % 1.0 == 0.0, axis=0)
     largest = float(np.max(rows, initial=0.0))
     return largest <= 1.0 or bool(is_whole.all()) or (not is_whole.any() and largest <= MAX_BYTE)
-
-
-def has_names_of_fractions(names: Sequence[str]) -> bool:
-    """Return True if a header says that colours are 0 to 1."""
-    return {*FRACTION_NAMES} <= {*names}
 
 
 def note_names(path: Path, names: tuple[str, ...], line: str, is_pts: bool = False) -> str:
