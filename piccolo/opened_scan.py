@@ -254,6 +254,14 @@ def photo_of(result: Result, path: Path | None = None) -> Photo:
     return Photo(picture, **given)
 
 
+def read_as_localized(result: Result) -> Panorama:
+    """Read the photo of a result as when it was localized: not valid is what was masked then."""
+    how: Any = result.settings.get("panorama") or {}
+    nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
+    photo = replace(photo_of(result), mask=how.get("mask"), mask_nadir_deg=nadir_deg)
+    return read_panorama(photo, labels_of(result))
+
+
 def labels_of(result: Result) -> Labels | None:
     """Return how the labels of a result's photo were read; None for colours."""
     how: Any = result.settings.get("panorama") or {}

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from . import __version__
+from .arrays import Array
 from .camera import Mount
 from .camera.calibration import document_of as camera_document, read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
@@ -158,6 +159,11 @@ class Result:
     def best_guess(self) -> Pose | None:
         """The best pose found for a photo that is not localized; None if there is none."""
         return None if self.status == LOCALIZED else self.best_pose
+
+    @property
+    def pose_errors(self) -> Array:
+        """Covariance (6, 6) of `best_pose`, as `covariance` has it; zeros if that is None."""
+        return np.zeros((6, 6)) if self.covariance is None else self.covariance.matrix
 
     @property
     def cloud_name(self) -> str:

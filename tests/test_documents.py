@@ -19,6 +19,7 @@ from batches import main_of
 
 import piccolo
 from piccolo.cloud.stream import FORMATS
+from piccolo.export.formats import FORMATS as EXPORTS
 from research.synthetic import make_room
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -196,3 +197,14 @@ def test_the_table_of_formats_names_what_is_read():
     section = (ROOT / "docs/USAGE.md").read_text().partition("## Scans")[2].partition("##")[0]
     named = set(re.findall(r"`(\.[a-z0-9]+)`", section.partition("Colours go")[0]))
     assert named == {suffix for form in FORMATS for suffix in form.suffixes}
+
+
+def test_the_table_of_exports_says_what_each_format_holds():
+    section = (ROOT / "docs/CONVENTIONS.md").read_text().partition("## Exports")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (.) \| (.) \| (.) \| (.) \|", section, flags=re.MULTILINE)
+    options = "faces", "points", "offset"
+    held = [
+        (name, form.cameras != "spheres", *(option in form.options for option in options))
+        for name, form in EXPORTS.items()
+    ]
+    assert sorted((name, *(mark == "+" for mark in marks)) for name, *marks in rows) == sorted(held)

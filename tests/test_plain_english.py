@@ -23,7 +23,7 @@ MAX_PARTICIPLES = 3  # of nouns: masked_correlation, square_gap; and searched_fo
 # A message below piccolo/cli names a parameter in backticks by its Python name, such as `max_memory`, and a
 # script as tools/NAME.py; for_terminal of cli/start.py makes them --max-memory and piccolo-NAME.
 FLAG = re.compile(r"(?<![\w-])--[a-z{]")
-DOCUMENTS = ("README.md", "BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/*.md")
+DOCUMENTS = ("README.md", "BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/*.md", "docs/recipes/*.md")
 MAX_WORDS = 20_000
 MAX_PARALLEL = 4.99  # assignments a, b = x, y in 1,000 lines
 

@@ -3,17 +3,19 @@
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from itertools import takewhile
 from operator import eq
 from pathlib import Path, PurePosixPath
+from typing import TypeVar
+from xml.etree import ElementTree
 
 import numpy as np
 
 from ..arguments import PICTURES
 from ..arrays import Array
-from ..camera.foreign import read_binary_images
+from ..camera.foreign import parse_xml, read_binary_images
 from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
 from ..files.json_file import DAMAGE, MAX_SIZE, describe, read_bytes, read_json, read_text
@@ -27,29 +29,31 @@ from ..geometry.pose import (
 from ..localization.bundle_adjustment import RelativeScale
 
 WANTED = (
-    "wanted COLMAP's images.txt or .bin, hloc's poses, or in metres a transforms.json of nerfstudio, "
-    "a TUM trajectory or a tracker's table with a header"
+    "wanted COLMAP's images.txt or .bin, hloc's poses, Metashape's cameras.xml, or in metres a "
+    "transforms.json of nerfstudio, a TUM trajectory or a tracker's table with a header"
 )
 ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
 NUM_KITTI = 12  # columns: T_world_from_cam without its last row
 NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
-TUM_NAMES = (  # of a header's columns, without what is no letter
-    re.compile("time.*|t|stamp|name|image|file.*"),
-    *(re.compile(f"(p|t|pos.*|tr.*|prsr|)_?{axis}") for axis in "xyz"),
-    *(re.compile(f"(q|rot|ori|quat).*{axis}") for axis in "xyzw"),
-)
+COLUMNS = {  # of a header, without what is no letter
+    "name": re.compile("label|.*name|image|file.*|photo"),
+    "time": re.compile("time.*|t|stamp"),
+    **{axis: re.compile(f"(p|t|pos.*|tr.*|prsr|){axis}") for axis in "xyz"},
+    **{f"q{axis}": re.compile(f"(q|rot|ori|quat).*{axis}") for axis in "xyzw"},
+}
 NOT_IN_NAMES = re.compile(r"[\[(].*|[^a-z]")
 UNIT_LENGTH = 0.01  # by which the length of a quaternion may differ from 1
 NamedPose = tuple[str, Pose]
+Value = TypeVar("Value")
 
 
 def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose | None]:
     """Return each photo's pose in the common frame of a file of poses; None of one that it has not.
 
-    COLMAP's files, hloc's and transforms.json name their photos; in a TUM trajectory the time is the photo's
-    name without suffix. Raises InputError if the file is none of these, or has two poses of a photo, or
-    fewer than two photos'.
+    COLMAP's files, hloc's, Metashape's cameras.xml and transforms.json name their photos; in a TUM trajectory
+    the time is the photo's name without suffix. Raises InputError if the file is none of these, or has two
+    poses of a photo, or fewer than two photos'.
     """
     poses = read_transforms(path) if path.suffix == ".json" else read_lines(path)
     found = match_names(path, poses, photos)
@@ -63,22 +67,22 @@ def find_scale(path: Path) -> RelativeScale:
     """Return the unit of a file's positions: structure from motion, as in COLMAP's files, has none."""
     if path.suffix == ".json":
         return "metres"
-    if path.suffix == ".bin":
+    if path.suffix in (".bin", ".xml"):
         return "unknown"
     rows = _rows(path)
     return "unknown" if _are_colmap(rows) or _are_hloc(rows) else "metres"
 
 
-def match_names(path: Path, poses: Sequence[NamedPose], photos: Sequence[Path]) -> list[Pose | None]:
-    """Return the pose of each photo by the end of its path, as much as is in common, or by its stem.
+def match_names(path: Path, poses: Sequence[tuple[str, Value]], photos: Sequence[Path]) -> list[Value | None]:
+    """Return the pose, or what else is named, of each photo by the end of its path or by its stem.
 
     Raises InputError if two fit alike.
     """
-    by_name = defaultdict[str, list[tuple[tuple[str, ...], Pose]]](list)
+    by_name = defaultdict[str, list[tuple[tuple[str, ...], Value]]](list)
     for name, pose in poses:
         parts = PurePosixPath(name.replace("\\", "/")).parts or ("",)
         by_name[parts[-1]].append((parts[::-1], pose))
-    chosen: list[Pose | None] = []
+    chosen: list[Value | None] = []
     for photo in photos:
         own = photo.parts[::-1]
         found = by_name.get(photo.name) or by_name.get(photo.stem) or []
@@ -165,6 +169,8 @@ def read_transforms(path: Path) -> list[NamedPose]:
 def read_lines(path: Path) -> list[NamedPose]:
     """Return the poses in a file of COLMAP or hloc, by the photos' names, or of a tracker, by times."""
     with naming(path, WANTED):
+        if path.suffix == ".xml":
+            return [read_metashape(camera) for camera in read_xml(path).iter("camera") if _has_pose(camera)]
         if path.suffix == ".bin":
             rows = list(read_binary_images(read_bytes(path, WANTED, MAX_SIZE)))
             return [read_colmap_row(row) for row in rows]
@@ -176,6 +182,23 @@ def read_lines(path: Path) -> list[NamedPose]:
         return [read_tum_row(row) for row in rows]
 
 
+def read_xml(path: Path) -> ElementTree.Element:
+    """Return the root of an XML file; InputError if it is damaged."""
+    with naming(path, WANTED):
+        return parse_xml(read_text(path, WANTED))
+
+
+def _has_pose(camera: ElementTree.Element) -> bool:
+    return camera.find("transform") is not None
+
+
+def read_metashape(camera: ElementTree.Element) -> NamedPose:
+    """Return the label and the pose of a camera: T_chunk_from_cam, camera axes right, down, forward."""
+    label = camera.get("label", "")
+    T = np.array((camera.findtext("transform") or "").split(), float).reshape(4, 4)
+    return label, check_transform(T, label, OPTICAL_FROM_CAM)
+
+
 def _rows(path: Path) -> list[list[str]]:
     """Return the rows of a file of poses, those of a tracker's table as TUM has them.
 
@@ -185,14 +208,24 @@ def _rows(path: Path) -> list[list[str]]:
     rows = [_split(line) for line in lines if not line.startswith("#")]
     if _are_colmap(rows):
         return rows
-    names = [NOT_IN_NAMES.sub("", name.lower()) for name in _split(lines[0].lstrip("# "))] if lines else []
-    columns = [next((k for k, name in enumerate(names) if some.fullmatch(name)), None) for some in TUM_NAMES]
-    if all(column is not None for column in columns):
+    found = find_columns(_split(lines[0].lstrip("# ")), COLUMNS) if lines else {}
+    if {*COLUMNS} - {*found} <= {"time"} or {*COLUMNS} - {*found} == {"name"}:
+        first, *others = (at for name, at in found.items() if name in ("name", "time"))
+        columns = [min([first, *others]), *(found[name] for name in list(COLUMNS)[2:])]
         rows = rows[not lines[0].startswith("#") :]
-        return [[row[k] for k in columns if k is not None and k < len(row)] for row in rows]
+        return [[row[k] for k in columns if k < len(row)] for row in rows]
     if rows and all(len(row) == NUM_TUM + 1 and all(map(is_number, row[1:])) for row in rows):
         return [row[:NUM_TUM] for row in rows]
     return rows
+
+
+def find_columns(words: Sequence[str], names: Mapping[str, re.Pattern[str]]) -> dict[str, int]:
+    """Return the first column of a header's words that each of the names fits."""
+    letters = [NOT_IN_NAMES.sub("", word.lower()) for word in words]
+    fits = {
+        name: [at for at, word in enumerate(letters) if form.fullmatch(word)] for name, form in names.items()
+    }
+    return {name: columns[0] for name, columns in fits.items() if columns}
 
 
 def _split(line: str) -> list[str]:

@@ -71,18 +71,23 @@ def _unpack(form: str, content: bytes, at: int) -> tuple[Any, ...]:
 def parse_markup(text: str) -> Any:
     """Return what YAML or XML holds, as JSON would have it; ValueError if it is damaged."""
     if text.lstrip().startswith("<"):
-        if "<!DOCTYPE" in text or "<!ENTITY" in text:
-            raise ValueError("a document type, which is not read")
-        try:
-            return {"xml": _of_element(ElementTree.fromstring(text.strip()))}
-        except ElementTree.ParseError as error:
-            raise ValueError(f"damaged XML ({error})") from error
+        return {"xml": _of_element(parse_xml(text))}
     yaml = import_optional("a calibration in YAML", "yaml", "formats")
     lines = [line for line in text.replace("!!opencv-matrix", "").splitlines() if not line.startswith("%")]
     try:
         return yaml.safe_load("\n".join(lines))
     except yaml.YAMLError as error:
         raise ValueError(f"damaged YAML ({' '.join(str(error).split())[:100]})") from error
+
+
+def parse_xml(text: str) -> ElementTree.Element:
+    """Return the root of XML; ValueError if it is damaged, or has a document type."""
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:
+        raise ValueError("a document type, which is not read")
+    try:
+        return ElementTree.fromstring(text.strip())
+    except ElementTree.ParseError as error:
+        raise ValueError(f"damaged XML ({error})") from error
 
 
 def _of_element(element: ElementTree.Element) -> Any:

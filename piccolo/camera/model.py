@@ -212,6 +212,11 @@ class Camera:
         f = self._named.get("f", 0.0)
         return self._named.get("fx", f), self._named.get("fy", f)
 
+    @property
+    def center(self) -> tuple[float, float]:
+        """Pixel of the optical axis, of a lens."""
+        return self._named["cx"], self._named["cy"]
+
     @cached_property
     def distortion(self) -> Distortion:
         """The coefficients that this model has."""

@@ -2,12 +2,16 @@
 
 from argparse import ArgumentParser
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from ..export.formats import FORMATS, export, offset_file
-from ..export.posed_images import Options, Selection, select
+from ..export.faces import FACES
+from ..export.formats import FORMATS, export
+from ..export.posed_images import Options, Selection, offset_file, select
+from ..export.reconstructions import points_file
+from ..export.scan_points import open_scan_of
 from ..geometry.pose import CAMERA_AXES
 from ..result import Result, check_scan, read_results
 from ..scan_map.open_map import CachePolicy, scan_sha256_of
@@ -20,16 +24,21 @@ formats:
 
 examples:
   python tools/export_poses.py --results poses.jsonl --format colmap --images photos --out model
+  python tools/export_poses.py --results poses.jsonl --format colmap --points 200000 --faces 6 --out splat
+  python tools/export_poses.py --results poses.jsonl --format colmap --into sparse/0 --out sparse/1
   python tools/export_poses.py --results poses.jsonl --format geojson --crs EPSG:25832 --out poses.geojson
 
 Results that are not localized are left out and counted on stderr, and so are pictures that a format can't
-hold: for example with a blank in the name (colmap), or a sphere stored rotated (nerfstudio). In csv, a path
-that a spreadsheet would take for a formula gets a leading apostrophe. Axes and angles: docs/CONVENTIONS.md.
-A file at --out is replaced; - is stdout. Prints one JSON object to stdout (to stderr if the poses go there).
+hold: for example with a blank in the name (colmap), or a sphere stored rotated (nerfstudio). --faces writes a
+data set: images, masks (black is ignored), and sparse/0 or transforms.json; photos are copied into it.
+In csv, a path that a spreadsheet would take for a formula gets a leading apostrophe. Axes and angles:
+docs/CONVENTIONS.md. A file at --out is replaced; - is stdout. Prints one JSON object to stdout (to stderr if
+the poses go there).
 """
 EXIT_LEFT_OUT = 1
 EXIT_CODES = "0 done, 1 pictures that the format can't hold were left out"
-OPTIONS = ("size", "offset", "axes", "timestamps", "crs")  # those that only some formats take
+# options that only some formats take
+OPTIONS = ("size", "offset", "axes", "timestamps", "crs", "points", "faces", "into")
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -50,6 +59,14 @@ def add_arguments(parser: ArgumentParser) -> None:
     text = "index (default): 0, 1, ...; name: the number that is the picture's name; walk: the frames' times"
     option(group, "--timestamps", f"{text} ({_takers('timestamps')})", choices=["index", "name", "walk"])
     option(group, "--crs EPSG", f"coordinate system of the cloud, such as EPSG:25832 ({_takers('crs')})")
+    text = f"also write N points of the scan that the pictures show, at most ({_takers('points')})"
+    option(group, "--points N", text)
+    text = (
+        "write pinhole pictures of each sphere, and masks: 6 as of a cube, 8 around the horizon, 14 also at "
+    )
+    option(group, "--faces N", f"{text}the cube's corners ({_takers('faces')})", choices=FACES)
+    text = "folder of a model in the scan's coordinates, of which --out is a copy with the pictures added"
+    option(group, "--into FOLDER", f"{text} ({_takers('into')})")
 
 
 def _takers(option: str) -> str:
@@ -97,12 +114,17 @@ def main(arguments: Arguments) -> int:
         options = options_from(arguments)
     results = read_results(arguments.results)
     beside = offset_file(arguments.out) if options.offset else None
-    outputs = {"--out": arguments.out, "the offset": beside}
+    points = (
+        points_file(arguments.out) if options.points and not FORMATS[arguments.format].is_folder else None
+    )
+    outputs = {"--out": arguments.out, "the offset": beside, "the points": points}
     files = {Path(name) for result in results for name in (result.pano, result.cloud_name)}
     check_distinct(outputs, [*arguments.results, *files])
     selection = select(results, arguments.cloud, arguments.all)
     for note in (*notes_on(selection), *check_content(arguments, selection.results)):
         arguments.note(note)
+    if options.points is not None:
+        options = replace(options, scan=open_scan_of(selection.results, arguments.workers()))
     left_out = export(selection.results, arguments.format, arguments.out, options)
     counts = {reason: len(names) for reason, names in left_out.items()}
     for reason, names in left_out.items():

@@ -158,9 +158,9 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
 def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks, and of photos that belong together in another way."""
     group = parser.add_argument_group("photos together")
-    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt or .bin, or "
-    text += "hloc's (of any scale), or in metres a transforms.json (nerfstudio, phone apps), or a TUM "
-    text += "trajectory or a tracker's table with the photos' names as times"
+    text = "relative poses of the photos, which are then localized together: COLMAP's images.txt or .bin, "
+    text += "hloc's or Metashape's cameras.xml (of any scale), or in metres a transforms.json (nerfstudio, "
+    text += "phone apps), or a TUM trajectory or a tracker's table with the photos' names as times"
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)

@@ -24,6 +24,10 @@ class PackedPoints:
     def __len__(self) -> int:
         return len(self.x)
 
+    def stack(self) -> Array32:
+        """Return the positions (N, 3) [m]."""
+        return np.stack([self.x, self.y, self.z], axis=1)
+
     def take(self, indices: Integers | slice) -> "PackedPoints":
         """Return the points at `indices`, in that order."""
         return PackedPoints(self.x[indices], self.y[indices], self.z[indices], self.rgbx[indices])

@@ -6,7 +6,7 @@ A point's colour is the weighted median of the photos that see it, so that no si
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,8 @@ from ..geometry.pose_gaussian import turn_positions
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, HALF, kernel
-from ..opened_scan import OpenedScan, labels_of, photo_of
-from ..panorama import Panorama, read_panorama, texels
+from ..opened_scan import OpenedScan, read_as_localized
+from ..panorama import Panorama, texels
 from ..panorama.model import shrink
 from ..result import FAILED, Result
 from ..scan_map.open_map import find_prepared_map
@@ -267,22 +267,16 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
     if len(found) < LEAST_PHOTOS:
         text = f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours"
         raise InputError(text)
-    panoramas = [read_unmasked(found[0][0])]
+    panoramas = [shrink(read_as_localized(found[0][0]), WIDTH)]
     bytes_each = PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES + PAIR_BYTES * len(found)
     check_memory(len(found) * bytes_each, f"colouring by {len(found)} photos", "localize fewer at once")
-    panoramas += workers.map(read_unmasked, [result for result, _ in found[1:]], "read")
+    panoramas += workers.map(
+        lambda result: shrink(read_as_localized(result), WIDTH), [result for result, _ in found[1:]], "read"
+    )
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
     poses, gains = align(scan_map.octree, panoramas, poses, anchors, workers)
     return make_brushes(scan_map.octree, panoramas, poses, gains, workers)
-
-
-def read_unmasked(result: Result) -> Panorama:
-    """Read the photo of a result as it was read when it was localized, without what was masked."""
-    how: Any = result.settings.get("panorama") or {}
-    nadir_deg = float(how.get("mask_nadir_deg") or 0.0)
-    photo = replace(photo_of(result), mask=how.get("mask"), mask_nadir_deg=nadir_deg)
-    return shrink(read_panorama(photo, labels_of(result)), WIDTH)
 
 
 def make_anchor(result: Result, pose_world: Pose, pose_map: Pose) -> Anchor:

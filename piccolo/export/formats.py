@@ -6,7 +6,6 @@ written beside it: <name>.offset.txt.
 
 import csv
 import io
-import json
 from collections.abc import Iterable, Sequence
 from decimal import Decimal
 from pathlib import Path
@@ -16,23 +15,34 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..errors import InputError, import_optional, printable
-from ..files.atomic import check_output, check_output_folder, is_stream, replacing_folder, write_atomically
+from ..files.atomic import check_output, check_output_folder, replacing_folder, write_atomically, write_lines
 from ..files.json_file import read_bytes
-from ..geometry.pose import (
-    CAMERA_AXES,
-    OPENGL_FROM_CAM,
-    OPTICAL_FROM_CAM,
-    Pose,
-    heading_pitch_roll_deg,
-    log_so3,
-    quaternion_wxyz,
-    translation,
-    turn_axes,
-)
+from ..geometry.pose import CAMERA_AXES, Pose, heading_pitch_roll_deg, quaternion_wxyz, turn_axes
 from ..panorama.gpano import with_pose
 from ..panorama.picture import WANTED
 from ..result import Result
-from .posed_images import NO_UTF8, Format, LeftOut, Options, PosedImage, select_images
+from .colmap import write_colmap
+from .faces import write_faces
+from .posed_images import (
+    NO_UTF8,
+    Format,
+    LeftOut,
+    Options,
+    PosedImage,
+    names_within,
+    numbers,
+    offset_comment,
+    select_images,
+    write_offset_beside,
+)
+from .reconstructions import (
+    NERFSTUDIO_LENSES,
+    OPENSFM_LENSES,
+    check_shape,
+    write_json,
+    write_nerfstudio,
+    write_opensfm,
+)
 
 COLUMNS = (
     *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
@@ -43,37 +53,6 @@ STEP = 10.0  # [m] ahead, to find true north
 MARGIN_DEG = 3.0  # around a system's area: a country that spans two zones often uses one for both
 LOCAL = 10_000.0  # [m] from (0, 0): without a margin, as scans with coordinates of their own lie there
 GPX_NAMESPACE = "http://www.topografix.com/GPX/1/1"
-
-
-def numbers(values: Iterable[float], separator: str = " ") -> str:
-    """Return the shortest text of each number that reads back as the same float64."""
-    return separator.join(repr(float(value)) for value in values)
-
-
-def offset_comment(options: Options) -> list[str]:
-    """Return a comment line that gives the offset; none without."""
-    if options.offset is None:
-        return []
-    return [f"# world position = position here + {numbers(options.offset)}"]
-
-
-def write_lines(out: Path, lines: Sequence[str]) -> None:
-    """Write a text file, UTF-8."""
-    write_atomically(out, "".join(f"{line}\n" for line in lines).encode())
-
-
-def offset_file(out: Path) -> Path:
-    """Return the file of the offset beside one that has no place for it."""
-    return out.with_name(f"{out.name}.offset.txt")
-
-
-def write_offset_beside(out: Path, options: Options) -> None:
-    """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
-    if options.offset is None:
-        return
-    if is_stream(out):
-        raise InputError(f"`offset`: nothing can be written beside {out}, wanted a file as `out`")
-    write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])
 
 
 def cell(text: str) -> str:
@@ -135,98 +114,6 @@ def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> N
         lines.append("\t".join([image.name, image.time, numbers(values, "\t")]))
     write_offset_beside(out, options)
     write_lines(out, lines)
-
-
-def write_colmap(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write cameras.txt, images.txt and a points3D.txt without points into a new folder.
-
-    https://colmap.github.io/format.html: T_cam_from_world, camera axes right, down, forward. The camera model
-    EQUIRECTANGULAR came with COLMAP 4; its parameters are the width and height. Its pixels are ours. Photos
-    have their own models, which are COLMAP's; of a rig each picture is an image.
-    """
-    texts = [_colmap_camera(image) for image in images]
-    camera_ids = {text: i for i, text in enumerate(dict.fromkeys(texts), 1)}
-    cameras = [f"{i} {text}" for text, i in camera_ids.items()]
-    lines = []
-    for i, (image, text) in enumerate(zip(images, texts, strict=True), 1):
-        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
-        values = numbers([*quaternion_wxyz(pose.R_cam_from_world), *translation(pose)])
-        lines += [f"{i} {values} {camera_ids[text]} {image.name}", ""]  # a line of points follows
-    offset = offset_comment(options)
-    with replacing_folder(out) as folder:
-        comment = "# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"
-        write_lines(folder / "cameras.txt", [comment, *offset, *cameras])
-        comment = "# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME, then a line of points"
-        write_lines(folder / "images.txt", [comment, *offset, *lines])
-        write_lines(folder / "points3D.txt", ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[]"])
-
-
-def _colmap_camera(image: PosedImage) -> str:
-    """Model, size and parameters."""
-    if camera := image.camera:
-        return f"{camera.model} {camera.width} {camera.height} {numbers(camera.params)}"
-    w, h = image.size
-    return f"EQUIRECTANGULAR {w} {h} {w} {h}"
-
-
-def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write transforms.json: T_world_from_cam, camera axes right, up, back; the offset is applied_transform.
-
-    Rays of EQUIRECTANGULAR in nerfstudio/cameras/cameras.py: theta = -pi (x - cx) / fl_x,
-    phi = pi (1/2 + (y - cy) / fl_y), direction (-sin theta sin phi, cos phi, -cos theta sin phi): the image
-    centre looks along -z.
-    """
-    is_one_size = len({image.size for image in images}) == 1
-    document: dict[str, object] = {"camera_model": "EQUIRECTANGULAR"}
-    if is_one_size:
-        document |= _intrinsics(images[0].size)
-    if options.offset is not None:
-        moved = np.column_stack([np.eye(3), -np.array(options.offset)])
-        document["applied_transform"] = moved.tolist()
-    frames = []
-    for image in images:
-        own = {} if is_one_size else _intrinsics(image.size)
-        matrix = turn_axes(image.pose, OPENGL_FROM_CAM).T_world_from_cam.tolist()
-        frames.append({"file_path": image.name, **own, "transform_matrix": matrix})
-    write_json(out, document | {"frames": frames})
-
-
-def _intrinsics(size: tuple[int, int]) -> dict[str, float]:
-    """Return sphere as a focal length: x - cx reaches +-fl_x at the seam, y - cy +-fl_y / 2 at the poles."""
-    w, h = size
-    return {"w": w, "h": h, "fl_x": w / 2, "fl_y": float(h), "cx": w / 2, "cy": h / 2}
-
-
-def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> None:
-    """Write a list of one reconstruction without points. Camera axes right, down, forward.
-
-    https://opensfm.org/docs/geometry.html: rotation is an angle-axis vector and translation t of
-    x_cam = R x_world + t. Its spherical camera takes the sphere to be W = 2 H exactly.
-    """
-    cameras = {}
-    shots = {}
-    for image in images:
-        width, height = image.size
-        camera = f"spherical {width} {height}"
-        cameras[camera] = {"projection_type": "spherical", "width": width, "height": height}
-        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
-        rotation = log_so3(pose.R_cam_from_world).tolist()
-        shot = {"rotation": rotation, "translation": translation(pose).tolist(), "camera": camera}
-        shots[image.name] = shot
-    write_offset_beside(out, options)
-    write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
-
-
-def _check_shape(image: PosedImage) -> None:
-    """Refuse a sphere that OpenSfM can't take."""
-    width, height = image.size
-    if width != 2 * height:
-        raise InputError(f"{image.path}: found {width} x {height}, wanted W = 2 H exactly for OpenSfM")
-
-
-def write_json(out: Path, document: object) -> None:
-    """Write a JSON file."""
-    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
 
 
 def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -318,10 +205,7 @@ def _feature(image: PosedImage, transformer: Any, geod: Any, crs: str) -> dict[s
 
 def write_gpano(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write a copy of each picture into a new folder, under its name in `images` or its file name."""
-    names = [image.name if options.images else Path(image.name).name for image in images]
-    if len(set(names)) < len(names):
-        twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{twice}: two pictures have this name; use `images` FOLDER to distinguish them")
+    names = names_within(images, options.images is not None)
     with replacing_folder(out) as folder:
         for name, image in zip(names, images, strict=True):
             (folder / name).parent.mkdir(parents=True, exist_ok=True)
@@ -335,14 +219,32 @@ def _copy(image: PosedImage) -> bytes:
 
 OFFSET = frozenset({"offset"})
 MODEL = OFFSET | {"size"}
-COLMAP_TEXT = "text model of COLMAP 4 and pycolmap; `out` is a new folder"
+COLMAP_TEXT = "text and binary model of COLMAP 4; needs the library pycolmap; `out` is a new folder"
 NERFSTUDIO_TEXT = "transforms.json of nerfstudio, in the folder of `images`"
 POTREE_TEXT = "coordinates.txt of Potree's 360 images, in the folder of `images`"
-# a blank ends a name, for COLMAP as for the readers in Python
-COLMAP = Format("colmap", COLMAP_TEXT, write_colmap, MODEL, True, forbidden=rf"\s|{NO_UTF8}", cameras="own")
-NERFSTUDIO = Format("nerfstudio", NERFSTUDIO_TEXT, write_nerfstudio, MODEL, cameras="spheres")
+COLMAP = Format(
+    "colmap",
+    COLMAP_TEXT,
+    write_colmap,
+    MODEL | {"points", "faces", "into"},
+    is_folder=True,
+    forbidden=rf"\s|{NO_UTF8}",  # a blank ends a name, for COLMAP as for the readers in Python
+    cameras="own",
+    data_set=("sparse/0", "images"),
+)
+NERFSTUDIO = Format(
+    "nerfstudio",
+    NERFSTUDIO_TEXT,
+    write_nerfstudio,
+    MODEL | {"points", "faces"},
+    cameras="own",
+    lenses=NERFSTUDIO_LENSES,
+    data_set=("transforms.json", ""),
+)
 OPENSFM_TEXT = "reconstruction.json of OpenSfM"
-OPENSFM = Format("opensfm", OPENSFM_TEXT, write_opensfm, MODEL, cameras="spheres", check=_check_shape)
+OPENSFM = Format(
+    "opensfm", OPENSFM_TEXT, write_opensfm, MODEL, cameras="own", check=check_shape, lenses=OPENSFM_LENSES
+)
 CSV = Format("csv", "table with a header", write_csv, OFFSET, has_unique_names=False)
 TRAJECTORY = "trajectory for evo and other tools"
 TUM = Format("tum", TRAJECTORY, write_tum, OFFSET | {"axes", "timestamps"}, forbidden="")
@@ -368,9 +270,19 @@ def export(results: Sequence[Result], name: str, out: Path, options: Options) ->
     Raises InputError if no pose is left, or `out` can't be written.
     """
     form = FORMATS[name]
-    (check_output_folder if form.is_folder else check_output)(out)
+    has_folder = form.is_folder or options.faces is not None
+    (check_output_folder if has_folder else check_output)(out)
     if not results:
         raise InputError(f"{out}: there is no pose to write; `all` also writes those that are not localized")
     images, left_out = select_images(results, form, options)
-    form.write(images, out, options)
+    if options.faces is None:
+        form.write(images, out, options)
+        return left_out
+    with replacing_folder(out) as folder:
+        model, root = form.data_set
+        (folder / model).parent.mkdir(parents=True, exist_ok=True)
+        faces = write_faces(images, options.faces, options.images is not None, folder)
+        names = [image.path.relative_to(folder / root).as_posix() for image in faces]
+        faces = [image._replace(name=name) for image, name in zip(faces, names, strict=True)]
+        form.write(faces, folder / model, options)
     return left_out

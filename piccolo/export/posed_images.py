@@ -4,7 +4,7 @@ import math
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -12,14 +12,18 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 from ..camera import Calibration, Camera, Mount
+from ..cloud.soa import LocalCloud
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, unreadable
+from ..files.atomic import is_stream, write_lines
 from ..geometry.pose import Pose
 from ..panorama import panorama_size
 from ..panorama.gpano import check_size
 from ..result import Result
 
 NO_UTF8 = "[\ud800-\udfff]"  # in a name
+# by the lens of a camera model: its name in a format, and the coefficients that it may have
+Lenses = Mapping[str, tuple[str, tuple[str, ...]]]
 LeftOut = dict[str, list[str]]  # names of pictures that a format can't hold, by why
 
 
@@ -33,6 +37,13 @@ class PosedImage(NamedTuple):
     size: tuple[int, int]  # W, H [px]; (0, 0) for a format that takes none
     result: Result
     camera: Camera | None = None  # None for a sphere
+    mask: str | None = None  # in the data set, black where the picture does not count
+
+    @property
+    def lens(self) -> Camera:
+        """The camera, also of a sphere."""
+        width, height = self.size
+        return self.camera or Camera("EQUIRECTANGULAR", width, height, (float(width), float(height)))
 
 
 @dataclass(frozen=True)
@@ -45,12 +56,20 @@ class Options:
     axes: str = "optical"  # of the camera in a trajectory: "optical" or "piccolo"
     timestamps: str = "index"  # "index"; "name": the number that is the picture's name; "walk": of its frame
     crs: str | None = None  # of the cloud's coordinates, such as EPSG:25832
+    points: int | None = None  # of the scan, at most
+    scan: LocalCloud | None = None  # from which these are
+    faces: int | None = None  # pinhole pictures of each sphere, in a folder with the model; None: spheres
+    into: Path | None = None  # folder of a model to which the images are added
 
     def __post_init__(self) -> None:
         if self.size is not None:
             check_size("`size`", self.size)
         if self.offset is not None and not all(math.isfinite(value) for value in self.offset):
             raise InputError(f"`offset`: found {self.offset}, wanted three finite numbers")
+        if self.points is not None and self.points < 1:
+            raise InputError(f"`points`: found {self.points}, wanted at least 1")
+        if self.faces is not None and self.into is not None:
+            raise InputError("`faces`, `into`: found both, wanted one: a model has the pictures that it has")
 
 
 class Format(NamedTuple):
@@ -65,6 +84,8 @@ class Format(NamedTuple):
     forbidden: str = NO_UTF8  # regular expression of what a name can't have in it; empty for anything
     check: Callable[[PosedImage], object] | None = None  # raises InputError for a picture that it can't hold
     cameras: Literal["any", "own", "spheres"] = "any"  # of photos: no matter, an image each, or not at all
+    lenses: Lenses | None = None  # those that it has; None: COLMAP's, all of ours
+    data_set: tuple[str, str] = ("", "")  # of faces: path of the model, and of the folder that names begin in
 
 
 class Selection(NamedTuple):
@@ -143,10 +164,22 @@ def _images_of(result: Result, index: int, form: Format, options: Options) -> li
         image = PosedImage(name, path, _time(result, path, index, options), pose, size, result)
         if mount is not None:
             image = image._replace(pose=mount.pose(pose), camera=mount.camera)
+        if form.lenses is not None:
+            _check_lens(image, form.lenses, form.name)
         if form.check is not None:
             form.check(image)
         images.append(image)
     return images
+
+
+def _check_lens(image: PosedImage, lenses: Lenses, name: str) -> None:
+    """Refuse a lens, or coefficients of one, that a format has not."""
+    lens = image.lens
+    known = lenses[lens.lens][1] if lens.lens in lenses else ()
+    more = [name for name, value in lens.distortion._asdict().items() if value and name not in known]
+    if more or lens.lens not in lenses:
+        wanted = f"wanted {' '.join(known) or 'another'} for {name}"
+        raise InputError(f"{image.path}: found the model {lens.model} {' '.join(more)}, {wanted}")
 
 
 def _time(result: Result, path: Path, index: int, options: Options) -> str:
@@ -188,6 +221,15 @@ def _size(path: Path, options: Options) -> tuple[int, int]:
     return size
 
 
+def names_within(images: Sequence[PosedImage], has_names: bool) -> list[str]:
+    """Return names for copies of the pictures: those they have, or without `has_names` their last parts."""
+    names = [image.name if has_names else Path(image.name).name for image in images]
+    if len(set(names)) < len(names):
+        twice = next(name for name in names if names.count(name) > 1)
+        raise InputError(f"{twice}: two pictures have this name; use `images` FOLDER to distinguish them")
+    return names
+
+
 def _name(pano: Path, images: Path | None) -> str:
     """Return the picture's name, with slashes, in the folder of images if there is one."""
     if images is None:
@@ -196,3 +238,29 @@ def _name(pano: Path, images: Path | None) -> str:
     if ".." in name.parts:
         raise InputError(f"{pano}: is not in the folder `images` {images}")
     return name.as_posix()
+
+
+def numbers(values: Iterable[float], separator: str = " ") -> str:
+    """Return the shortest text of each number that reads back as the same float64."""
+    return separator.join(repr(float(value)) for value in values)
+
+
+def offset_comment(options: Options) -> list[str]:
+    """Return a comment line that gives the offset; none without."""
+    if options.offset is None:
+        return []
+    return [f"# world position = position here + {numbers(options.offset)}"]
+
+
+def offset_file(out: Path) -> Path:
+    """Return the file of the offset beside one that has no place for it."""
+    return out.with_name(f"{out.name}.offset.txt")
+
+
+def write_offset_beside(out: Path, options: Options) -> None:
+    """Write <name>.offset.txt with the offset's three numbers, if there is an offset."""
+    if options.offset is None:
+        return
+    if is_stream(out):
+        raise InputError(f"`offset`: nothing can be written beside {out}, wanted a file as `out`")
+    write_lines(offset_file(out), [*offset_comment(options), numbers(options.offset)])

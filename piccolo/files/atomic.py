@@ -12,7 +12,7 @@ import sys
 import tempfile
 import time
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -186,6 +186,11 @@ def write_atomically(path: Path, content: bytes) -> None:
     """Write `content` to `path`, whole or not at all."""
     with replacing(path) as file:
         file.write(content)
+
+
+def write_lines(out: Path, lines: Sequence[str]) -> None:
+    """Write a text file, UTF-8."""
+    write_atomically(out, "".join(f"{line}\n" for line in lines).encode())
 
 
 @contextmanager

@@ -19,6 +19,7 @@ UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known
 NUM_ADJUSTMENTS = 6
 NUM_ROUNDS = 4  # in which errors of relative poses and the bundle are estimated in turn
 TELLING = 10.0  # ratio of variances (F) by which one photo differs from the others: it contradicts them
+MEDIAN = 2.366  # of chi square of 3
 QUANTILE = 1.645  # deviations of the normal distribution below which 95 % lie
 
 
@@ -33,6 +34,9 @@ class RelativeErrors(NamedTuple):
     def covariance(self) -> Array:
         """Covariance (6, 6) of one photo's relative pose."""
         return np.asarray(np.diag(np.repeat([self.turn**2, self.move**2], 3)))
+
+
+LEAST_ERRORS = RelativeErrors(math.radians(0.01), 0.001)  # chosen: no given pose is better
 
 
 class Bundle(NamedTuple):
@@ -147,6 +151,31 @@ def estimate_errors(bundle: Bundle, estimates: Sequence[Estimate], errors: Relat
         if max(factors) == 1.0:
             break
     return errors
+
+
+def match_median(covariances: Sequence[Array], steps: Array, errors: RelativeErrors) -> RelativeErrors:
+    """Return the errors by which the median photo is as far off as it should be, whatever wrong ones say.
+
+    Photos' own poses have covariances (6, 6), and are off by steps (6,).
+    """
+    scales = []
+    for part in (slice(0, 3), slice(3, 6)):
+        spreads = [(own + errors.covariance)[part, part] for own in covariances]
+        squares = [
+            step[part] @ np.linalg.solve(spread, step[part])
+            for spread, step in zip(spreads, steps, strict=True)
+        ]
+        scales.append(math.sqrt(float(np.median(squares)) / MEDIAN))
+    turn = max(errors.turn * scales[0], LEAST_ERRORS.turn)
+    move = max(errors.move * scales[1], LEAST_ERRORS.move)
+    return errors._replace(turn=turn, move=move)
+
+
+def find_odd(covariances: Sequence[Array], steps: Array, errors: RelativeErrors) -> tuple[bool, ...]:
+    """Return which photos, off by steps (N, 6), contradict the others: chi square is far too large."""
+    spreads = [own + errors.covariance for own in covariances]
+    squares = [step @ np.linalg.solve(spread, step) for spread, step in zip(spreads, steps, strict=True)]
+    return tuple(bool(square > 2.0 * LIKELY) for square in squares)
 
 
 def find_contradicting(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> int | None:

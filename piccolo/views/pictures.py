@@ -104,10 +104,15 @@ def sphere_width_for(camera: Camera) -> int:
 def cut(image: Bytes, camera: Camera, R_lens_from_cam: Array = UPRIGHT) -> Bytes:
     """Return a camera's picture (height, width, 3) of a sphere's (H, W, 3); black where it shows nothing."""
     u, v, is_in = _places(camera, image.shape[1], R_lens_from_cam)
-    around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
-    found = cv2.remap(around, u + np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR)
+    found = sample_sphere(image, u, v)
     found[~is_in] = 0
-    return np.asarray(found, np.uint8)
+    return found
+
+
+def sample_sphere(image: Bytes, u: Array32, v: Array32) -> Bytes:
+    """Return the colours of a sphere's picture (H, W, ...) at its columns and rows (h, w) [px], bilinear."""
+    around = np.concatenate([image[:, -1:], image, image[:, :1]], axis=1)
+    return np.asarray(cv2.remap(around, u + np.float32(0.5), v - np.float32(0.5), cv2.INTER_LINEAR), np.uint8)
 
 
 def cut_view(view: View, camera: Camera) -> View:

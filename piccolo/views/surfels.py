@@ -66,7 +66,7 @@ def make_surfels(points: PackedPoints, workers: Workers) -> Surfels:
     """Fit a surfel to each point and its nearest neighbours; leave out points in the air."""
     from scipy.spatial import cKDTree  # noqa: PLC0415  # who draws no picture need not wait for it
 
-    positions = np.stack([points.x, points.y, points.z], axis=1)
+    positions = points.stack()
     normals = np.zeros_like(positions)
     radii = np.zeros(len(positions), np.float32)
     if len(positions) <= NUM_NEIGHBORS:
@@ -219,7 +219,7 @@ def visible_indices(points: PackedPoints, center_world: Array) -> Int64s:
 def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
     """Render surfels at a pose, (width / 2, width) pixels; colours in uint8."""
     p = surfels.points
-    ranges = np.linalg.norm(np.stack([p.x, p.y, p.z], axis=1) - pose.center_world, axis=1)
+    ranges = np.linalg.norm(p.stack() - pose.center_world, axis=1)
     largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
     surfels = surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
     packed, extents = _in_camera(surfels, pose, width)
@@ -249,7 +249,7 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
 def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[Array32, Array]:
     """Return surfels (N, 9) and extents (N, 3) as `splat` reads them."""
     p = surfels.points
-    x_cam = (np.stack([p.x, p.y, p.z], axis=1) - pose.center_world) @ pose.R_cam_from_world.T
+    x_cam = (p.stack() - pose.center_world) @ pose.R_cam_from_world.T
     ranges = np.linalg.norm(x_cam, axis=1)
     rays = x_cam / ranges[:, None]
     normals = surfels.normals @ pose.R_cam_from_world.T

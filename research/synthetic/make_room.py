@@ -13,8 +13,8 @@ from piccolo.camera.calibration import read_cameras
 from piccolo.cli.command import Arguments, UsageError, check_folder_name, checking_options, command, option
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.errors import import_optional
-from piccolo.export.formats import tum_lines, write_lines
-from piccolo.files.atomic import write_atomically
+from piccolo.export.formats import tum_lines
+from piccolo.files.atomic import write_atomically, write_lines
 from piccolo.jobs.threads import Workers
 from piccolo.views.pictures import encode_image
 

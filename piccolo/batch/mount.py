@@ -1,0 +1,135 @@
+"""Boresight calibration: how a camera sits on what carries it, from photos that were localized.
+
+With body_from_world(t) the given poses: cam_from_world(t) = cam_from_body @ body_from_world(t + clock). The
+rotation and lever arm of cam_from_body and the clock offset are fitted by Gauss and Newton, robustly. Errors
+of the given poses are estimated from what is left.
+"""
+
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..errors import InputError
+from ..geometry.pose import Pose, exp_so3, log_so3, orthonormal
+from ..geometry.pose_gaussian import LIKELY, LOOSE, add, subtract
+from ..localization.bundle_adjustment import RelativeErrors, find_odd, match_median, weigh_robustly
+
+LEAST_PHOTOS = 4
+NUM_ROUNDS = 5  # in which errors and the mount are estimated in turn
+MOST_ALIKE = 0.9  # correlation of errors of neighbouring photos
+NUM_STEPS = 8  # of Gauss and Newton, at most
+SETTLED = 1e-6  # [rad, m, s] of a step, after which there is none
+NEAR_S = 0.01  # [s] on either side, over which a velocity is taken
+MOST_ERRORS = RelativeErrors(math.radians(5.0), 0.5)  # chosen: such poses are in another frame, or of others
+LOOSER = 0.04  # chosen: of the information of a given pose that counts before the clock is known
+
+
+class Trajectory(NamedTuple):
+    """Given poses by time."""
+
+    times: Array  # (N,) [s], rising; of poses without times their numbers
+    poses: Sequence[Pose]  # body_from_world
+    has_clock: bool = True
+
+    def at(self, time: float) -> Pose:
+        """Return the pose at a time: linear between two poses, and beyond the first and last."""
+        k = min(max(int(np.searchsorted(self.times, time)), 1), len(self.times) - 1)
+        before, after = self.poses[k - 1], self.poses[k]
+        share = (time - self.times[k - 1]) / (self.times[k] - self.times[k - 1])
+        turn = share * log_so3(after.R_cam_from_world @ before.R_cam_from_world.T)
+        center = before.center_world + share * (after.center_world - before.center_world)
+        return Pose(orthonormal(exp_so3(turn) @ before.R_cam_from_world), center)
+
+
+class Sighting(NamedTuple):
+    """A photo that was localized."""
+
+    pose: Pose
+    covariance: Array  # (6, 6)
+    time: float  # by the photos' clock, or of its given pose
+
+
+class MountFit(NamedTuple):
+    """A camera's mount."""
+
+    cam_from_body: Pose  # center_world is the lever arm in the body's axes [m]
+    clock: float  # [s] to be added to photos' times; 0 without times
+    covariance: Array  # (7, 7) of rotation [rad] about the camera's axes, lever arm [m], clock [s]
+    errors: RelativeErrors  # of a given pose
+    is_odd: tuple[bool, ...]  # True for photos that contradict the others
+    steps: Array  # (N, 6) of photos from where the mount puts them [rad, m]
+
+
+def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit:
+    """Fit a mount; InputError for too few photos, and for poses that do not fit at all."""
+    if len(sightings) < LEAST_PHOTOS or len(trajectory.poses) < LEAST_PHOTOS:
+        found = f"found {len(sightings)} localized photos with a given pose"
+        raise InputError(f"{found}, wanted {LEAST_PHOTOS} or more")
+    own = [sighting.covariance for sighting in sightings]
+    errors = RelativeErrors()
+    mount = _begin(sightings, trajectory, errors)
+    clock = 0.0
+    for _ in range(NUM_ROUNDS):
+        for _ in range(NUM_STEPS):
+            information = np.diag([LOOSE] * 7)
+            gradient = np.zeros(7)
+            for sighting in sightings:
+                J, step = _compare(mount, clock, sighting, trajectory)
+                weighted = J.T @ weigh_robustly(step, sighting.covariance + errors.covariance)
+                information = information + weighted @ J
+                gradient = gradient + weighted @ step
+            covariance = np.linalg.inv(information)
+            delta = np.asarray(covariance @ gradient)
+            mount = add(mount, delta[:6])
+            clock += float(delta[6])
+            if np.abs(delta).max() < SETTLED:
+                break
+        steps = np.array([_compare(mount, clock, sighting, trajectory)[1] for sighting in sightings])
+        errors = match_median(own, steps, errors)
+    if errors.turn > MOST_ERRORS.turn or errors.move > MOST_ERRORS.move:
+        off = f"{errors.move:.2g} m and {math.degrees(errors.turn):.2g} deg"
+        wanted = "wanted those of one rigid mount in the scan's coordinates"
+        raise InputError(f"found given poses that are off by {off}, {wanted}")
+    is_odd = find_odd(own, steps, errors)
+    return MountFit(mount, clock, covariance * _repeat(own, steps, errors, is_odd), errors, is_odd, steps)
+
+
+def _repeat(own: Sequence[Array], steps: Array, errors: RelativeErrors, is_odd: Sequence[bool]) -> float:
+    """Return how many photos in order say what one says, by how alike the errors of two neighbours are.
+
+    Given poses drift: those of neighbouring photos are off in the same way, which is not averaged away.
+    """
+    roots = [np.linalg.cholesky(covariance + errors.covariance) for covariance in own]
+    whitened = np.array([np.linalg.solve(root, step) for root, step in zip(roots, steps, strict=True)])
+    whitened = whitened[~np.array(is_odd)]
+    alike = float((whitened[1:] * whitened[:-1]).sum() / max(np.square(whitened).sum(), 1e-12))
+    alike = min(max(alike, 0.0), MOST_ALIKE)
+    return (1.0 + alike) / (1.0 - alike)
+
+
+def _begin(sightings: Sequence[Sighting], trajectory: Trajectory, errors: RelativeErrors) -> Pose:
+    """Return the mount that one photo says and most others agree with."""
+    mounts = [sighting.pose @ trajectory.at(sighting.time).inverse() for sighting in sightings]
+    information = LOOSER / np.diag(errors.covariance)
+
+    def cost(mount: Pose) -> float:
+        squares = [float(information @ np.square(subtract(other, mount))) for other in mounts]
+        return float(np.minimum(squares, LIKELY).sum())
+
+    return min(mounts, key=cost)
+
+
+def _compare(mount: Pose, clock: float, sighting: Sighting, trajectory: Trajectory) -> tuple[Array, Array]:
+    """Return the derivative (6, 7) of a photo's pose by mount and clock, and its step (6,) from there."""
+    time = sighting.time + clock
+    body = trajectory.at(time)
+    J = np.zeros((6, 7))
+    J[:3, :3] = np.eye(3)
+    J[3:, 3:6] = body.R_cam_from_world.T
+    if trajectory.has_clock:
+        ends = [mount @ trajectory.at(time + side) for side in (-NEAR_S, NEAR_S)]
+        J[:, 6] = subtract(ends[1], ends[0]) / (2.0 * NEAR_S)
+    return J, subtract(sighting.pose, mount @ body)

@@ -1,0 +1,58 @@
+"""Move a model of COLMAP or Metashape onto the scan, with scale."""
+
+from argparse import ArgumentParser
+
+import numpy as np
+
+from ..export.model_alignment import file_of_poses, fit_alignment, write_aligned
+from ..files.atomic import check_output, check_output_folder
+from ..geometry.pose import quaternion_wxyz
+from ..result import read_results
+from .command import Arguments, check_distinct, command, option
+
+EPILOG = """\
+example:
+  python localize.py --cloud scan.ply --pano photos --relative sparse/0/images.bin --out poses.jsonl
+  python tools/align_model.py --model sparse/0 --results poses.jsonl --out aligned
+
+The photos are localized together first, by the poses that the model gives them relative to each other; three
+or more that are localized decide. The whole model moves: cameras, poses and points (COLMAP), or the transform
+of the chunk (Metashape, whose coordinates become local). Prints one JSON object: x_scan = scale R x_model +
+translation, with R = R_scan_from_model as a quaternion; standard deviations; how far half and nine tenths of
+the photos are from where the model puts them; and the photos that contradict the others.
+"""
+SHARES = 0.5, 0.9  # of the photos
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """All options."""
+    text = "folder of COLMAP's model, or Metashape's cameras.xml (File > Export > Cameras)"
+    option(parser, "--model FILE", text, required=True)
+    option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
+    option(parser, "--out FILE", "the model in the scan's coordinates: a new folder, or .xml", required=True)
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: Arguments) -> int:
+    """Read, fit, write; returns the exit code."""
+    outputs = {"--out": arguments.out}
+    check_distinct(outputs, [*arguments.results, file_of_poses(arguments.model)])
+    (check_output_folder if arguments.model.is_dir() else check_output)(arguments.out)
+    fit = fit_alignment(arguments.model, read_results(arguments.results))
+    write_aligned(arguments.model, fit, arguments.out)
+    turned, moved = (np.quantile(np.linalg.norm(part, axis=1), SHARES) for part in np.split(fit.steps, 2, 1))
+    report = {
+        "out": str(arguments.out),
+        "scale": fit.scale,
+        "std_scale": fit.scale * float(fit.std[6]),
+        "quaternion_wxyz_scan_from_model": quaternion_wxyz(fit.R_scan_from_model).tolist(),
+        "std_deg": np.degrees(fit.std[:3]).tolist(),
+        "translation_m": fit.translation.tolist(),
+        "std_m": fit.std[3:6].tolist(),
+        "photos": len(fit.steps),
+        "off_deg": np.degrees(turned).tolist(),
+        "off_m": moved.tolist(),
+        "contradicting": list(fit.contradicting),
+    }
+    arguments.report(outputs, report)
+    return 0

@@ -1,0 +1,97 @@
+"""Find how a camera sits on a scanner, vehicle or robot: rotation, lever arm and clock offset."""
+
+from argparse import ArgumentParser
+from collections.abc import Sequence
+from itertools import compress
+from pathlib import Path
+
+import numpy as np
+
+from ..arrays import Array
+from ..batch.inputs import times_of
+from ..batch.mount import Sighting, Trajectory, fit_mount
+from ..batch.pose_table import PoseTable, read_pose_table
+from ..batch.relative_poses import match_names
+from ..errors import InputError
+from ..files.atomic import write_atomically
+from ..geometry.pose import log_so3, quaternion_wxyz
+from ..result import Result, read_results
+from .command import Arguments, check_outputs, command, option
+
+EPILOG = """\
+example:
+  python tools/calibrate_mount.py --results poses.jsonl --given coordinates.txt --out corrected.txt
+
+Given poses are in the scan's coordinates: Potree's coordinates.txt, a table with a header that names x, y, z
+and omega, phi, kappa or yaw, pitch, roll [deg] (Metashape, Pix4D), or a trajectory in TUM's form (time x y z
+qx qy qz qw), which needs the photos' times. Photos are found by their names. --out has the same rows, the
+camera's poses in place of the given ones.
+
+Prints one JSON object: cam_from_body as a quaternion and a rotation vector [deg], axes of both +x forward, +y
+left, +z up, as those of the camera that the given poses mean; the lever arm [m] in the body's axes; the clock
+offset [s] to be added to photos' times; standard deviations; errors of a given pose; and the photos that
+contradict the others.
+"""
+
+
+def add_arguments(parser: ArgumentParser) -> None:
+    """All options."""
+    option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
+    option(parser, "--given FILE", "given poses, see below", required=True)
+    option(parser, "--out FILE", "write the file again with the mount applied")
+    text = (
+        "times of photos, for a trajectory: exif, names (the last number in each) or a CSV file of name and "
+    )
+    option(parser, "--times SOURCE", text + "time [s] (default: of a walk its own, else exif)")
+
+
+def find_times(
+    results: Sequence[Result], table: PoseTable, clock: Array, source: str | None
+) -> list[float | None]:
+    """Return the time of each photo; None of one that the table has not."""
+    photos = [Path(result.pano) for result in results]
+    if (names := table.column("name")) is not None:
+        return match_names(table.path, list(zip(names, clock.tolist(), strict=True)), photos)
+    own = [result.walk.time for result in results if result.walk]
+    found = own if own else times_of(photos, source)
+    if found is None or len(found) != len(photos):
+        raise InputError("`times`: found none of the photos, wanted those for the trajectory")
+    return [*found]
+
+
+@command(__file__, __doc__, EPILOG, add_arguments)
+def main(arguments: Arguments) -> int:
+    """Read, fit, write; returns the exit code."""
+    outputs = {"--out": arguments.out}
+    check_outputs(outputs, [*arguments.results, arguments.given])
+    table = read_pose_table(arguments.given)
+    times = table.times
+    clock = np.arange(float(len(table.rows))) if times is None else times
+    trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
+    results = [result for result in read_results(arguments.results) if result.pose]
+    found = find_times(results, table, clock, arguments.times)
+    sightings = {
+        result.pano: Sighting(result.pose, result.pose_errors, time)
+        for result, time in zip(results, found, strict=True)
+        if result.pose is not None and time is not None
+    }
+    fit = fit_mount(list(sightings.values()), trajectory)
+    if arguments.out:
+        poses = [fit.cam_from_body @ trajectory.at(float(time) + fit.clock) for time in clock]
+        write_atomically(arguments.out, table.with_poses(poses).encode())
+    std = np.sqrt(np.diag(fit.covariance))
+    R = fit.cam_from_body.R_cam_from_world
+    report = {
+        "photos": len(sightings),
+        "contradicting": list(compress(sightings, fit.is_odd)),
+        "quaternion_wxyz_cam_from_body": quaternion_wxyz(R).tolist(),
+        "rotation_deg": np.degrees(log_so3(R)).tolist(),
+        "std_deg": np.degrees(std[:3]).tolist(),
+        "lever_arm_m": fit.cam_from_body.center_world.tolist(),
+        "std_m": std[3:6].tolist(),
+        "clock_s": fit.clock if trajectory.has_clock else None,
+        "std_s": float(std[6]) if trajectory.has_clock else None,
+        "given_errors": {"deg": float(np.degrees(fit.errors.turn)), "m": fit.errors.move},
+    }
+    arguments.report(outputs, report)
+    return 0

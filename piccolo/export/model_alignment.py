@@ -1,0 +1,133 @@
+"""Models of structure from motion, COLMAP's or Metashape's, moved into the scan's coordinates with scale.
+
+Rotation, scale and position are those of the bundle that localized photos and the model's poses make.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..arrays import Array
+from ..batch.relative_poses import read_relative_poses, read_xml
+from ..errors import InputError, import_optional
+from ..files.atomic import write_atomically
+from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
+from ..localization.bundle_adjustment import (
+    UNKNOWN_SCALE,
+    Bundle,
+    Estimate,
+    RelativeErrors,
+    adjust,
+    find_odd,
+    match_median,
+)
+from ..localization.bundle_search import move_origin_near
+from ..result import Result
+from .colmap import read_model, write_model
+
+LEAST_PHOTOS = 3
+LOOSER = 0.04  # chosen: of the information of a pose that counts before the scale is exact
+NUM_ROUNDS = 4  # in which the errors of the model and its place are estimated in turn
+LOCAL = (
+    'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
+)
+
+
+class Alignment(NamedTuple):
+    """The similarity x_scan = scale R_scan_from_model x_model + translation, and how well photos agree."""
+
+    scale: float
+    R_scan_from_model: Array
+    translation: Array  # (3,) [m]
+    std: Array  # (7,) of rotation [rad] about the model's axes, place of its middle [m], logarithm of scale
+    contradicting: tuple[str, ...]
+    steps: Array  # (N, 6) of photos from where the model puts them [rad, m]
+
+
+def file_of_poses(model: Path) -> Path:
+    """Return the file with the poses of a model: images.bin or images.txt of a folder, else itself."""
+    if not model.is_dir():
+        return model
+    return next((model / name for name in ("images.bin", "images.txt") if (model / name).exists()), model)
+
+
+def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
+    """Fit the similarity of a model to photos that are localized; InputError for fewer than three of them."""
+    sure = [(Path(result.pano), result) for result in results if result.pose is not None]
+    relative = read_relative_poses(file_of_poses(model), [path for path, _ in sure])
+    known = [(result, pose) for (_, result), pose in zip(sure, relative, strict=True) if pose is not None]
+    if len(known) < LEAST_PHOTOS:
+        found = f"found {len(known)} localized photos of it in the results"
+        raise InputError(f"{model}: {found}, wanted {LEAST_PHOTOS} or more")
+    middle = np.mean([pose.center_world for _, pose in known], axis=0)
+    near = move_origin_near([pose for _, pose in known])
+    none = np.zeros((6, 6))
+    estimates = [
+        Estimate(PoseGaussian(result.pose, result.pose_errors, none), pose)
+        for (result, _), pose in zip(known, near, strict=True)
+        if result.pose is not None
+    ]
+    free = RelativeErrors(log_scale=UNKNOWN_SCALE)
+    bundle = _begin(estimates, free)
+    own_covariances = [own.own for own, _ in estimates]
+    errors = free
+    for _ in range(NUM_ROUNDS):
+        adjusted = adjust(bundle, estimates, errors)
+        bundle = adjusted.bundle
+        steps = np.array([subtract(own.pose, bundle.place(pose)) for own, pose in estimates])
+        errors = match_median(own_covariances, steps, errors)
+    odd = itertools.compress([result.pano for result, _ in known], find_odd(own_covariances, steps, errors))
+    scale = math.exp(bundle.log_scale)
+    R = bundle.pose.R_cam_from_world.T
+    translation = bundle.pose.center_world - scale * R @ middle
+    return Alignment(scale, R, translation, np.sqrt(np.diag(adjusted.covariance)), tuple(odd), steps)
+
+
+def _begin(estimates: Sequence[Estimate], errors: RelativeErrors) -> Bundle:
+    """Return the bundle by one photo that most others agree with; its scale is a median of distances."""
+    own = np.array([one.pose.center_world for one, _ in estimates])
+    given = np.array([pose.center_world for _, pose in estimates])
+    rows, columns = np.triu_indices(len(own), 1)
+    lengths = [np.linalg.norm(centers[rows] - centers[columns], axis=1) for centers in (own, given)]
+    log_scale = math.log(max(float(np.median(lengths[0] / np.maximum(lengths[1], 1e-12))), 1e-12))
+    frame = Bundle(Pose(np.eye(3), np.zeros(3)), log_scale)
+    information = LOOSER / np.diag(errors.covariance)
+
+    def cost(bundle: Bundle) -> float:
+        steps = np.array([subtract(one.pose, bundle.place(pose)) for one, pose in estimates])
+        return float(np.minimum(np.square(steps) @ information, LIKELY).sum())
+
+    return min(
+        (Bundle(frame.scale(pose).inverse() @ one.pose, log_scale) for one, pose in estimates), key=cost
+    )
+
+
+def write_aligned(model: Path, alignment: Alignment, out: Path) -> None:
+    """Write the whole model, moved: a new folder of COLMAP's files, or Metashape's cameras.xml."""
+    if model.is_dir():
+        pycolmap = import_optional("COLMAP", "pycolmap", "colmap")
+        reconstruction = read_model(model)
+        rotation = pycolmap.Rotation3d(alignment.R_scan_from_model)
+        reconstruction.transform(pycolmap.Sim3d(alignment.scale, rotation, alignment.translation))
+        write_model(reconstruction, out)
+        return
+    root = read_xml(model)
+    frames = [*root.iter("component")] or [*root.iter("chunk")]
+    if len(frames) != 1:
+        raise InputError(f"{model}: found {len(frames)} components or chunks, wanted one")
+    for old in frames[0].findall("transform"):
+        frames[0].remove(old)
+    transform = ElementTree.SubElement(frames[0], "transform")
+    parts: dict[str, Array] = {"rotation": alignment.R_scan_from_model, "translation": alignment.translation}
+    for name, values in {**parts, "scale": np.array(alignment.scale)}.items():
+        ElementTree.SubElement(transform, name).text = " ".join(map(repr, values.ravel().tolist()))
+    for reference in root.iter("reference"):
+        if reference.text and reference.text.strip():
+            reference.text = LOCAL
+    write_atomically(out, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")

@@ -1,0 +1,144 @@
+"""Models of COLMAP and Metashape, moved onto the scan with scale."""
+
+import json
+from xml.etree import ElementTree
+
+import numpy as np
+import pycolmap
+import pytest
+from poses import result, write_results
+
+from piccolo.cli import align_model
+from piccolo.confidence.covariance import PoseCovariance
+from piccolo.geometry.pose import OPTICAL_FROM_CAM, Pose, exp_so3, log_so3
+from piccolo.geometry.pose_gaussian import add
+
+ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
+SCALE = 0.37  # model from scan
+R_MODEL_FROM_SCAN = exp_so3(np.array([0.4, -1.1, 2.0]))
+SHIFT = np.array([3.0, -1.0, 0.5])
+PHOTO = np.repeat([np.radians(0.05), 0.004], 3)
+MODEL = np.repeat([np.radians(0.02), 0.002], 3)  # errors of the model, in the scan's unit
+
+
+def to_model(points):
+    return SCALE * (points - ORIGIN) @ R_MODEL_FROM_SCAN.T + SHIFT
+
+
+@pytest.fixture
+def scene():
+    """True poses of 20 photos on a walk through 8 m, one result wrong, and points."""
+    rng = np.random.default_rng(4)
+    places = ORIGIN + np.column_stack([np.linspace(0.0, 8.0, 20), rng.normal(size=(20, 2))])
+    poses = [Pose(exp_so3(2.0 * rng.normal(size=3)), place) for place in places]
+    covariance = PoseCovariance(np.diag(PHOTO**2), "")
+    found = [add(pose, PHOTO * rng.normal(size=6)) for pose in poses]
+    found[5] = add(found[5], np.array([0.0, 0.0, 2.0, 1.0, 3.0, 0.0]))
+    results = [result(f"photos/{k:02d}.jpg", pose, covariance=covariance) for k, pose in enumerate(found)]
+    noisy = [add(pose, MODEL * rng.normal(size=6)) for pose in poses]
+    in_model = [Pose(p.R_cam_from_world @ R_MODEL_FROM_SCAN.T, to_model(p.center_world)) for p in noisy]
+    points = ORIGIN + np.array([4.0, 0.0, 0.0]) + rng.uniform(-4.0, 4.0, (300, 3))
+    return results, in_model, points
+
+
+def _write_colmap(folder, in_model, points):
+    """A model with a point in 33 at a wrong place, which the poses don't depend on."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model="SIMPLE_RADIAL", width=640, height=480, params=[500, 320, 240, 0.1], camera_id=1
+        )
+    )
+    for k, pose in enumerate(in_model):
+        R = OPTICAL_FROM_CAM @ pose.R_cam_from_world
+        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(R), -R @ pose.center_world)
+        model.add_image_with_trivial_frame(
+            pycolmap.Image(f"{k:02d}.jpg", keypoints=np.empty((0, 2)), camera_id=1, image_id=k + 1), rigid
+        )
+    for k, point in enumerate(to_model(points)):
+        model.add_point3D(point + (5.0 if k % 33 == 0 else 0.0), pycolmap.Track(), np.uint8([k % 256, 1, 2]))
+    folder.mkdir()
+    model.write(folder)
+
+
+def _run(tmp_path, scene, model, out, capsys):
+    results = write_results(tmp_path / "r.jsonl", scene[0])
+    words = ["--model", str(model), "--results", str(results), "--out", str(out)]
+    code = align_model.main(words)
+    printed = capsys.readouterr()
+    return code, json.loads(printed.out) if code == 0 else printed.err
+
+
+def _check(report):
+    assert report["scale"] == pytest.approx(1.0 / SCALE, rel=1e-3)
+    assert abs(report["scale"] * SCALE - 1.0) < 4.0 * report["std_scale"] * SCALE
+    assert report["contradicting"] == ["photos/05.jpg"]
+    assert report["photos"] == 20
+    assert report["off_m"][0] < 0.02
+    assert report["off_deg"][0] < 0.2
+
+
+def test_a_model_of_colmap_moves_with_its_points_and_photos(tmp_path, scene, capsys):
+    _, in_model, points = scene
+    _write_colmap(tmp_path / "model", in_model, points)
+    code, report = _run(tmp_path, scene, tmp_path / "model", tmp_path / "aligned", capsys)
+    assert code == 0
+    _check(report)
+    model = pycolmap.Reconstruction(tmp_path / "aligned")
+    before = pycolmap.Reconstruction(tmp_path / "model")
+    assert model.cameras[1].params.tolist() == [500, 320, 240, 0.1]
+    for k, point in enumerate(points):
+        if k % 33:
+            assert np.linalg.norm(model.points3D[k + 1].xyz - point) < 0.01
+        assert model.points3D[k + 1].color.tolist() == [k % 256, 1, 2]
+    R = np.array(report["quaternion_wxyz_scan_from_model"])
+    turn = pycolmap.Rotation3d(np.roll(R, -1)).matrix() @ R_MODEL_FROM_SCAN
+    assert np.degrees(np.linalg.norm(log_so3(turn))) < 0.05
+    for number, image in model.images.items():
+        seen = before.images[number].project_point(before.points3D[2].xyz)
+        if seen is not None:
+            assert np.abs(image.project_point(model.points3D[2].xyz) - seen).max() < 0.5
+
+
+XML = """<?xml version="1.0" encoding="UTF-8"?>
+<document version="2.0.0"><chunk label="Chunk 1" enabled="true">
+<cameras next_id="20">{}<camera id="99" sensor_id="0" label="lost"/></cameras>
+<reference>GEOGCS["WGS 84"]</reference>
+<transform><rotation>1 0 0 0 1 0 0 0 1</rotation><translation>0 0 0</translation><scale>2</scale></transform>
+</chunk></document>
+"""
+
+
+def test_a_chunk_of_metashape_gets_the_transform(tmp_path, scene, capsys):
+    _, in_model, points = scene
+    cameras = []
+    for k, pose in enumerate(in_model):
+        T = np.eye(4)
+        T[:3, :3] = (OPTICAL_FROM_CAM @ pose.R_cam_from_world).T
+        T[:3, 3] = pose.center_world
+        words = " ".join(map(str, T.ravel()))
+        cameras.append(
+            f'<camera id="{k}" sensor_id="0" label="{k:02d}"><transform>{words}</transform></camera>'
+        )
+    (tmp_path / "cameras.xml").write_text(XML.format("".join(cameras)))
+    code, report = _run(tmp_path, scene, tmp_path / "cameras.xml", tmp_path / "out.xml", capsys)
+    assert code == 0
+    _check(report)
+    chunk = ElementTree.parse(tmp_path / "out.xml").getroot().find("chunk")
+    (transform,) = chunk.findall("transform")
+    R, t, scale = (
+        np.array(transform.findtext(n).split(), float) for n in ("rotation", "translation", "scale")
+    )
+    moved = scale * to_model(points) @ R.reshape(3, 3).T + t
+    assert np.linalg.norm(moved - points, axis=1).max() < 0.01
+    assert chunk.findtext("reference").startswith("LOCAL_CS")
+
+
+def test_what_can_not_be_aligned_is_refused(tmp_path, scene, capsys):
+    results, in_model, points = scene
+    _write_colmap(tmp_path / "model", in_model, points)
+    code, text = _run(tmp_path, (results[:2],), tmp_path / "model", tmp_path / "x", capsys)
+    assert (code, "found 2 localized photos of it in the results, wanted 3 or more" in text) == (3, True)
+    (tmp_path / "a.xml").write_text("<chunk><camera label='00'><transform>1 2</transform></camera></chunk>")
+    code, text = _run(tmp_path, scene, tmp_path / "a.xml", tmp_path / "x.xml", capsys)
+    assert (code, "a.xml: found" in text) == (3, True)

@@ -1,0 +1,167 @@
+"""Mounts: rotation, lever arm and clock offset of a camera, from photos and given poses."""
+
+import json
+
+import numpy as np
+import pytest
+from poses import result, write_results
+from refusals import assert_input_error
+
+from piccolo.batch.mount import Sighting, Trajectory, fit_mount
+from piccolo.batch.pose_table import read_pose_table
+from piccolo.cli import calibrate_mount
+from piccolo.confidence.covariance import PoseCovariance
+from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
+from piccolo.geometry.pose_gaussian import add, subtract
+
+ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
+MOUNT = Pose(exp_so3(np.radians([1.2, -1.2, 1.1])), np.array([0.06, -0.05, 0.06]))  # 2 degrees, 10 cm
+CLOCK = 0.08
+PHOTO = np.repeat([np.radians(0.05), 0.004], 3)  # deviations of a photo's pose
+GIVEN = np.repeat([np.radians(0.07), 0.01], 3)
+
+
+def body_at(time):
+    """A walk in curves, with a nod."""
+    nod = 0.5 + 0.15 * np.sin(1.3 * time)
+    turn = exp_so3(np.array([0.1 * np.sin(2.1 * time), nod, 0.0])) @ yaw_rotation(1.0 + np.sin(0.7 * time))
+    place = np.array([3.0 * np.cos(0.4 * time), 3.0 * np.sin(0.4 * time), 0.1 * np.sin(time)])
+    return Pose(turn, ORIGIN + place)
+
+
+def _made(seed, num_photos=40, num_wrong=2):
+    """A trajectory at 20 Hz with errors that last for half a second, and photos with errors of their own."""
+    rng = np.random.default_rng(seed)
+    times = np.arange(-0.5, 30.5, 0.05)
+    slow = np.repeat(rng.normal(size=(len(times) // 10 + 1, 6)) * GIVEN, 10, axis=0)[: len(times)]
+    given = [add(body_at(time), error) for time, error in zip(times, slow, strict=True)]
+    photo_times = np.sort(rng.uniform(0.0, 30.0, num_photos))
+    poses = [add(MOUNT @ body_at(time + CLOCK), PHOTO * rng.normal(size=6)) for time in photo_times]
+    for k in range(num_wrong):
+        poses[7 * k + 3] = add(poses[7 * k + 3], np.array([0.0, 0.0, 1.0, 2.0, -3.0, 0.0]))
+    return Trajectory(times, given), photo_times, poses
+
+
+def _fit(seed):
+    trajectory, times, poses = _made(seed)
+    covariance = np.diag(PHOTO**2)
+    sightings = [Sighting(p, covariance, t) for p, t in zip(poses, times, strict=True)]
+    return fit_mount(sightings, trajectory)
+
+
+def test_a_mount_and_its_clock_are_found_with_deviations_that_hold():
+    squares = []
+    for seed in range(2):
+        fit = _fit(seed)
+        off = np.append(subtract(MOUNT, fit.cam_from_body), CLOCK - fit.clock)
+        assert np.degrees(np.linalg.norm(off[:3])) < 0.05
+        assert np.linalg.norm(off[3:6]) < 0.01
+        assert abs(off[6]) < 0.01
+        assert [k for k, is_odd in enumerate(fit.is_odd) if is_odd] == [3, 10]
+        squares.append(np.square(off) / np.diag(fit.covariance))
+    assert np.max(squares) < 4.0**2
+    assert 0.3 < np.mean(squares) < 3.0
+    assert fit.errors.move == pytest.approx(0.01, rel=0.5)
+
+
+def _text_of(kind, names, times, poses):
+    """A file of poses in each of the formats, by formulas of its own."""
+    lines = {
+        "tum": [],
+        "potree": [""],
+        "opk": ["# CoordinateSystem: LOCAL", OPK_HEAD],
+        "metashape": [YPR_HEAD],
+    }[kind]
+    for name, time, pose in zip(names, times, poses, strict=True):
+        R = pose.R_cam_from_world.T  # columns: forward, left, up
+        x, y, z = (repr(float(value)) for value in pose.center_world)
+        if kind == "potree":
+            f, left, up = R.T
+            course = np.arctan2(f[0], f[1])
+            level = np.array([-np.cos(course), np.sin(course), 0.0])
+            angles = [course, np.arcsin(f[2]), np.arctan2(-up @ level, left @ level)]
+            lines.append("\t".join([name, repr(float(time)), x, y, z, *map(str, np.degrees(angles))]))
+            continue
+        right, top, back = -R[:, 1], R[:, 2], -R[:, 0]
+        if kind == "opk":
+            phi = np.arcsin(back[0])
+            angles = np.degrees([np.arctan2(-back[1], back[2]), phi, np.arctan2(-top[0], right[0])])
+            lines.append(" ".join([name.removesuffix(".jpg"), x, y, z, *map(str, angles), *["0"] * 9]))
+        if kind == "metashape":
+            angles = np.degrees(
+                [np.arctan2(top[0], top[1]), np.arcsin(top[2]), np.arctan2(-right[2], back[2])]
+            )
+            lines.append(",".join([name, x, y, z, *map(str, angles), "1"]))
+    return "\n".join(lines) + "\n"
+
+
+OPK_HEAD = "#Label X/Easting Y/Northing Z/Altitude Omega Phi Kappa r11 r12 r13 r21 r22 r23 r31 r32 r33"
+YPR_HEAD = "#Label,X/Easting,Y/Northing,Z/Altitude,Yaw,Pitch,Roll,Enabled"
+
+
+@pytest.mark.parametrize("kind", ["potree", "opk", "metashape"])
+def test_tables_come_out_as_they_came_in_with_the_mount_applied(tmp_path, kind, capsys):
+    times = np.linspace(0.0, 20.0, 12)
+    names = [f"{k:02d}.jpg" for k in range(12)]
+    bodies = [body_at(time) for time in times]
+    poses = [MOUNT @ body for body in bodies]
+    given = tmp_path / "given.txt"
+    given.write_text(_text_of(kind, names, times, bodies))
+    for body, read in zip(bodies, read_pose_table(given).poses, strict=True):
+        assert pose_errors(read, body) == pytest.approx((0.0, 0.0), abs=1e-7)
+    results = write_results(
+        tmp_path / "r.jsonl", [result(f"photos/{n}", p) for n, p in zip(names, poses, strict=True)]
+    )
+    out = tmp_path / "out.txt"
+    assert calibrate_mount.main(["--results", str(results), "--given", str(given), "--out", str(out)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["lever_arm_m"] == pytest.approx([0.06, -0.05, 0.06], abs=1e-6)
+    assert report["rotation_deg"] == pytest.approx([1.2, -1.2, 1.1], abs=1e-4)
+    for pose, read in zip(poses, read_pose_table(out).poses, strict=True):
+        assert pose_errors(read, pose) == pytest.approx((0.0, 0.0), abs=1e-6)
+    before, after = (path.read_text().splitlines() for path in (given, out))
+    assert len(before) == len(after)
+    assert "r11" not in out.read_text()
+    assert after[-1].split(",")[-1] == "1" or kind != "metashape"
+
+
+def test_a_trajectory_and_photos_with_times_in_their_names(tmp_path, capsys):
+    trajectory, times, poses = _made(1, 12, 0)
+    covariance = PoseCovariance(np.diag(PHOTO**2), "")
+    rows = [(f"{t:.6f}.jpg", pose) for t, pose in zip(times, poses, strict=True)]
+    results = write_results(tmp_path / "r.jsonl", [result(n, p, covariance=covariance) for n, p in rows])
+    given = tmp_path / "tum.txt"
+    lines = []
+    for time, pose in zip(trajectory.times, trajectory.poses, strict=True):
+        x, y, z = pose.center_world.tolist()
+        R = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]) @ pose.R_cam_from_world
+        w, qx, qy, qz = Pose(R.T, np.zeros(3)).quaternion_wxyz
+        lines.append(f"{time} {x} {y} {z} {qx} {qy} {qz} {w}")
+    given.write_text("# t x y z qx qy qz qw\n" + "\n".join(lines) + "\n")
+    arguments = ["--results", str(results), "--given", str(given), "--times", "names"]
+    assert calibrate_mount.main([*arguments, "--out", str(tmp_path / "out.txt")]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["clock_s"] == pytest.approx(CLOCK, abs=max(0.02, 3.0 * report["std_s"]))
+    written = read_pose_table(tmp_path / "out.txt")
+    at = int(np.argmin(np.abs(trajectory.times - 10.0)))
+    assert pose_errors(written.poses[at], MOUNT @ body_at(10.0 + CLOCK)) < (0.06, 0.02)
+    assert calibrate_mount.main(arguments[:4]) == 3
+    assert "--times: found none" in capsys.readouterr().err
+
+
+def test_what_is_no_table_and_too_few_photos_are_refused(tmp_path):
+    path = tmp_path / "a.txt"
+    path.write_text("name;lon;lat\na;1;2\n")
+    assert_input_error(
+        "found 0 rows of poses and no known columns, wanted Potree", lambda: read_pose_table(path)
+    )
+    path.write_text("a 0 1 2 3 40 0 0\nb 1 2 2 3 40 0 0\n".replace(" ", "\t"))  # numbered by Potree's exports
+    assert read_pose_table(path).times is None
+    path.write_text("name,time,x,y,z,omega,phi,kappa,r\na,noon,1,2,3,4,5,6,0\nb,2,1,2,3,4,5,6,0\n")
+    assert_input_error("found could not convert string to float: .noon.", lambda: read_pose_table(path).times)
+    still = Trajectory(np.arange(5.0), [body_at(0.0)] * 5)
+    sightings = [Sighting(body_at(k), 1e-4 * np.eye(6), k) for k in range(5)]
+    assert_input_error("found 3 localized photos with a given pose", lambda: fit_mount(sightings[:3], still))
+    assert_input_error(
+        "found given poses that are off by .* m and .* deg", lambda: fit_mount(sightings, still)
+    )
