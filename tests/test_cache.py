@@ -262,7 +262,7 @@ def test_who_waits_for_kernels_is_told(monkeypatch, capsys):
             compiling.start()
             compiling.finish()
             compiling.finish()
-        text = "compiling kernels (only once): 2 so far, half a minute in total\n"
+        text = "compiling kernels (only once): 2 so far, half a minute on one core\n"
         assert capsys.readouterr().err == ("" if is_quiet else text)
         seconds = iter([10.0, 11.0, 14.0])
     assert logging.getLogger("piccolo").level == logging.NOTSET

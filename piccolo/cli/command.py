@@ -81,7 +81,13 @@ class Arguments(argparse.Namespace):
         return progress_bar(self.quiet)
 
     def workers(self, num_threads: int | None = None) -> Workers:
-        """Return workers, by default one a core, that show progress, unless --quiet, and log warnings."""
+        """Return workers, by default one a core, that show progress, unless --quiet, and log warnings.
+
+        If this process has to compile kernels, others help.
+        """
+        from ..kernels import ahead  # noqa: PLC0415  # Numba is imported where it is used
+
+        ahead.get_help()
         return Workers(num_threads or num_cores(), self.progress(), LOG.warning)
 
     def check_least(self, **limits: float) -> None:

@@ -16,6 +16,7 @@ import pickle
 import sys
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cache, partial
 from pathlib import Path
@@ -28,7 +29,8 @@ from numba.core import compiler, serialize
 from numba.core.runtime.nrt import rtsys
 from numpy.typing import NDArray
 
-from ..files.atomic import write_atomically
+from ..errors import InputError
+from ..files.atomic import hold_lock, write_atomically
 from ..files.cache import PRIVATE, WRITABLE, cache_root, in_words, is_own, mark_used, own_folder, own_names
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -42,6 +44,8 @@ FLAGS = (
     "SLP_VECTORIZE",
 )  # fmt: skip
 QUIET_S = 3.0  # between two lines on what is compiled, and before the first
+POLL_S = 0.01  # while another process compiles
+KERNELS: dict[str, Any] = {}  # by their names, all that have been imported
 log = logging.getLogger("piccolo")
 
 
@@ -91,10 +95,13 @@ class Compiling:
 
     count: int = 0
     quiet_since: float = 0.0  # [s] when the first kernel was not found, or a line was last logged
+    get_help: Callable[[], object] = str  # called when the first kernel is not found
 
     def start(self) -> None:
-        """Note the time at which the first kernel was asked for and not found."""
-        self.quiet_since = self.quiet_since or time.monotonic()
+        """Note the time at which the first kernel was asked for and not found, and get help."""
+        if not self.quiet_since:
+            self.quiet_since = time.monotonic()
+            self.get_help()
 
     def finish(self) -> None:
         """Count a kernel; from time to time log how many there are."""
@@ -102,7 +109,7 @@ class Compiling:
         now = time.monotonic()
         if now - self.quiet_since >= QUIET_S:
             self.quiet_since = now
-            log.info("compiling kernels (only once): %d so far, half a minute in total", self.count)
+            log.info("compiling kernels (only once): %d so far, half a minute on one core", self.count)
 
 
 compiling = Compiling()
@@ -162,8 +169,9 @@ class KernelCache:
         """Remember which kernel; nothing is opened."""
         self.name = " ".join(f"{f.__module__}.{f.__qualname__}" for f in (function, *find_captured(function)))
         self.cache_path = None  # Numba's `stats` shows it
+        self.claims: dict[Path, ExitStack] = {}  # files that this process is to write
 
-    def _file(self, signature: object, codegen: Any) -> Path | None:
+    def file(self, signature: object, codegen: Any) -> Path | None:
         """Return the file for a signature on this machine's processor."""
         versions = numba.__version__, np.__version__, sys.version_info[:2], sys.byteorder
         how = versions, codegen.magic_tuple(), [getattr(numba.config, flag, None) for flag in FLAGS]
@@ -175,22 +183,43 @@ class KernelCache:
         """Read compiled code; None if there is none that can be trusted."""
         try:
             rtsys.initialize(target_context)
-            path = self._file(signature, target_context.codegen())
-            if payload := path and read_whole(path):
+            path = self.file(signature, target_context.codegen())
+            if payload := path and (read_whole(path) or self._claim(path)):
                 return rebuild(target_context, *pickle.loads(payload))
         except Exception as error:  # Numba's insides are not as they were
             warn_not_kept(f"Numba {numba.__version__}: {error!r}")
         compiling.start()
         return None
 
+    def _claim(self, path: Path) -> bytes | None:
+        """Claim a kernel, so that no other process compiles it; wait for one that does, and return its code.
+
+        One kernel is compiled into another, never into itself: none waits for one that waits for it. Where
+        nothing can be locked each process compiles by itself.
+        """
+        while path not in self.claims:
+            try:
+                with ExitStack() as claim:
+                    claim.enter_context(hold_lock(path))
+                    payload = read_whole(path)
+                    if payload is None:
+                        self.claims[path] = claim.pop_all()
+                    return payload
+            except InputError:  # another process has it
+                time.sleep(POLL_S)
+            except OSError:
+                return None
+        return None
+
     def save_overload(self, signature: object, compiled: Any) -> None:
         """Write compiled code whole; where that can't be done it is compiled again by the next run."""
         compiling.finish()
         try:
-            if path := self._file(signature, compiled.codegen):
+            if path := self.file(signature, compiled.codegen):
                 dump: Callable[[Any], bytes] = serialize.dumps  # Numba gives it no type
                 payload = dump(compiled._reduce())
-                write_atomically(path, compute_digest(path.name, payload) + payload)
+                with self.claims.pop(path, ExitStack()):
+                    write_atomically(path, compute_digest(path.name, payload) + payload)
         except OSError as error:
             warn_not_kept(f"{kernel_folder()}: {error.strerror or error}")
         except Exception as error:  # as above
@@ -240,4 +269,5 @@ def kernel(function: Function) -> Function:
     dispatcher: Any = _compile_inline(function)  # Numba gives it no type
     if hasattr(dispatcher, "enable_caching"):  # not with NUMBA_DISABLE_JIT=1
         dispatcher._cache = KernelCache(function)
+        KERNELS[dispatcher._cache.name] = dispatcher
     return cast(Function, dispatcher)

@@ -88,7 +88,8 @@ def write_gradients(problem: ChannelProblem, rotations: Array, centers: Array, g
     sums = np.empty(NUM_SUMS)
     for k in range(len(rotations)):
         channel_equations(problem, rotations[k], centers[k], sums)
-        gradients[k] = sums[GRADIENT:MATRIX]
+        for i in range(MATRIX - GRADIENT):  # see `copy_to`
+            gradients[k, i] = sums[GRADIENT + i]
 
 
 def fill_symmetric(upper: Array) -> Array:
