@@ -25,6 +25,7 @@ from ..jobs.threads import num_cores
 from . import jit
 
 LISTED = Path(__file__).with_name("signatures.txt")
+PACKAGES = Path(__file__).parents[2]  # from which a process imports this one
 IMPORTS = "piccolo.scan"  # imports all of them
 TOKEN = re.compile(r"[\w.]*\(|\)|[\w.]+(?:\[\w+\])?")
 HELPS = "helps"  # argument of a process that helps
@@ -83,9 +84,16 @@ def compile_listed() -> None:
 
 def start_helpers(count: int) -> list[subprocess.Popen[bytes]]:
     """Start so many processes that compile; each ends by itself, and with the one that started it."""
-    command = [sys.executable, "-m", __name__, HELPS]
-    quiet = {"stdin": subprocess.PIPE, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    return [subprocess.Popen(command, **quiet) for _ in range(count)]
+    return [
+        subprocess.Popen(
+            [sys.executable, "-m", "piccolo.kernels.ahead", HELPS],
+            cwd=PACKAGES,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for _ in range(count)
+    ]
 
 
 def get_help() -> None:
