@@ -28,6 +28,7 @@ LISTED = Path(__file__).with_name("signatures.txt")
 PACKAGES = Path(__file__).parents[2]  # from which a process imports this one
 IMPORTS = "piccolo.scan"  # imports all of them
 TOKEN = re.compile(r"[\w.]*\(|\)|[\w.]+(?:\[\w+\])?")
+TYPES: Any = types  # Numba gives them none
 HELPS = "helps"  # argument of a process that helps
 
 
@@ -38,7 +39,7 @@ def describe(kind: Any) -> str:
     if isinstance(kind, types.BaseTuple):
         made = getattr(kind, "instance_class", None)
         name = f"{made.__module__}.{made.__qualname__}" if made else ""
-        return f"{name}({' '.join(map(describe, kind))})"
+        return f"{name}({' '.join(describe(inner) for inner in kind)})"
     return str(kind)
 
 
@@ -50,12 +51,11 @@ def parse(text: str) -> tuple[Any, ...]:
             within.append((token[:-1], []))
         elif token == ")":
             name, inner = within.pop()
-            made: Any = types.NamedTuple(inner, locate(name)) if name else types.Tuple(inner)
-            within[-1][1].append(made)
+            within[-1][1].append(TYPES.NamedTuple(inner, locate(name)) if name else TYPES.Tuple(inner))
         else:
             name, _, axes = token.rstrip("]").partition("[")
-            kind = getattr(types, name)
-            within[-1][1].append(types.Array(kind, int(axes[0]), axes[1]) if axes else kind)
+            kind = getattr(TYPES, name)
+            within[-1][1].append(TYPES.Array(kind, int(axes[0]), axes[1]) if axes else kind)
     return tuple(within[0][1])
 
 
