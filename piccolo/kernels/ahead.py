@@ -36,7 +36,7 @@ def describe(kind: Any) -> str:
     """Return a type of Numba in words that `parse` reads: float32[2C] is an array of two axes in C order."""
     if isinstance(kind, types.Array):
         return f"{kind.dtype}[{kind.ndim}{kind.layout}]"
-    if isinstance(kind, types.BaseTuple):
+    if isinstance(kind, TYPES.BaseTuple):
         made = getattr(kind, "instance_class", None)
         name = f"{made.__module__}.{made.__qualname__}" if made else ""
         return f"{name}({' '.join(describe(inner) for inner in kind)})"
