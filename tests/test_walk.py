@@ -12,6 +12,7 @@ import rooms
 import piccolo
 from piccolo.cli import localize as localize_command
 from piccolo.cli.together import steps_file
+from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.export.formats import tum_lines
 from piccolo.geometry.pose import Pose, carry, pose_errors, yaw_rotation
@@ -149,13 +150,18 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, queries):
     assert (motion["max_speed"], motion["is_timed"]) == (5.0, False)
 
 
-def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, queries, tmp_path):
+def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(
+    scan, queries, tmp_path, monkeypatch
+):
     """The first frame can't be read; the second is searched, and as it is lost, again 2.3 m and 6.3 m on."""
+    localize = tracker_module.localize
+    monkeypatch.setattr(tracker_module, "localize", lambda *_: Localization())
     walk = scan.track(motion=piccolo.Motion(max_speed=1.0), gravity="known")
     walk.add(tmp_path / "missing.jpg", 0.0)
     noise = np.random.default_rng(1).integers(0, 255, (256, 512, 3), dtype=np.uint8)
     searched = [walk.add(noise, time).walk.alone is not None for time in range(1, 10)]
     assert searched == [k in (1, 4, 8) for k in range(1, 10)]
+    monkeypatch.setattr(tracker_module, "localize", localize)
     assert walk.add(queries[0].image, 14.0).status == "localized"
 
 
