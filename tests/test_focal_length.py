@@ -128,10 +128,11 @@ def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found
 
 
 def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose(monkeypatch):
-    """Nor does a bundle of one photo, which keeps what that rules out; the photo is searched once for both."""
+    """Nor does a bundle of one photo, which keeps what that rules out; the photo is searched for once."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     photo = Photo(rgb, focal_px=145.0)
-    find, found = module.find, []
+    find = module.find
+    found = []
     monkeypatch.setattr(module, "find", lambda *given: found.append(find(*given)) or found[0])
     monkeypatch.setattr(bundle, "find", lambda *_: found[0])
     alone = scan().localize(photo, gravity="known")

@@ -158,7 +158,9 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
 
 def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypatch):
     """Each trial is localized once, whatever the constants are then."""
-    localize, found, moved = sensitivity.localize_trial, {}, []
+    localize = sensitivity.localize_trial
+    found = {}
+    moved = []
 
     def localize_once(scan_map, trial, workers):
         moved.append((attempts.MIRROR_RATIO, attempts.NUM_MATCHED))

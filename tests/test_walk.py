@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import rooms
+from batches import untimed
 
 import piccolo
 from piccolo.cli import localize as localize_command
@@ -150,9 +151,7 @@ def test_photos_in_any_order_are_each_searched_in_the_whole_scan(scan, queries):
     assert (motion["max_speed"], motion["is_timed"]) == (5.0, False)
 
 
-def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(
-    scan, queries, tmp_path, monkeypatch
-):
+def test_a_camera_is_searched_everywhere_as_soon_as_it_may_be_elsewhere(scan, queries, tmp_path, monkeypatch):
     """The first frame can't be read; the second is searched, and as it is lost, again 2.3 m and 6.3 m on."""
     localize = tracker_module.localize
     monkeypatch.setattr(tracker_module, "localize", lambda *_: Localization())
@@ -311,11 +310,7 @@ def test_a_walk_that_was_stopped_goes_on_where_it_stood(building, tmp_path, monk
     monkeypatch.setattr(Walk, "prepare", lambda self, *a: added.append(a[1]) or prepare(self, *a))
     assert _command(*walk, str(stopped)) == 0
     assert added == [str(q.image) for q in queries[-2:]]
-
-    def told(path):
-        return [{**json.loads(line), "seconds": None} for line in path.read_text().splitlines()]
-
-    assert told(stopped) == told(whole)
+    assert untimed(stopped) == untimed(whole)
     assert _command(*walk, str(stopped)) == 0
     assert len(added) == 2
 
