@@ -5,19 +5,16 @@ import json
 import os
 import pty
 import re
-import shutil
 import signal
 import subprocess
-import sys
 import termios
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import rooms
-from batches import ROOT, command_of, start_localize
+from batches import command_of, start_localize
 from rooms import errors, query
 from test_result import RESULT
 
@@ -207,40 +204,19 @@ def test_closed_pipe_is_no_error_message(scene):
     assert process.returncode == 141
 
 
-# localize.py, which tells at once what it compiles, and which compiled code it looks for
-WATCHED = """
-import sys
-from piccolo.cli import localize
-from piccolo.kernels import jit
-jit.QUIET_S = 0.0
-read = jit.read_whole
-jit.read_whole = lambda path: print(path, file=sys.stderr) or read(path)
-sys.exit(localize.main(sys.argv[1:]))
-"""
-
-
 def test_first_use_is_announced_and_two_processes_may_share_it(scene, tmp_path):
-    """Two kernels are missing. The first one waits where it compiles them, until the second does too."""
-    command = [sys.executable, "-c", WATCHED, *_arguments(scene, *PAPER)]
-    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
-    own = {**options, "env": {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}}
-    out, err = subprocess.Popen(command, **options).communicate(timeout=120)
-    pose = json.loads(out)["center_world"]
-    kernels = [Path(line) for line in err.splitlines() if line.endswith(".kernel")]
-    folder = tmp_path / "piccolo" / "kernels"
-    folder.mkdir(parents=True)
-    for path in sorted(kernels, key=lambda path: path.stat().st_size)[:-2]:
-        shutil.copy(path, folder)
-    first, second = (subprocess.Popen(command, **own) for _ in range(2))
+    """The first one waits, where it begins to compile, until the second has come as far."""
+    options = {"env": {**os.environ, "XDG_CACHE_HOME": str(tmp_path)}, "stdout": subprocess.PIPE}
+    arguments = _arguments(scene, *PAPER)
+    first, second = (start_localize(arguments, **options) for _ in range(2))
     try:
         assert any("compiling kernels (only once)" in line for line in first.stderr)
         first.send_signal(signal.SIGSTOP)
         assert any("compiling kernels (only once)" in line for line in second.stderr)
     finally:
         first.send_signal(signal.SIGCONT)
-    for process in (first, second):
-        assert json.loads(process.communicate(timeout=120)[0])["center_world"] == pose
-    assert {path.name for path in kernels} <= {path.name for path in folder.iterdir()}
-    out, err = subprocess.Popen(command, **own).communicate(timeout=60)
+    poses = [json.loads(process.communicate(timeout=120)[0])["center_world"] for process in (first, second)]
+    assert poses[0] == poses[1]
+    out, err = start_localize(arguments, **options).communicate(timeout=60)
     assert "compiling" not in err
-    assert json.loads(out)["center_world"] == pose
+    assert json.loads(out)["center_world"] == poses[0]
