@@ -18,12 +18,14 @@ VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-# The files that take longest begin first, so that in the end no worker waits for another.
+# The files that take longest begin first, so that in the end no worker waits for another. Before them one
+# worker runs what compiles most kernels, and the other what needs none, so that none is compiled twice.
 SLOWEST = (
-    "test_focal_length.py", "test_bundle.py", "test_cluster.py", "test_walk.py", "test_tools.py",
-    "test_shape.py", "test_verification.py", "test_coloring.py", "test_documents.py", "test_batch.py",
-    "test_camera_tools.py", "test_localize_cameras.py", "test_batch_second_look.py", "test_one_judge.py",
-    "test_jobs.py", "test_localize.py", "test_localization.py", "test_doors.py", "test_focal_consensus.py",
+    "test_documents.py", "test_panorama_formats.py", "test_cloud_damage.py", "test_cloud_e57.py",
+    "test_tools.py", "test_coloring.py", "test_localize_cameras.py", "test_bundle.py", "test_jobs.py",
+    "test_camera_tools.py", "test_walk.py", "test_focal_length.py", "test_cluster.py", "test_shape.py",
+    "test_batch.py", "test_focal_consensus.py", "test_localize.py", "test_batch_second_look.py",
+    "test_verification.py", "test_one_judge.py", "test_doors.py", "test_localization.py",
     "test_localization_covariance.py",
 )  # fmt: skip
 

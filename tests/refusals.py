@@ -1,5 +1,8 @@
 """What tests of damaged files share."""
 
+import errno
+import os
+
 import pytest
 
 from piccolo.errors import InputError
@@ -11,6 +14,11 @@ def assert_input_error(message, call, *arguments, **options):
     with pytest.raises(InputError, match=message) as error:
         call(*arguments, **options)
     assert "\n" not in str(error.value)
+
+
+def fill_disk(*_):
+    """Refuse to write, as on a full device."""
+    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def assert_refused(message, read, path, *arguments, **options):

@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import rooms
+from batches import untimed
 from pictures import encoded, write
 from test_localize_cameras import SEED, place
 
@@ -208,8 +209,7 @@ def test_a_second_look_is_of_the_photos_that_there_are(scene, photos, tmp_path, 
         assert _run(scene, photos, "--out", out, "--quiet") == 1
         assert [name for name, _ in looked.asked] == list(repeated)
         assert _run(scene, photos, "--out", whole, "--quiet", "--overwrite") == 1
-        untimed = [json.loads(line) | {"seconds": 0} for line in whole.read_text().splitlines()]
-        assert [json.loads(line) | {"seconds": 0} for line in out.read_text().splitlines()] == untimed
+        assert untimed(out) == untimed(whole)
 
     run_again("b.jpg", "d.jpg")
     a, b, c, d = out.read_text().splitlines(keepends=True)

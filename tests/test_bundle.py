@@ -185,32 +185,23 @@ def test_two_photos_propose_the_scale(free):
     assert bundle_search.propose_with_scale(one, pair[0], other, turned, errors) == []
 
 
-@functools.lru_cache
-def _taken(seed, eighths=WHERE):
-    """Photos of 60 degrees in a room, each with its true pose in the world."""
+def _take(seed, fov_deg, offset_by_eighth):
+    """Photos of a room, at offsets (3,) from a place and turned by eighths, each with its true pose."""
     world = rooms.room(seed)[0]
     base = rooms.query(seed).pose
     taken = []
-    for k in eighths:
-        center_world = base.center_world + np.random.default_rng(k).uniform(-0.3, 0.3, 3)
-        pose = Pose(yaw_rotation(k * math.pi / 4.0) @ base.R_cam_from_world, center_world)
+    for eighth, offset in offset_by_eighth.items():
+        turn = yaw_rotation(eighth * math.pi / 4.0)
+        pose = Pose(turn @ base.R_cam_from_world, base.center_world + np.array(offset))
         rgb = photograph(world.rooms[0], pose, rooms.WIDTH, Workers(2))
-        taken.append((Panorama(rgb, ~mask_outside_field(rooms.WIDTH, 60.0, 0.0)), pose))
+        taken.append((Panorama(rgb, ~mask_outside_field(rooms.WIDTH, fov_deg, 0.0)), pose))
     return taken
 
 
 @functools.lru_cache
-def _apart():
-    """Wide photos at three places of a room, each with its true pose in the world."""
-    world = rooms.room(SEED)[0]
-    base = rooms.query(SEED).pose
-    taken = []
-    for k, offset in enumerate(([0.0, 0.0, 0.0], [0.8, 0.5, 0.1], [-0.6, 0.9, 0.0])):
-        turn = yaw_rotation((2 + 2 * k) * math.pi / 4.0)
-        pose = Pose(turn @ base.R_cam_from_world, base.center_world + np.array(offset))
-        rgb = photograph(world.rooms[0], pose, rooms.WIDTH, Workers(2))
-        taken.append((Panorama(rgb, ~mask_outside_field(rooms.WIDTH, 110.0, 0.0)), pose))
-    return taken
+def _taken(seed, eighths=WHERE):
+    """Photos of 60 degrees that were taken near each other."""
+    return _take(seed, 60.0, {k: np.random.default_rng(k).uniform(-0.3, 0.3, 3) for k in eighths})
 
 
 def _relative(poses, far=0.0):
@@ -295,7 +286,8 @@ def test_a_stranger_is_named_and_lowers_nobody():
 
 def test_positions_that_are_too_long_are_named():
     """Positions of photos 2 m apart by 20 %: each is as by itself."""
-    photos, poses = zip(*_apart(), strict=True)
+    apart = {2: [0.0, 0.0, 0.0], 4: [0.8, 0.5, 0.1], 6: [-0.6, 0.9, 0.0]}
+    photos, poses = zip(*_take(SEED, 110.0, apart), strict=True)
     wrong = [Pose(p.R_cam_from_world, 1.2 * p.center_world) for p in _relative(poses)]
     for found, pose in zip(_together(photos, wrong), poses, strict=True):
         assert found.status == "not_localized" or pose_errors(found.pose, pose)[0] < 0.05

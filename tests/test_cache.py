@@ -1,6 +1,5 @@
 """What is kept between runs: where, and what is trusted of it."""
 
-import errno
 import logging
 import os
 import subprocess
@@ -12,6 +11,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from refusals import fill_disk
 
 from piccolo.cli import terminal
 from piccolo.files import atomic, cache
@@ -102,17 +102,13 @@ def test_where_no_kernel_can_be_kept_one_warning_says_so(folders, tmp_path, monk
     elif how == "no place":
         root.chmod(0o777)
     else:
-        monkeypatch.setattr(jit, "write_atomically", _full)
+        monkeypatch.setattr(jit, "write_atomically", fill_disk)
     for name in ("a", "b"):
         compiled = kernel(eval(f"lambda {name}: {name} + 1"))
         assert compiled(np.float64(3.0)) == 4.0
     (warning,) = [record.getMessage() for record in caplog.records]
     assert warning.endswith("compiled code is not kept, and each run takes half a minute longer")
     assert not list(root.rglob("*.kernel"))
-
-
-def _full(*_):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 @pytest.mark.parametrize("ending", ["kernel", "fact", "piccolo-map"])

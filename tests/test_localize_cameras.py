@@ -163,10 +163,10 @@ def test_a_folder_has_a_calibration_for_each_photo(tmp_path):
         write(photos / f"{name}.jpg", encoded(rgb, ".jpg"))
     write(cameras / "a.camera.json", json.dumps(document_of((Mount(pinhole(240, 180, 75.0)),))).encode())
     write(cameras / "b.json", json.dumps(document_of((Mount(pinhole(240, 180, 75.5)),))).encode())
-    given = [Photo(path, camera=cameras) for path in sorted(photos.iterdir())]
-    results = list(scan().localize_many(given, gravity="known"))
-    assert [result.focal_length.given_px for result in results[:2]] == [75.0, 75.5]
-    assert results[0].status == "localized"
-    assert results[0].settings["panorama"]["camera"] == str(cameras)
-    assert results[2].status == "unreadable"
-    assert f"found no calibration of it in {cameras}, wanted c.camera.json or c.json" in results[2].error
+    first, second, third = (Photo(path, camera=cameras) for path in sorted(photos.iterdir()))
+    assert [read_panorama(one).cameras[0].camera.focal[0] for one in (first, second)] == [75.0, 75.5]
+    found, lacking = scan().localize_many([first, third], gravity="known")
+    assert (found.status, found.focal_length.given_px) == ("localized", 75.0)
+    assert found.settings["panorama"]["camera"] == str(cameras)
+    assert lacking.status == "unreadable"
+    assert f"found no calibration of it in {cameras}, wanted c.camera.json or c.json" in lacking.error

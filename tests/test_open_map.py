@@ -1,6 +1,5 @@
 """Maps in the cache: made once, their features when they are needed; and what is known of files."""
 
-import errno
 import hashlib
 import os
 import resource
@@ -12,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import rooms
-from refusals import assert_input_error
+from refusals import assert_input_error, fill_disk
 from rooms import scan_map
 
 from piccolo.cloud.settings import IN_METRES
@@ -114,10 +113,6 @@ def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch,
     )
 
 
-def _full(*_):
-    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-
 @pytest.fixture
 def facts(tmp_path, monkeypatch):
     folder = tmp_path / "facts"
@@ -148,7 +143,7 @@ def test_facts_that_can_not_be_kept_or_read_are_lost(facts, tmp_path, monkeypatc
     (kept,) = facts.iterdir()
     kept.write_bytes(b"\xff\xff")
     assert cache.recall("what", status) is None
-    monkeypatch.setattr(cache, "write_atomically", _full)
+    monkeypatch.setattr(cache, "write_atomically", fill_disk)
     cache.remember("other", status, "a fact")
     monkeypatch.setattr(cache, "private_folder", lambda *_: None)
     cache.remember("more", status, "a fact")
@@ -294,7 +289,7 @@ def test_what_another_process_has_made_meanwhile_is_taken(opened, finding):
 
 def test_where_they_can_not_be_kept_they_are_there_all_the_same(opened, finding, monkeypatch):
     found = opened()
-    monkeypatch.setattr(open_map, "save_map", lambda *_: (_ for _ in ()).throw(OSError(28, "full")))
+    monkeypatch.setattr(open_map, "save_map", fill_disk)
     assert len(found.features_now(WORKERS).points) > 1000
     assert opened().lacks_features
 

@@ -151,10 +151,7 @@ def png_of(packed):
     ("content", "message"),
     [
         (b"", "the file is empty"),
-        (
-            b"GIF89a" + bytes(99),
-            "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF, WebP, HEIC",
-        ),
+        (b"GIF89a" + bytes(99), "begins with b'GIF89a.*', wanted a whole JPEG, PNG, TIFF, WebP, HEIC"),
         (b"\xff\xd8", "the JPEG is cut off"),
         (PNG[:60] + b"\x01\x02\x03" + PNG[63:], "the PNG is cut off, damaged .* .broken PNG file"),
         (png_of(zlib.compress(bytes(9000))), "the PNG is cut off, damaged .*truncated"),

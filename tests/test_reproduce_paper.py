@@ -20,13 +20,7 @@ from piccolo.paper.localize import PaperSettings
 from piccolo.views.zbuffer import visible_points
 from research.evaluation.query_result import read_run
 from research.experiments import reproduce_paper
-from research.experiments.reproduce_paper import (
-    EXPERIMENTS,
-    conditions_of,
-    flip,
-    thin,
-    with_random_rotation,
-)
+from research.experiments.reproduce_paper import EXPERIMENTS, conditions_of, flip, thin, with_random_rotation
 from research.scene import Query, read_scene, write_queries
 
 PRESETS = [PaperSettings(), CoarseToFineSettings()]
@@ -54,8 +48,7 @@ def _loss(scene, number):
 
 
 @pytest.mark.parametrize(
-    "transform",
-    [with_random_rotation, flip, partial(thin, fraction=0.5), partial(thin, num_points=9000)],
+    "transform", [with_random_rotation, flip, partial(thin, fraction=0.5), partial(thin, num_points=9000)]
 )
 @pytest.mark.parametrize("number", [0, 1])
 def test_a_transformed_scene_fits_its_true_poses(rooms, tmp_path, transform, number):

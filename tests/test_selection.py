@@ -199,10 +199,7 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
     monkeypatch.setattr(judging, "list_rivals", _all_rivals)
     best, *others = (at(x, 0.0) for x in (0.0, 1.0, 2.0, 3.0))
     standings = [Standing(1.0, 0.5, n, "drawn scan") for n in (12, 3, 4, 20)]
-    for evidence, expected in (
-        ("drawn scan", [20, 20, 4, 20]),
-        ("views", [12, 3, 4, 20]),
-    ):
+    for evidence, expected in (("drawn scan", [20, 20, 4, 20]), ("views", [12, 3, 4, 20])):
         query = replace(QUERY, evidence=evidence)
         found = judging.credit_copies(standings, judging.list_copies(query, best, others))
         assert [s.num_matches for s in found] == expected

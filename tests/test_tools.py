@@ -24,6 +24,7 @@ from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries
 from research.synthetic.world import cut_photo, write_photo
 
+DAMAGE = "20% hidden by objects", "night", "half of the sphere masked"
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
 
 
@@ -43,6 +44,15 @@ def table_of(page, title):
 def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch):
     small = PaperSettings(num_translations=4, num_iterations=5, max_points=5000)
     monkeypatch.setattr(page, "PAPER_SETTINGS", small)
+    damage = page.damage_trial
+
+    def make_all(*given):
+        """Make all kinds of damage, of which some are localized."""
+        made = list(damage(*given))
+        assert [trial.case for trial in made if trial.true_pose is None] == ["mirrored"]
+        return [trial for trial in made if trial.case in DAMAGE]
+
+    monkeypatch.setattr(page, "damage_trial", make_all)
     out = tmp_path / "page.md"
     sizes = ["--damaged", "1", "--photos", "1", "--points", "20000", "--rooms"]
     assert benchmark.main(["all", "--scenes", str(scene), *sizes, "--quiet", "--out", str(out)]) == 0
@@ -59,9 +69,8 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     damaged = table_of(text, TITLES["damage"])
     assert {row["queries"] for row in damaged.values()} == {"1"}
     assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
-    for name in ("mirrored", "another place"):
-        assert [damaged[name][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
-    assert set(confidence.DAMAGED_SCANS) < set(damaged)
+    assert [damaged["another place"][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
+    assert set(damaged) == {"as taken", *DAMAGE, "another place", *confidence.DAMAGED_SCANS}
     photos = table_of(text, TITLES["photos"])
     assert [row["queries"] for row in photos.values()] == ["1", "1"]
     paper = table_of(text, TITLES["paper"])
@@ -154,6 +163,18 @@ def test_trials_of_a_scene_and_what_is_learnt_from_them(scene, tmp_path, capsys,
 
 
 def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypatch):
+    """Each trial is localized once, whatever the constants are then."""
+    localize = sensitivity.localize_trial
+    found = {}
+    moved = []
+
+    def localize_once(scan_map, trial, workers):
+        moved.append((attempts.MIRROR_RATIO, attempts.NUM_MATCHED))
+        if trial.case not in found:
+            found[trial.case] = localize(scan_map, trial, workers)
+        return found[trial.case]
+
+    monkeypatch.setattr(sensitivity, "localize_trial", localize_once)
     few = {"localization.attempts": ("MIRROR_RATIO", "NUM_MATCHED")}
     monkeypatch.setattr(sensitivity, "CONSTANTS", few)
     assert benchmark.main(["sensitivity", "--scenes", str(scene), "--most", "1", "--quiet"]) == 0
@@ -162,6 +183,9 @@ def test_constants_are_moved_one_at_a_time_and_put_back(scene, capsys, monkeypat
     assert re.fullmatch(r"\| as they are \| [12] \| [12] \| 0 \| \d+\.\d\d \| 0 \|", before)
     names = [f"localization.attempts.{name} x {factor}" for name in few.popitem()[1] for factor in (0.8, 1.2)]
     assert [row.split(" | ")[0].strip("| ") for row in rows] == names
+    by_run = zip(moved[::2], moved[1::2], strict=True)  # a panorama, and a photo
+    expected = [(1.1, 6), (0.88, 6), (1.32, 6), (1.1, 5), (1.1, 7)]
+    assert [run for run, again in by_run if run == again] == [pytest.approx(pair) for pair in expected]
     assert (attempts.MIRROR_RATIO, attempts.NUM_MATCHED) == (1.1, 6)
 
 

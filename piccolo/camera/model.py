@@ -94,10 +94,14 @@ class Distortion(NamedTuple):
         """Values g and dg/dr2 at r2, of any shape."""
         n = self.numerator
         d = self.denominator
+        above = n(r2)
+        slope = n.deriv()(r2)
+        if d.degree() == 0:
+            return above, slope
         below = d(r2)
         below = np.where(np.abs(below) < LEAST, LEAST, below)  # 0 at the limit itself
-        value = n(r2) / below
-        return value, (n.deriv()(r2) - value * d.deriv()(r2)) / below
+        value = above / below
+        return value, (slope - value * d.deriv()(r2)) / below
 
     def max_radius(self) -> float:
         """Radius up to which r g(r^2) grows, infinite if it always does: beyond, a pixel is two rays."""

@@ -10,7 +10,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import cv2
@@ -344,12 +344,15 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
     def move(delta: Array) -> Pose:
         return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:6])
 
+    @cache
+    def find_rays(change: float) -> Array32:
+        return _turn_rays(matches.rays, before, before.with_camera(before.camera.change(change)))
+
     def find_residuals(delta: Array) -> Array:
-        after = before.with_camera(before.camera.change(delta[6]))
         end = move(delta)
         offsets = rotate_points(matches.points - end.center_world, end.R_cam_from_world)
         rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-        return np.asarray(rays - _turn_rays(matches.rays, before, after))
+        return np.asarray(rays - find_rays(float(delta[6])))
 
     if len(matches.rays) < ENOUGH_AGREEING:
         return 0.0, 0.0, pose
