@@ -30,6 +30,7 @@ IMPORTS = "piccolo.scan"  # imports all of them
 TOKEN = re.compile(r"[\w.]*\(|\)|[\w.]+(?:\[\w+\])?")
 TYPES: Any = types  # Numba gives them none
 HELPS = "helps"  # argument of a process that helps
+helping: list[subprocess.Popen[bytes]] = []  # kept, as its end would close what they wait on
 
 
 def describe(kind: Any) -> str:
@@ -98,7 +99,7 @@ def start_helpers(count: int) -> list[subprocess.Popen[bytes]]:
 
 def get_help() -> None:
     """Start helpers as soon as this process has to compile: as many as it has further cores."""
-    jit.compiling.get_help = lambda: start_helpers(num_cores() - 1)
+    jit.compiling.get_help = lambda: helping.extend(start_helpers(num_cores() - 1))
 
 
 def _end_with_parent() -> None:
