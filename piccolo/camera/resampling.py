@@ -55,8 +55,10 @@ def make_sphere(views: Sequence[View], width: int) -> Pixels:
         for top, left in _blocks(view, width):
             block = slice(top, top + ROWS), slice(left, left + COLUMNS)
             pixels, is_valid = _resample_block(view, width, top, left)
-            centers = np.arange(left, left + COLUMNS) + 0.5, np.arange(top, top + ROWS) + 0.5
-            closeness = (compute_rays(centers[0], centers[1][:, None], width) @ axis).astype(np.float32)
+            closeness = np.float32(1.0)
+            if len(views) > 1:
+                centers = np.arange(left, left + COLUMNS) + 0.5, np.arange(top, top + ROWS) + 0.5
+                closeness = (compute_rays(centers[0], centers[1][:, None], width) @ axis).astype(np.float32)
             is_better = is_valid & (closeness > nearest[block])
             np.copyto(rgb[block], pixels, where=is_better[..., None])
             np.copyto(nearest[block], closeness, where=is_better)

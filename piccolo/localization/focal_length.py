@@ -232,11 +232,12 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     whole = query.photo.panorama
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
-    def retake(change: Array) -> Panorama:
+    @cache
+    def retake(*change: float) -> Panorama:
         found = given.resample(given.cameras[0].camera.change(*change), whole.rgb.shape[1])
         return replace(found, is_valid=found.is_valid & is_left)
 
-    narrowest = retake(changes.max(axis=0)).is_valid
+    narrowest = retake(*changes.max(axis=0)).is_valid
     points = mask_edge(shown.view_at(pose, "points"), pose, narrowest)
     fine = shown.view_at(pose, "fine")
     around, begins = sort_by_block(remove_poles(points.around(pose.center_world), pose))
@@ -244,7 +245,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
-        images = make_images(retake(change), query.method.scales)
+        images = make_images(retake(*change), query.method.scales)
         full = images.full()
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
         near = pose if is_near else descend(fine, images.fine(), pose, FINE.limits)
@@ -356,6 +357,9 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
 
     if len(matches.rays) < ENOUGH_AGREEING:
         return 0.0, 0.0, pose
+    known: tuple[float, float, Pose] | None = query.cache.fits.get(pose.key)
+    if known is not None:
+        return known
     delta = np.zeros(7)
     for scale in MATCH_SCALES:
         steps = [find_residuals(delta + h) - find_residuals(delta - h) for h in STEP * np.eye(7)]
@@ -368,7 +372,8 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         delta[6] = np.clip(delta[6], -1.0, 1.0)  # the focal length stays one
     variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
     is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
-    return float(delta[6]), is_known / variance, move(delta)
+    fit = query.cache.fits[pose.key] = float(delta[6]), is_known / variance, move(delta)
+    return fit
 
 
 def recalibrate(query: Query, change: Array) -> Query:

@@ -117,10 +117,21 @@ def make_photo(
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:
     """Make the images of a panorama, each resized from the one before."""
     images = {}
+    larger = Once(lambda: panorama)
     for name, scale in scales._asdict().items():
-        panorama = reduce(panorama, scale)
-        images[name] = Once(partial(normalize_panorama, panorama, scale.cell_deg, scale.sigma_deg))
+        larger = Once(partial(reduce_larger, larger, scale))
+        images[name] = Once(partial(normalize_larger, larger, scale))
     return Images(**images)
+
+
+def reduce_larger(larger: Once[Panorama], scale: ImageScale) -> Panorama:
+    """Return a larger panorama at the size of an image."""
+    return reduce(larger(), scale)
+
+
+def normalize_larger(reduced: Once[Panorama], scale: ImageScale) -> Texels:
+    """Return the image of a panorama that is reduced to its size."""
+    return normalize_panorama(reduced(), scale.cell_deg, scale.sigma_deg)
 
 
 def reduce(panorama: Panorama, scale: ImageScale) -> Panorama:

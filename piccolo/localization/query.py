@@ -49,6 +49,7 @@ class Cache:
     comparisons: dict[bytes, Any] = field(default_factory=dict)  # `comparison.compare`, by the pose's key
     masked: dict[bytes, "Query"] = field(default_factory=dict)  # `comparison.mask_occluders`, by its blocks
     matches: dict[bytes, Any] = field(default_factory=dict)  # `verification.matches_near`, by its grid
+    fits: dict[bytes, Any] = field(default_factory=dict)  # `focal_length.fit_matches`, by the pose's key
     ends: set[bytes] = field(default_factory=set)  # keys of poses that no perturbation improves
 
 

@@ -115,36 +115,46 @@ def as_texel_channel(value: Scalar, mean: Scalar, gain: Scalar, shift: int) -> n
 
 
 @kernel
-def pack_normalized(channels: Array32, weight: Array32, stats: Array32, texels: Int32s) -> None:
+def pack_normalized(
+    channels: Array32, weight: Array32, stats: Array32, corner: tuple[int, int], texels: Int32s
+) -> None:
     """Write padded RGBX texels (H + 2, W + 2): (channel - mean) / deviation in levels, and validity.
 
-    Means and 1 / standard deviations are interpolated bilinearly in `stats` (h, w, 6). On each side a column
-    of texels is wrapped and a row clamped.
+    Channels and weights are those of a box of the image; `corner` is its first row and column. Means and
+    1 / standard deviations are interpolated bilinearly in `stats` (h, w, 6). On each side a column of texels
+    is wrapped and a row clamped.
     """
-    height, width = weight.shape
+    top, begin = corner
+    height = texels.shape[0] - 2
+    width = texels.shape[1] - 2
     num_rows, num_columns, _ = stats.shape
-    left, right, fraction = interpolation_along(width, num_columns)
+    of_all = interpolation_along(width, num_columns)
+    num = weight.shape[1]
+    left = of_all[0][begin : begin + num]
+    right = of_all[1][begin : begin + num]
+    fraction = of_all[2][begin : begin + num]
     wide = np.empty((6, num_columns), np.float32)
-    along = np.empty((6, width), np.float32)
+    along = np.empty((6, num), np.float32)
     per = np.float32(num_columns) / np.float32(width)
-    for i in range(height):
-        v = min(max((np.float32(i) + HALF) * per - HALF, F0), np.float32(num_rows - 1))
+    for i in range(len(weight)):
+        v = min(max((np.float32(i + top) + HALF) * per - HALF, F0), np.float32(num_rows - 1))
         i0 = min(np.int32(v), num_rows - 2)
         fv = v - np.float32(i0)
         for j in range(num_columns):
             for c in range(6):
                 wide[c, j] = stats[i0, j, c] + fv * (stats[i0 + 1, j, c] - stats[i0, j, c])
         for c in range(6):
-            for j in range(width):
+            for j in range(num):
                 at = wide[c, left[j]]
                 along[c, j] = at + fraction[j] * (wide[c, right[j]] - at)
-        planes = channels[i].T.copy()  # (3, width): what follows is vectorised then
-        row = texels[i + 1, 1 : width + 1]
-        for j in range(width):
+        planes = channels[i].T.copy()  # (3, num): what follows is vectorised then
+        row = texels[top + i + 1, begin + 1 : begin + num + 1]
+        for j in range(num):
             texel = as_texel_channel(planes[0, j], along[0, j], along[3, j], 0)
             texel |= as_texel_channel(planes[1, j], along[1, j], along[4, j], 8)
             texel |= as_texel_channel(planes[2, j], along[2, j], along[5, j], 16)
             row[j] = texel | (np.int32(1 << 24) if weight[i, j] > HALF else np.int32(0))
+    for i in range(height):
         texels[i + 1, 0] = texels[i + 1, width]
         texels[i + 1, width + 1] = texels[i + 1, 1]
     copy_to(texels[0], texels[1])
@@ -175,6 +185,11 @@ def local_statistics(channels: Array32, weight: Array32, width: int, sigma_deg: 
     """
     moments = np.empty((width // 2, width, 7), np.float32)
     block_moments(channels, weight, moments)
+    return smooth_statistics(moments, sigma_deg)
+
+
+def smooth_statistics(moments: Array32, sigma_deg: float) -> Array32:
+    """Compute local means and 1 / standard deviations (h, w, 6) from the moments (h, w, 7) of blocks."""
     sums = blur_sphere(moments, sigma_deg)
     finish_statistics(sums)
     return np.asarray(sums[..., 1:])
@@ -190,17 +205,37 @@ def normalize_locally(rgb: Array32, counts: Mask, sigma_deg: float) -> Array32:
 
 
 def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) -> Texels:
-    """Average opponent channels over `cell_deg`, normalise over `sigma_deg`; STATS_WIDTH divides W."""
+    """Average opponent channels over `cell_deg`, normalise over `sigma_deg`; STATS_WIDTH divides W.
+
+    What does not count is left 0 outside of a box around what does.
+    """
     height, width = panorama.is_valid.shape
-    weight = panorama.is_valid.astype(np.float32)
-    channels = opponent_channels(panorama.rgb.astype(np.float32) / np.float32(255.0))
-    if cell_deg * width / 360.0 > 1.5:  # cells wider than pixels: a Gaussian with a cell's second moment
+    step = width // STATS_WIDTH
+    rows, columns = (find_span(np.asarray(panorama.is_valid.any(axis=k)), step) for k in (1, 0))
+    if is_averaged := cell_deg * width / 360.0 > 1.5:  # cells wider than pixels
+        rows = columns = slice(None)
+    weight = panorama.is_valid[rows, columns].astype(np.float32)
+    channels = opponent_channels(panorama.rgb[rows, columns].astype(np.float32) / np.float32(255.0))
+    if is_averaged:  # by a Gaussian with a cell's second moment
         sums = blur_sphere(np.dstack([channels * weight[..., None], weight]), cell_deg / math.sqrt(12.0))
         channels = np.asarray(sums[..., :3] / np.maximum(sums[..., 3:], LEAST_WEIGHT), np.float32)
-    statistics = local_statistics(channels, weight, STATS_WIDTH, sigma_deg)
-    texels = np.empty((height + 2, width + 2), np.int32)
-    pack_normalized(channels, weight, statistics, texels)
+    inner = np.empty((len(weight) // step, weight.shape[1] // step, 7), np.float32)
+    block_moments(channels, weight, inner)
+    corner = rows.start or 0, columns.start or 0
+    moments = np.zeros((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
+    top, left = (begin // step for begin in corner)
+    moments[top : top + len(inner), left : left + inner.shape[1]] = inner
+    texels = np.zeros((height + 2, width + 2), np.int32)
+    pack_normalized(channels, weight, smooth_statistics(moments, sigma_deg), corner, texels)
     return Texels(texels.reshape(-1), width)
+
+
+def find_span(counts: Mask, step: int) -> slice:
+    """Return the span of what counts (N,), in whole steps: the first one if nothing does."""
+    found = np.flatnonzero(counts)
+    if len(found) == 0:
+        return slice(0, step)
+    return slice(int(found[0]) // step * step, -(-(int(found[-1]) + 1) // step) * step)
 
 
 @kernel
