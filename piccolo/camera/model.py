@@ -295,7 +295,9 @@ class Camera:
             return ray, np.ones(u.shape, np.bool_)
         x = (u - self._named["cx"]) / self.focal[0]
         y = (v - self._named["cy"]) / self.focal[1]
-        x, y, is_found = self.distortion.invert(x, y, self._radii)
+        is_found = np.ones(x.shape, np.bool_)
+        if self.distortion != Distortion():
+            x, y, is_found = self.distortion.invert(x, y, self._radii)
         radius = np.hypot(x, y)
         angle = self._angle(radius)
         per = np.sin(angle) / np.maximum(radius, 1e-300)
