@@ -45,6 +45,7 @@ FLAGS = (
 )  # fmt: skip
 QUIET_S = 3.0  # between two lines on what is compiled, and before the first
 POLL_S = 0.01  # while another process compiles
+MOST_WAIT_S = 60.0  # for one kernel
 KERNELS: dict[str, Any] = {}  # by their names, all that have been imported
 log = logging.getLogger("piccolo")
 
@@ -104,8 +105,12 @@ class Compiling:
             self.get_help()
 
     def finish(self) -> None:
-        """Count a kernel; from time to time log how many there are."""
+        """Count a kernel."""
         self.count += 1
+        self.tell()
+
+    def tell(self) -> None:
+        """From time to time log how many kernels there are."""
         now = time.monotonic()
         if now - self.quiet_since >= QUIET_S:
             self.quiet_since = now
@@ -195,9 +200,10 @@ class KernelCache:
         """Claim a kernel, so that no other process compiles it; wait for one that does, and return its code.
 
         One kernel is compiled into another, never into itself: none waits for one that waits for it. Where
-        nothing can be locked each process compiles by itself.
+        nothing can be locked, or another process stands still, each compiles by itself.
         """
-        while path not in self.claims:
+        end = time.monotonic() + MOST_WAIT_S
+        while path not in self.claims and time.monotonic() < end:
             try:
                 with ExitStack() as claim:
                     claim.enter_context(hold_lock(path))
@@ -206,6 +212,8 @@ class KernelCache:
                         self.claims[path] = claim.pop_all()
                     return payload
             except InputError:  # another process has it
+                compiling.start()
+                compiling.tell()
                 time.sleep(POLL_S)
             except OSError:
                 return None
