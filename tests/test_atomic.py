@@ -152,7 +152,8 @@ def test_a_full_disk_is_one_line_and_leaves_what_was_there(tmp_path, out, why):
     (tmp_path / "p.csv").write_bytes(b"old")
     (tmp_path / "link.csv").symlink_to("p.csv")
     write_results(tmp_path / "r.jsonl", [result("a.jpg", Pose(np.eye(3), np.zeros(3)))])
-    tool = f'"{sys.executable}" "{ROOT}/tools/export_poses.py" --results r.jsonl --format csv'
+    # -B: Python would keep compiled sources that are cut off at the limit
+    tool = f'"{sys.executable}" -B "{ROOT}/tools/export_poses.py" --results r.jsonl --format csv'
     command = f"(ulimit -f {1 if out == '-' else 0}; {tool} --out {out} > /dev/full)"
     done = subprocess.run(["bash", "-c", command], cwd=tmp_path, capture_output=True, text=True, check=False)
     line = f"export_poses.py: {out}: cannot be used ({why})\n"
@@ -309,6 +310,6 @@ with open_locked(Path(sys.argv[1])) as file:
     for k in range(9):
         file.append(str(k) * 300)
 """
-    done = run([sys.executable, "-c", code, str(out)], cwd=ROOT)
+    done = run([sys.executable, "-B", "-c", code, str(out)], cwd=ROOT)
     assert "File too large" in done.stderr
     assert out.read_text() == "".join(f"{str(k) * 300}\n" for k in range(3))

@@ -99,6 +99,7 @@ def test_a_cache_that_can_not_be_used_is_a_warning(cloud, tmp_path, monkeypatch,
         folder.mkdir()
         (folder / "piccolo-maps").symlink_to("nothing")
     else:
+        monkeypatch.setattr("sys.dont_write_bytecode", True)  # it would be cut off too
         resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, limit[1]))
     try:
         (warning,) = _open(cloud, folder, monkeypatch)
