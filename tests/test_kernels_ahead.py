@@ -124,3 +124,8 @@ def test_help_ends_with_the_process_that_asked_for_it():
     assert helper.stdin is not None
     helper.stdin.close()
     assert helper.wait(60.0) == 0
+
+
+def test_compiling_all_beforehand_ends_well():
+    command = [sys.executable, "-m", "piccolo.kernels.ahead"]
+    assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
