@@ -315,7 +315,8 @@ def whole(files, tmp_path_factory):
 
 def test_the_commands_colour_a_scan(files, whole, tmp_path, capsys):
     cloud, _ = files
-    lines, again = tmp_path / "poses.jsonl", tmp_path / "again.ply"
+    lines = tmp_path / "poses.jsonl"
+    again = tmp_path / "again.ply"
     found = [json.loads(line) for line in whole.with_suffix(".jsonl").read_text().splitlines()]
     assert [result["status"] for result in found] == ["localized"] * 2
     assert all(PAINTED in result["warnings"] for result in found)

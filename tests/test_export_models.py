@@ -149,12 +149,15 @@ def nerfstudio_pixels(frame, points):
     """Pixels as nerfstudio/cameras/camera_utils.py distorts: r2 (k1 + r2 (k2 + ..)), axes right, up, back."""
     T = np.array(frame["transform_matrix"])
     d = (points - T[:3, 3]) @ T[:3, :3]
-    x, y = d[:, 0] / -d[:, 2], d[:, 1] / d[:, 2]
+    x = d[:, 0] / -d[:, 2]
+    y = d[:, 1] / d[:, 2]
     r2 = x * x + y * y
     g = 1 + r2 * (frame["k1"] + r2 * (frame["k2"] + r2 * (frame["k3"] + r2 * frame["k4"])))
-    p1, p2 = frame["p1"], frame["p2"]
-    x, y = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x), y * g + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
-    return np.stack([frame["fl_x"] * x + frame["cx"], frame["fl_y"] * y + frame["cy"]], axis=1)
+    p1 = frame["p1"]
+    p2 = frame["p2"]
+    u = x * g + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    v = y * g + 2 * p2 * x * y + p1 * (r2 + 2 * y * y)
+    return np.stack([frame["fl_x"] * u + frame["cx"], frame["fl_y"] * v + frame["cy"]], axis=1)
 
 
 def test_nerfstudio_has_photos_masks_and_points(tmp_path):

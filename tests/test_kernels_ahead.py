@@ -24,7 +24,8 @@ from piccolo.kernels import ahead, jit
 
 asked = []
 within = []
-load, compile = jit.KernelCache.load_overload, Dispatcher.compile
+load = jit.KernelCache.load_overload
+compile = Dispatcher.compile
 
 def note(self, signature, context):
     if len(within) == 1:
@@ -38,7 +39,8 @@ def enter(self, signature):
     finally:
         within.pop()
 
-jit.KernelCache.load_overload, Dispatcher.compile = note, enter
+jit.KernelCache.load_overload = note
+Dispatcher.compile = enter
 code = run("piccolo.cli.localize")
 print(*asked, sep="\n", file=sys.stderr)
 sys.exit(code)
@@ -101,7 +103,8 @@ def test_helpers_compile_what_nobody_has_begun(folder, monkeypatch):
     def doubled(values):
         return 2.0 * values.sum()
 
-    first, second = kernel(total), kernel(doubled)
+    first = kernel(total)
+    second = kernel(doubled)
     arguments = ahead.parse("float64[1C]")
     monkeypatch.setattr(ahead, "list_kernels", lambda: iter([(first, arguments), (second, arguments)]))
     codegen = ahead.cpu_target.target_context.codegen()

@@ -82,7 +82,9 @@ def _text_of(kind, names, times, poses):
             angles = [course, np.arcsin(f[2]), np.arctan2(-up @ level, left @ level)]
             lines.append("\t".join([name, repr(float(time)), x, y, z, *map(str, np.degrees(angles))]))
             continue
-        right, top, back = -R[:, 1], R[:, 2], -R[:, 0]
+        right = -R[:, 1]
+        top = R[:, 2]
+        back = -R[:, 0]
         if kind == "opk":
             phi = np.arcsin(back[0])
             angles = np.degrees([np.arctan2(-back[1], back[2]), phi, np.arctan2(-top[0], right[0])])

@@ -310,7 +310,8 @@ def test_a_radiance_picture_is_exposed_by_its_mean_and_a_broken_one_refused(tmp_
     path = tmp_path / "a.hdr"
     cv2.imwrite(str(path), light)
     picture = read_picture(path)
-    low, high = picture.rgb[1, 0], picture.rgb[1, 127]  # 0.018 and 1.8 of white
+    low = picture.rgb[1, 0]  # 0.018 of white
+    high = picture.rgb[1, 127]  # 1.8
     assert (np.abs(low.astype(int) - 36) <= 1).all()
     assert (high == 255).all()
     assert "exposed so that the geometric mean" in picture.warnings[0]

@@ -126,7 +126,8 @@ def test_nobody_walks_through_a_wall(two_rooms):
         scan_map.centers[is_high & ((centers > r.corner) & (centers < r.corner + rooms.SIZE)).all(axis=1)]
         for r in world.rooms
     )
-    space, start = FreeSpace(scan_map.octree, scan_map.centers, Workers(2)), first[np.argmax(first[:, 1])]
+    space = FreeSpace(scan_map.octree, scan_map.centers, Workers(2))
+    start = first[np.argmax(first[:, 1])]
     same = space.distances(start[None], first, 20.0)[0]
     assert len(first) > 20
     assert np.isfinite(same).mean() > 0.95

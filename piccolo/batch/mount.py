@@ -37,7 +37,8 @@ class Trajectory(NamedTuple):
     def at(self, time: float) -> Pose:
         """Return the pose at a time: linear between two poses, and beyond the first and last."""
         k = min(max(int(np.searchsorted(self.times, time)), 1), len(self.times) - 1)
-        before, after = self.poses[k - 1], self.poses[k]
+        before = self.poses[k - 1]
+        after = self.poses[k]
         share = (time - self.times[k - 1]) / (self.times[k] - self.times[k - 1])
         turn = share * log_so3(after.R_cam_from_world @ before.R_cam_from_world.T)
         center = before.center_world + share * (after.center_world - before.center_world)

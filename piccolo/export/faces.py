@@ -26,7 +26,8 @@ CUBE = (0.0, 0.0), (90.0, 0.0), (180.0, 0.0), (270.0, 0.0), (0.0, 90.0), (0.0, -
 CORNERS = tuple((yaw, up * CORNER_DEG) for up in (1, -1) for yaw in (45.0, 135.0, 225.0, 315.0))
 # directions by their number: azimuth from the panorama's centre to the left, and elevation [deg]
 FACES = {6: CUBE, 8: tuple((45.0 * k, 0.0) for k in range(8)), 14: CUBE + CORNERS}
-IMAGES, MASKS = "images", "masks"  # folders of a data set
+IMAGES = "images"  # folders of a data set
+MASKS = "masks"
 
 
 def write_faces(

@@ -69,7 +69,8 @@ def points_file(out: Path) -> Path:
 
 def _intrinsics(lens: Camera) -> dict[str, float]:
     """Return size and lengths [px]; of a sphere x - cx is +-fl_x at the seam, y - cy +-fl_y / 2 at a pole."""
-    w, h = lens.width, lens.height
+    w = lens.width
+    h = lens.height
     size = {"w": w, "h": h}
     if lens.lens == SPHERE:
         return {**size, "fl_x": w / 2, "fl_y": float(h), "cx": w / 2, "cy": h / 2}

@@ -21,7 +21,8 @@ from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
 from ..confidence.focal_length import WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
-from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
+from ..geometry.pose import Pose, exp_so3, rotate_points
+from ..geometry.pose_gaussian import subtract
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
 from ..local_features.matching import NO_MATCHES
@@ -283,13 +284,8 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
     hessians[:, rows, columns] += fitted[1 + num :].T
     hessians[:, columns, rows] += fitted[1 + num :].T
     H = hessians.sum(axis=0)
-    moved = [
-        np.concatenate(
-            [log_so3(p.R_cam_from_world @ pose.R_cam_from_world.T), p.center_world - pose.center_world]
-        )
-        for p in poses
-    ]
-    motion = np.linalg.lstsq(terms[:, : 1 + num], np.array(moved), rcond=None)[0][1:].T
+    moved = np.array([subtract(p, pose) for p in poses])
+    motion = np.linalg.lstsq(terms[:, : 1 + num], moved, rcond=None)[0][1:].T
     num_blocks = int(losses.any(axis=0).sum())
     if num_blocks < LEAST_BLOCKS * num or not np.linalg.eigvalsh(H)[0] > 0.0:
         return Crest(middle, np.zeros((num, num)), motion)
