@@ -14,8 +14,14 @@ import numpy as np
 from ..arrays import Array
 from ..errors import InputError
 from ..geometry.pose import Pose, exp_so3, log_so3, orthonormal
-from ..geometry.pose_gaussian import LIKELY, LOOSE, add, subtract
-from ..localization.bundle_adjustment import RelativeErrors, find_odd, match_median, weigh_robustly
+from ..geometry.pose_gaussian import LOOSE, add, subtract
+from ..localization.bundle_adjustment import (
+    RelativeErrors,
+    choose_agreed,
+    find_odd,
+    match_median,
+    weigh_robustly,
+)
 
 LEAST_PHOTOS = 4
 NUM_ROUNDS = 5  # in which errors and the mount are estimated in turn
@@ -24,7 +30,6 @@ NUM_STEPS = 8  # of Gauss and Newton, at most
 SETTLED = 1e-6  # [rad, m, s] of a step, after which there is none
 NEAR_S = 0.01  # [s] on either side, over which a velocity is taken
 MOST_ERRORS = RelativeErrors(math.radians(5.0), 0.5)  # chosen: such poses are in another frame, or of others
-LOOSER = 0.04  # chosen: of the information of a given pose that counts before the clock is known
 
 
 class Trajectory(NamedTuple):
@@ -114,13 +119,7 @@ def _repeat(own: Sequence[Array], steps: Array, errors: RelativeErrors, is_odd: 
 def _begin(sightings: Sequence[Sighting], trajectory: Trajectory, errors: RelativeErrors) -> Pose:
     """Return the mount that one photo says and most others agree with."""
     mounts = [sighting.pose @ trajectory.at(sighting.time).inverse() for sighting in sightings]
-    information = LOOSER / np.diag(errors.covariance)
-
-    def cost(mount: Pose) -> float:
-        squares = [float(information @ np.square(subtract(other, mount))) for other in mounts]
-        return float(np.minimum(squares, LIKELY).sum())
-
-    return min(mounts, key=cost)
+    return choose_agreed(mounts, lambda mount: np.array([subtract(m, mount) for m in mounts]), errors)
 
 
 def _compare(mount: Pose, clock: float, sighting: Sighting, trajectory: Trajectory) -> tuple[Array, Array]:

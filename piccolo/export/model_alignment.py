@@ -6,6 +6,7 @@ Rotation, scale and position are those of the bundle that localized photos and t
 import itertools
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
@@ -17,13 +18,14 @@ from ..batch.relative_poses import read_relative_poses, read_xml
 from ..errors import InputError, import_optional
 from ..files.atomic import write_atomically
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
+from ..geometry.pose_gaussian import PoseGaussian, subtract
 from ..localization.bundle_adjustment import (
     UNKNOWN_SCALE,
     Bundle,
     Estimate,
     RelativeErrors,
     adjust,
+    choose_agreed,
     find_odd,
     match_median,
 )
@@ -32,7 +34,6 @@ from ..result import Result
 from .colmap import read_model, write_model
 
 LEAST_PHOTOS = 3
-LOOSER = 0.04  # chosen: of the information of a pose that counts before the scale is exact
 NUM_ROUNDS = 4  # in which the errors of the model and its place are estimated in turn
 LOCAL = (
     'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
@@ -80,7 +81,7 @@ def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
     for _ in range(NUM_ROUNDS):
         adjusted = adjust(bundle, estimates, errors)
         bundle = adjusted.bundle
-        steps = np.array([subtract(own.pose, bundle.place(pose)) for own, pose in estimates])
+        steps = _find_steps(estimates, bundle)
         errors = match_median(own_covariances, steps, errors)
     odd = itertools.compress([result.pano for result, _ in known], find_odd(own_covariances, steps, errors))
     scale = math.exp(bundle.log_scale)
@@ -97,15 +98,13 @@ def _begin(estimates: Sequence[Estimate], errors: RelativeErrors) -> Bundle:
     lengths = [np.linalg.norm(centers[rows] - centers[columns], axis=1) for centers in (own, given)]
     log_scale = math.log(max(float(np.median(lengths[0] / np.maximum(lengths[1], 1e-12))), 1e-12))
     frame = Bundle(Pose(np.eye(3), np.zeros(3)), log_scale)
-    information = LOOSER / np.diag(errors.covariance)
+    bundles = [Bundle(frame.scale(pose).inverse() @ one.pose, log_scale) for one, pose in estimates]
+    return choose_agreed(bundles, partial(_find_steps, estimates), errors)
 
-    def cost(bundle: Bundle) -> float:
-        steps = np.array([subtract(one.pose, bundle.place(pose)) for one, pose in estimates])
-        return float(np.minimum(np.square(steps) @ information, LIKELY).sum())
 
-    return min(
-        (Bundle(frame.scale(pose).inverse() @ one.pose, log_scale) for one, pose in estimates), key=cost
-    )
+def _find_steps(estimates: Sequence[Estimate], bundle: Bundle) -> Array:
+    """Return the steps (N, 6) of photos from where a bundle puts them."""
+    return np.array([subtract(own.pose, bundle.place(pose)) for own, pose in estimates])
 
 
 def write_aligned(model: Path, alignment: Alignment, out: Path) -> None:

@@ -5,8 +5,8 @@ tell how large these are, whether the positions are too long, and which photo do
 """
 
 import math
-from collections.abc import Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -36,6 +36,8 @@ class RelativeErrors(NamedTuple):
         return np.asarray(np.diag(np.repeat([self.turn**2, self.move**2], 3)))
 
 
+LOOSER = 0.04  # chosen: of the information of a given pose that counts before scale or clock are known
+Item = TypeVar("Item")
 LEAST_ERRORS = RelativeErrors(math.radians(0.01), 0.001)  # chosen: no given pose is better
 
 
@@ -151,6 +153,21 @@ def estimate_errors(bundle: Bundle, estimates: Sequence[Estimate], errors: Relat
         if max(factors) == 1.0:
             break
     return errors
+
+
+def choose_agreed(
+    candidates: Sequence[Item], find_steps: Callable[[Item], Array], errors: RelativeErrors
+) -> Item:
+    """Return the candidate by which most photos are off by few deviations; those far off count alike.
+
+    `find_steps` returns the steps (N, 6) by which photos are off by a candidate.
+    """
+    information = LOOSER / np.diag(errors.covariance)
+
+    def cost(candidate: Item) -> float:
+        return float(np.minimum(np.square(find_steps(candidate)) @ information, LIKELY).sum())
+
+    return min(candidates, key=cost)
 
 
 def match_median(covariances: Sequence[Array], steps: Array, errors: RelativeErrors) -> RelativeErrors:

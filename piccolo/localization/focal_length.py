@@ -368,7 +368,8 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         delta[6] = np.clip(delta[6], -1.0, 1.0)  # the focal length stays one
     variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
     is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
-    fit = query.cache.fits[pose.key] = float(delta[6]), is_known / variance, move(delta)
+    fit = float(delta[6]), is_known / variance, move(delta)
+    query.cache.fits[pose.key] = fit
     return fit
 
 

@@ -210,10 +210,10 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
     What does not count is left 0 outside of a box around what does.
     """
     height, width = panorama.is_valid.shape
+    is_averaged = cell_deg * width / 360.0 > 1.5  # cells wider than pixels: over the whole sphere
     step = width // STATS_WIDTH
-    rows, columns = (find_span(np.asarray(panorama.is_valid.any(axis=k)), step) for k in (1, 0))
-    if is_averaged := cell_deg * width / 360.0 > 1.5:  # cells wider than pixels
-        rows = columns = slice(None)
+    rows = find_span(np.asarray(panorama.is_valid.any(axis=1) | is_averaged), step)
+    columns = find_span(np.asarray(panorama.is_valid.any(axis=0) | is_averaged), step)
     weight = panorama.is_valid[rows, columns].astype(np.float32)
     channels = opponent_channels(panorama.rgb[rows, columns].astype(np.float32) / np.float32(255.0))
     if is_averaged:  # by a Gaussian with a cell's second moment
@@ -221,9 +221,10 @@ def normalize_panorama(panorama: Panorama, cell_deg: float, sigma_deg: float) ->
         channels = np.asarray(sums[..., :3] / np.maximum(sums[..., 3:], LEAST_WEIGHT), np.float32)
     inner = np.empty((len(weight) // step, weight.shape[1] // step, 7), np.float32)
     block_moments(channels, weight, inner)
-    corner = rows.start or 0, columns.start or 0
+    corner = rows.start, columns.start
     moments = np.zeros((STATS_WIDTH // 2, STATS_WIDTH, 7), np.float32)
-    top, left = (begin // step for begin in corner)
+    top = rows.start // step
+    left = columns.start // step
     moments[top : top + len(inner), left : left + inner.shape[1]] = inner
     texels = np.zeros((height + 2, width + 2), np.int32)
     pack_normalized(channels, weight, smooth_statistics(moments, sigma_deg), corner, texels)
