@@ -142,3 +142,6 @@ def test_what_can_not_be_aligned_is_refused(tmp_path, scene, capsys):
     (tmp_path / "a.xml").write_text("<chunk><camera label='00'><transform>1 2</transform></camera></chunk>")
     code, text = _run(tmp_path, scene, tmp_path / "a.xml", tmp_path / "x.xml", capsys)
     assert (code, "a.xml: found" in text) == (3, True)
+    code, text = _run(tmp_path, scene, tmp_path / "none", tmp_path / "x", capsys)
+    assert code == 3
+    assert text.count(str(tmp_path / "none")) == 1

@@ -142,6 +142,8 @@ def naming(path: Path, wanted: str) -> Iterator[None]:
     try:
         yield
     except InputError as error:
+        if str(error).startswith(f"{path}: "):  # it could not be read
+            raise
         raise InputError(f"{path}, {error}; {wanted}") from error
     except DAMAGE as error:
         raise InputError(f"{path}: found {describe(error)}, {wanted}") from error
