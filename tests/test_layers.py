@@ -19,6 +19,7 @@ LAYERS = [
     "research.scene",
     "__main__",
     "cli",
+    "service",
     "report",
     "export",
     "batch",

@@ -211,6 +211,13 @@ def read_cameras(path: Path) -> Calibration:
         return _of_colmap(path, text)
 
 
+def calibration_of(document: Any, label: str) -> Calibration:
+    """Return the cameras in the JSON of a calibration's file, which errors call by a label."""
+    path = Path(label)
+    with _naming(path, WANTED):
+        return _of_document(path, document)
+
+
 def read_rig(path: Path) -> Calibration:
     """Return the cameras of a rig in COLMAP's rig_config.json or our own JSON.
 

@@ -18,7 +18,7 @@ from ..jobs.memory import limit_of_process, share_arenas
 # Modules of this folder that are commands: scripts of the checkout, and piccolo-NAME where it is installed.
 COMMANDS = (
     "localize", "align_gravity", "prepare_map", "render_pose", "color_scan", "export_poses", "report",
-    "e57_images", "calibrate_mount", "align_model",
+    "e57_images", "calibrate_mount", "align_model", "serve",
 )  # fmt: skip
 SCRIPT = re.compile(rf"(?:python )?(?:tools/)?\b({'|'.join(COMMANDS)})\.py\b")
 # a parameter of the API in a message, the unit in its name, and those whose flag has another name

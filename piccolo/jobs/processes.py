@@ -45,6 +45,10 @@ class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
 
 
+class TooSlowError(Exception):
+    """An item took longer than it may; its process was killed. The text says how long that is."""
+
+
 @dataclass
 class Here:
     """Works on one item after another in this process, on each when its value is asked for."""
@@ -110,13 +114,23 @@ class InFlight:
 class Processes:
     """Works on items in processes, which begin as they are needed; each opens once what it works with.
 
-    An item whose process is killed is tried once more in a new one.
+    An item whose process is killed is tried once more in a new one, if there are two `attempts`; one that
+    takes more than `seconds` is given up.
     """
 
-    def __init__(self, opening: Opening, num_processes: int, num_threads: int = 1) -> None:
+    def __init__(
+        self,
+        opening: Opening,
+        num_processes: int,
+        num_threads: int = 1,
+        seconds: float | None = None,
+        attempts: int = ATTEMPTS,
+    ) -> None:
         self.opening = opening
         self.num_processes = num_processes
         self.num_threads = num_threads
+        self.seconds = seconds
+        self.attempts = attempts
         self._own = threading.local()  # its `worker` is the process of each thread, and a pool of it alone
         self._children: list[BaseProcess] = []
         self._starting = threading.Lock()
@@ -127,7 +141,11 @@ class Processes:
 
     def values(self, items: Iterator[Any]) -> InFlight:
         """Begin with the items."""
-        return InFlight(self._submit, items, IN_FLIGHT * self.num_processes)
+        return InFlight(self.submit, items, IN_FLIGHT * self.num_processes)
+
+    def submit(self, item: object) -> Future[Any]:
+        """Begin with an item as soon as a process is free; its future raises what `Pair` says."""
+        return self._threads.submit(self._value_of, item)
 
     def close(self) -> None:
         """Kill the processes, whatever they are doing."""
@@ -137,18 +155,23 @@ class Processes:
                 child.kill()
         self._threads.shutdown(cancel_futures=True)
 
-    def _submit(self, item: object) -> Future[Any]:
-        return self._threads.submit(self._value_of, item)
-
     def _value_of(self, item: object) -> Any:
         """Ask this thread's process for a value."""
-        for _ in range(ATTEMPTS):
+        for _ in range(self.attempts):
             pool, child = self._worker()
+            future = pool.submit(_value_of, item)
             try:
-                return pool.submit(_value_of, item).result()
+                return future.result(self.seconds)
             except BrokenProcessPool:
                 end = self._end_of(pool, child)
-        raise WorkerLostError(f"each of {ATTEMPTS} processes at work on it {end}")
+            except TimeoutError:
+                if future.done():  # it is the function's own
+                    raise
+                child.kill()
+                self._end_of(pool, child)
+                raise TooSlowError(f"it took more than {self.seconds} s") from None
+        who = "the process" if self.attempts == 1 else f"each of {self.attempts} processes"
+        raise WorkerLostError(f"{who} at work on it {end}")
 
     def _worker(self) -> Worker:
         """Return the process of this thread, or a new one, when it has opened what it needs."""

@@ -194,6 +194,13 @@ def document_of(
         entry = site.document_of_entry(task.entry, name, task.key, scan_map)
         photos.append({**entry, "short": short, "hasPictures": has_pictures, "thumb": thumb})
     cloud = tasks[0].entry.result.cloud
+    return {**document_of_scan(scan_map, cloud, folder, settings), "photos": photos}
+
+
+def document_of_scan(
+    scan_map: ScanMap, cloud: str | tuple[str, ...], folder: Path, settings: ReportSettings = DEFAULT
+) -> dict[str, Any]:
+    """Return what the page knows of a scan, with the paths of its files; writes the plans."""
     clouds = [Path(path).name for path in ([cloud] if isinstance(cloud, str) else cloud)]
     north = scan_map.R_map_from_world @ np.array([0.0, 1.0, 0.0])
     has_north = bool(settings.crs or scan_map.crs)
@@ -206,14 +213,11 @@ def document_of(
         "north": [float(north[0]), float(north[1])] if has_north else None,
         "origin": scan_map.origin_world.tolist(),
         "R": scan_map.R_map_from_world.ravel().tolist(),
-        "storeys": list(storey_documents(scan_map, tasks, folder, settings)),
-        "photos": photos,
+        "storeys": list(storey_documents(scan_map, folder, settings)),
     }
 
 
-def storey_documents(
-    scan_map: ScanMap, tasks: Sequence[Task], folder: Path, settings: ReportSettings
-) -> Iterator[dict[str, Any]]:
+def storey_documents(scan_map: ScanMap, folder: Path, settings: ReportSettings) -> Iterator[dict[str, Any]]:
     """Yield the storeys, each with its plan, which is written."""
     origin = float((scan_map.R_map_from_world @ scan_map.origin_world)[2])
     storey, height = scan_map.storeys.at(scan_map.centers)

@@ -227,10 +227,8 @@ def finish_folder(out: Path, document: Mapping[str, Any]) -> None:
     """Write the page and its data, and remove what earlier reports here left of photos."""
     for name in PAGE_FILES:
         write_atomically(out / name, page_file(name).encode())
-    script = f"window.PICCOLO_REPORT = {as_script_text(document)};\n"
-    write_atomically(out / "report.js", script.encode())
-    page = page_file(INDEX).replace("{{policy}}", POLICY.format(script=OWN, style=OWN))
-    write_atomically(out / INDEX, page.encode())
+    write_atomically(out / "report.js", report_script(document).encode())
+    write_atomically(out / INDEX, page_under(POLICY.format(script=OWN, style=OWN)).encode())
     used = {str(photo["key"]) for photo in document["photos"]}
     used |= {Path(s["plan"]["file"]).stem for s in document["storeys"] if s["plan"]}
     for name, suffix in FOLDERS.items():
@@ -241,15 +239,26 @@ def finish_folder(out: Path, document: Mapping[str, Any]) -> None:
                 path.unlink()
 
 
+def report_script(document: Mapping[str, Any]) -> str:
+    """Return the script that hands its data to the page."""
+    return f"window.PICCOLO_REPORT = {as_script_text(document)};\n"
+
+
+def page_under(policy: str) -> str:
+    """Return the page that takes data, script and style from beside it, under a Content-Security-Policy."""
+    return page_file(INDEX).replace("{{policy}}", policy)
+
+
 def self_contained(folder: Path, document: Mapping[str, Any]) -> str:
     """Return the page with everything in it; its pictures lie in a folder, as those of other reports do."""
     inlined = json.loads(json.dumps(document))
     for photo in inlined["photos"]:
         if photo["thumb"]:
-            photo["thumb"] = _data_url(folder / photo["thumb"], "image/jpeg")
+            photo["thumb"] = data_url((folder / photo["thumb"]).read_bytes(), "image/jpeg")
     for storey in inlined["storeys"]:
         if storey["plan"]:
-            storey["plan"]["file"] = _data_url(folder / storey["plan"]["file"], "image/png")
+            plan = folder / storey["plan"]["file"]
+            storey["plan"]["file"] = data_url(plan.read_bytes(), "image/png")
     script = page_file("app.js")
     style = page_file("app.css")
     data = [f'<script type="application/json" id="report">{as_script_text(inlined)}</script>']
@@ -258,8 +267,7 @@ def self_contained(folder: Path, document: Mapping[str, Any]) -> str:
             script_of_photo = picture_path(folder, "photos", photo["key"]).read_text()
             text = script_of_photo.partition(" = ")[2].removesuffix(";\n")
             data.append(f'<script type="application/json" id="photo-{photo["key"]}">{text}</script>')
-    page = page_file(INDEX)
-    page = page.replace("{{policy}}", POLICY.format(script=_hash_of(script), style=_hash_of(style)))
+    page = page_under(POLICY.format(script=_hash_of(script), style=_hash_of(style)))
     page = page.replace('<link rel="stylesheet" href="app.css">', f"<style>{style}</style>")
     page = page.replace('<script defer src="report.js"></script>', "")
     page = page.replace('<script defer src="app.js"></script>', "")
@@ -270,5 +278,6 @@ def _hash_of(text: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
 
 
-def _data_url(path: Path, kind: str) -> str:
-    return f"data:{kind};base64,{base64.b64encode(path.read_bytes()).decode()}"
+def data_url(content: bytes, kind: str) -> str:
+    """Return a picture as an address that holds it."""
+    return f"data:{kind};base64,{base64.b64encode(content).decode()}"

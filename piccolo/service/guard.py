@@ -1,0 +1,127 @@
+"""What every request passes: who may ask, from which page, and how much may be sent."""
+
+import asyncio
+import secrets
+from collections.abc import Mapping
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import urlsplit
+
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.exceptions import HTTPException
+from starlette.responses import JSONResponse
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+COOKIE = "piccolo_token"
+OPEN = ("/health", "/enter")  # paths that need no token
+LOCAL = ("127.0.0.1", "localhost", "[::1]", "::1")
+READ_S = 60.0  # [s] for a body to arrive
+DROP_S = 10.0  # [s] for what is left of a refused one: a client that still sends would not hear the answer
+SECURITY = {
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Cache-Control": "no-store",
+}
+
+
+class Body:
+    """The body of a request, read up to a limit; the rest of one that is refused is read and dropped."""
+
+    def __init__(self, receive: Receive, max_bytes: int) -> None:
+        self._receive = receive
+        self._max_bytes = max_bytes
+        self._num_bytes = 0
+        self._is_whole = False
+
+    async def receive(self) -> Message:
+        """Return the next part; HTTPException for one too many, or too late."""
+        try:
+            message = await asyncio.wait_for(self._next(), None if self._is_whole else READ_S)
+        except TimeoutError:
+            raise HTTPException(408, f"found no more of the body for {READ_S:g} s") from None
+        if self._num_bytes > self._max_bytes:
+            raise too_large(self._max_bytes)
+        return message
+
+    async def drop_rest(self) -> None:
+        """Read what is left, for a while."""
+        try:
+            async with asyncio.timeout(DROP_S):
+                while not self._is_whole:
+                    await self._next()
+        except TimeoutError:
+            self._is_whole = True
+
+    async def _next(self) -> Message:
+        message = await self._receive()
+        self._num_bytes += len(message.get("body", b""))
+        self._is_whole = self._is_whole or not message.get("more_body", False)
+        return message
+
+
+class Guard:
+    """Lets requests through to an application."""
+
+    def __init__(self, app: ASGIApp, max_bytes: int, token: str | None) -> None:
+        self.app = app
+        self.max_bytes = max_bytes
+        self.token = token
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, or refuse it in one line."""
+        if scope["type"] != "http":
+            await self.app(scope, receive, send)
+            return
+        body = Body(receive, self.max_bytes)
+
+        async def answer(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                await body.drop_rest()
+                MutableHeaders(scope=message).update(SECURITY)
+            await send(message)
+
+        try:
+            self.check(scope, Headers(scope=scope))
+        except HTTPException as error:
+            await refuse(error)(scope, body.receive, answer)
+            return
+        await self.app(scope, body.receive, answer)
+
+    def check(self, scope: Scope, headers: Headers) -> None:
+        """Raise HTTPException for a request of a foreign host, a foreign page, or without the token."""
+        host = headers.get("host", "")
+        if self.token is None and urlsplit(f"//{host}").hostname not in LOCAL:
+            raise HTTPException(403, f"found the host {host[:80]!r}, wanted localhost")
+        origin = headers.get("origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            raise HTTPException(403, f"found a page of {origin[:80]!r}, wanted one of this service")
+        if self.token is not None and scope["path"] not in OPEN and not self.knows_token(headers):
+            raise HTTPException(401, "found no token, or another: open the address that the service printed")
+        if int(headers.get("content-length", "0")) > self.max_bytes:
+            raise too_large(self.max_bytes)
+
+    def knows_token(self, headers: Headers) -> bool:
+        """Return True if the token came as a bearer's, or as the page's cookie."""
+        scheme, _, bearer = headers.get("authorization", "").partition(" ")
+        given = bearer if scheme.lower() == "bearer" else read_cookie(headers)
+        return secrets.compare_digest(given.encode(), (self.token or "").encode())
+
+
+def read_cookie(headers: Mapping[str, str]) -> str:
+    """Return the token in the page's cookie; empty without."""
+    try:
+        cookie = SimpleCookie(headers.get("cookie", ""))
+    except CookieError:
+        return ""
+    return cookie[COOKIE].value if COOKIE in cookie else ""
+
+
+def too_large(max_bytes: int) -> HTTPException:
+    """Return the refusal of a body."""
+    return HTTPException(413, f"found a larger body, wanted at most {max_bytes} bytes")
+
+
+def refuse(error: HTTPException) -> JSONResponse:
+    """Return the answer of a refusal: its text as JSON, in one line."""
+    return JSONResponse({"error": error.detail}, error.status_code, error.headers)
