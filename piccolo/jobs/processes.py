@@ -159,13 +159,13 @@ class Processes:
         """Ask this thread's process for a value."""
         for _ in range(self.attempts):
             pool, child = self._worker()
-            future = pool.submit(_value_of, item)
             try:
+                future = pool.submit(_value_of, item)
                 return future.result(self.seconds)
             except BrokenProcessPool:
                 end = self._end_of(pool, child)
             except TimeoutError:
-                if future.done():  # it is the function's own
+                if future.done():  # the function's own
                     raise
                 child.kill()
                 self._end_of(pool, child)

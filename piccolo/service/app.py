@@ -79,7 +79,7 @@ class Service:
         if name in site.PAGE_FILES:
             return Response(site.page_file(name), media_type=TYPES[Path(name).suffix])
         if name:
-            raise HTTPException(404, "found no such page")
+            raise HTTPException(404, "found no such plan")
         policy = site.POLICY.format(script=site.OWN, style=site.OWN)
         return Response(site.page_under(f"{policy}; connect-src 'self'"), media_type="text/html")
 
@@ -271,7 +271,7 @@ def make_app(service: Service, token: str | None) -> Starlette:
         Route("/walks", service.begin_walk, methods=["POST"]),
         Route("/walks/{walk}", service.follow, methods=["POST"]),
         Route("/walks/{walk}", service.end_walk, methods=["DELETE"]),
-        Route("/{path:path}", service.page),
+        *(Route(path, service.page) for path in ("/", "/report.js", "/app.js", "/app.css", "/plans/{name}")),
     ]
 
     @asynccontextmanager

@@ -1,0 +1,350 @@
+"""The service as its clients have it: the command is started, and asked over HTTP."""
+
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+import rooms
+from batches import workers_of
+
+from piccolo.cli import localize
+from piccolo.result import Result
+from piccolo.service.asking import clean_name
+
+ROOT = Path(__file__).resolve().parents[1]
+NEEDED = ("status", "confidence", "center_world", "R_cam_from_world", "covariance", "alternatives")
+
+
+class Client:
+    """Asks a service that runs at a port."""
+
+    def __init__(self, port, process):
+        self.port, self.process = port, process
+
+    def ask(self, method, path, body=b"", **headers):
+        """Status, headers and body of an answer."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
+        connection.request(method, path, body, {name.replace("_", "-"): v for name, v in headers.items()})
+        answer = connection.getresponse()
+        found = answer.status, dict(answer.getheaders()), answer.read()
+        connection.close()
+        return found
+
+    def post(self, path, name, content, options=None, **headers):
+        """The same of a picture that is sent as a form."""
+        mark = uuid.uuid4().hex
+        parts = [("picture", f'; filename="{name}"', content)]
+        if options is not None:
+            text = options if isinstance(options, str) else json.dumps(options)
+            parts.append(("options", "", text.encode()))
+        body = b"".join(
+            f'--{mark}\r\nContent-Disposition: form-data; name="{key}"{more}\r\n\r\n'.encode()
+            + value
+            + b"\r\n"
+            for key, more, value in parts
+        )
+        kind = f"multipart/form-data; boundary={mark}"
+        return self.ask("POST", path, body + f"--{mark}--\r\n".encode(), Content_Type=kind, **headers)
+
+
+@contextmanager
+def serving(*words):
+    """A client of a service that is started with some options, and ended by SIGTERM."""
+    command = [sys.executable, str(ROOT / "tools/serve.py"), "--port", "0", *map(str, words)]
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    lines = []
+    for line in process.stderr:
+        lines.append(line)
+        if " open http://" in line:
+            break
+    else:
+        pytest.fail("".join(lines))
+    address = lines[-1].split(" open ")[1].split()[0]
+    client = Client(int(address.split(":")[2].split("/")[0]), process)
+    client.address = address
+    yield client
+    if process.poll() is None:
+        process.send_signal(signal.SIGTERM)
+    client.rest = process.communicate(timeout=60)[1]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("service")
+
+
+@pytest.fixture(scope="module")
+def photo(scene):
+    return (scene / "images" / "clean_0.jpg").read_bytes()
+
+
+@pytest.fixture(scope="module")
+def service(scene, folder):
+    words = ["--cache", folder / "maps", "--max-megabytes", "2", "--max-megapixels", "1"]
+    with serving("--cloud", scene / "cloud.ply", "--jobs", "2", *words) as client:
+        yield client
+    assert client.process.returncode == 143
+    assert "Traceback" not in client.rest
+
+
+@pytest.fixture(scope="module")
+def expected(scene, folder, service):
+    """The line that the command line writes of the same photo, with the map that the service made."""
+    out = folder / "expected.jsonl"
+    words = ["--cloud", str(scene / "cloud.ply"), "--pano", str(scene / "images" / "clean_0.jpg")]
+    assert localize.main([*words, "--cache", str(folder / "maps"), "--threads", "1", "--out", str(out)]) == 0
+    return json.loads(out.read_text())
+
+
+def _same(found, expected):
+    changed = {"seconds": 0, "pano": 0}
+    return {**found, **changed} == {**expected, **changed}
+
+
+def test_a_photo_gets_the_line_of_the_command_line(service, photo, expected):
+    status, headers, body = service.post("/localize", "where.jpg", photo)
+    assert status == 200
+    found = json.loads(body)
+    assert Result.from_json(body.decode()).status == "localized"
+    assert found["pano"] == "where.jpg"
+    assert _same(found, expected)
+    assert headers["content-type"] == "application/json"
+
+
+def test_options_count(service, photo):
+    asked = {"prior": {"near": [90.0, 0.0, None], "radius": 1.0}, "gravity": "known"}
+    status, _, body = service.post("/localize", "a.jpg", photo, asked)
+    assert status == 200
+    found = json.loads(body)
+    assert found["status"] == "not_localized"
+    assert found["settings"]["gravity"] == "known"
+
+
+def test_the_page_gets_a_photo_in_two_lines(service, photo, expected):
+    status, headers, body = service.post("/show", "über dem Haus.jpg", photo)
+    assert status == 200
+    assert headers["content-type"].startswith("application/x-ndjson")
+    first, second = map(json.loads, body.decode().splitlines())
+    assert _same(first["result"], expected)
+    assert first["photo"]["name"] == "über dem Haus.jpg"
+    assert first["photo"]["pose"]["world"] == pytest.approx(expected["center_world"], abs=1e-5)
+    assert second["thumb"].startswith("data:image/jpeg;base64,/9j/")
+    assert second["pictures"]["sphere"]
+    assert second["pictures"]["scan"]
+
+
+def _form(parts):
+    mark = "x" * 20
+    body = "".join(f"--{mark}\r\nContent-Disposition: form-data; {h}\r\n\r\n{v}\r\n" for h, v in parts)
+    return {"body": f"{body}--{mark}--\r\n".encode(), "Content_Type": f"multipart/form-data; boundary={mark}"}
+
+
+def _blank(width, height):
+    """A PNG that is blank and much smaller than what it becomes."""
+    from io import BytesIO  # noqa: PLC0415
+
+    from PIL import Image  # noqa: PLC0415
+
+    file = BytesIO()
+    Image.new("RGB", (width, height)).save(file, "PNG")
+    return file.getvalue()
+
+
+BROKEN = {
+    "text": (422, "picture", lambda c, p: c.post("/localize", "a.jpg", b"no picture at all")),
+    "cut": (422, "damaged|cut|whole", lambda c, p: c.post("/localize", "a.jpg", p[: len(p) // 2])),
+    "empty": (422, "picture", lambda c, p: c.post("/localize", "a.jpg", b"")),
+    "too large": (413, "at most 2000000 bytes", lambda c, p: c.post("/localize", "a.jpg", bytes(20_000_000))),
+    "too many pixels": (422, "1 megapixels", lambda c, p: c.post("/localize", "a.png", _blank(4096, 2048))),
+    "no form": (400, "multipart/form-data", lambda c, p: c.ask("POST", "/localize", p)),
+    "no picture": (400, "no picture", lambda c, p: c.ask("POST", "/localize", **_form([('name="a"', "b")]))),
+    "torn form": (400, "", lambda c, p: c.ask("POST", "/localize", p, Content_Type="multipart/form-data")),
+    "no JSON": (400, "JSON", lambda c, p: c.post("/localize", "a.jpg", p, "{")),
+    "a list": (400, "object", lambda c, p: c.post("/localize", "a.jpg", p, [])),
+    "unknown": (400, "'speed'", lambda c, p: c.post("/localize", "a.jpg", p, {"speed": 1})),
+    "a path": (
+        400,
+        "'mask'",
+        lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"mask": "/etc/passwd"}}),
+    ),
+    "a file": (
+        400,
+        "camera",
+        lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"camera": "/etc/passwd"}}),
+    ),
+    "bad value": (400, "fov_deg", lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"fov_deg": -1}})),
+    "bad type": (400, "near", lambda c, p: c.post("/localize", "a.jpg", p, {"prior": {"near": "here"}})),
+    "many files": (
+        400,
+        "",
+        lambda c, p: c.ask("POST", "/localize", **_form([(f'name="p"; filename="{k}"', "b") for k in "ab"])),
+    ),
+    "method": (405, "", lambda c, p: c.ask("GET", "/localize")),
+    "another page": (403, "evil", lambda c, p: c.post("/localize", "a.jpg", p, Origin="http://evil.example")),
+    "another host": (403, "evil", lambda c, p: c.ask("GET", "/report.js", Host="evil.example:80")),
+    "no walk": (404, "walk", lambda c, p: c.post("/walks/none", "a.jpg", p)),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN)
+def test_what_is_wrong_gets_its_own_line(service, photo, name):
+    wanted, words, ask = BROKEN[name]
+    status, _, body = ask(service, photo)
+    assert status == wanted, body
+    error = json.loads(body)["error"]
+    assert "\n" not in error
+    assert any(word in error for word in words.split("|")), error
+    assert "/tmp" not in error
+    assert service.ask("GET", "/health")[0] == 200
+
+
+TRICKS = (
+    "/../requirements.txt", "/..%2f..%2fetc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/plans/../app.py",
+    "//etc/passwd", "/plans/%00", "/static/", "/.git/config", "/results.jsonl", "/app.js/../../x",
+    "/openapi.json/..%5c..%5cx", "/plans/" + "0" * 32 + ".png", "/%5c..%5c", "/~root", "/proc/self/environ",
+    "/app.js%00.png",
+)  # fmt: skip
+
+
+def test_nothing_but_the_page_can_be_read(service):
+    for path in TRICKS:
+        assert service.ask("GET", path)[0] in (400, 404), path
+    page = service.ask("GET", "/")
+    assert page[0] == 200
+    assert b"connect-src 'self'" in page[2]
+    assert page[1]["content-security-policy"] == "frame-ancestors 'none'"
+    document = json.loads(service.ask("GET", "/scan")[2])
+    assert document["photos"] == []
+    plan = document["storeys"][0]["plan"]["file"]
+    assert service.ask("GET", f"/{plan}")[2].startswith(b"\x89PNG")
+    for name in ("app.js", "app.css", "report.js"):
+        assert service.ask("GET", f"/{name}")[0] == 200
+
+
+def test_the_description_has_every_address(service):
+    document = json.loads(service.ask("GET", "/openapi.json")[2])
+    found = {(path, method.upper()) for path, item in document["paths"].items() for method in item}
+    found -= {("/walks/{walk}", "PARAMETERS")}
+    assert found == {
+        *((path, "POST") for path in ("/localize", "/show", "/walks", "/walks/{walk}")),
+        *((path, "GET") for path in ("/scan", "/health")),
+        ("/walks/{walk}", "DELETE"),
+    }
+
+
+@pytest.mark.parametrize(
+    ("given", "name"),
+    [
+        ("a.jpg", "a.jpg"),
+        ("../../etc/passwd", "passwd"),
+        ("C:\\x\\b.png", "b.png"),
+        (".hidden", "hidden"),
+        ("-rf", "rf"),
+        ("", "photo"),
+        ("a\0/b\r\n.jpg", "b_r_n.jpg"),
+        ("x" * 300 + ".jpg", "x" * 76 + ".jpg"),
+    ],
+)
+def test_names_are_no_paths(given, name):
+    assert clean_name(given) == name
+
+
+def test_a_walk_is_followed_frame_by_frame(service, scene):
+    status, _, body = service.ask("POST", "/walks", json.dumps({"motion": {"max_speed": 1.5}}))
+    assert status == 201
+    path = f"/walks/{json.loads(body)['walk']}"
+    frames = [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(2)]
+    for k, frame in enumerate(frames):
+        status, _, body = service.post(path, f"{k}.jpg", frame, {"time": 9.0 * k})
+        assert status == 200, body
+        found = json.loads(body)
+        assert (found["status"], found["pano"], found["walk"]["time"]) == ("localized", f"{k}.jpg", 9.0 * k)
+    status, _, body = service.post(path, "early.jpg", frames[0], {"time": 1.0})
+    assert (status, "time" in json.loads(body)["error"]) == (422, True)
+    status, _, body = service.ask("DELETE", path)
+    assert status == 200
+    assert [json.loads(line)["pano"] for line in body.splitlines()] == ["0.jpg", "1.jpg"]
+    assert service.ask("DELETE", path)[0] == 404
+
+
+def test_a_worker_that_is_killed_costs_no_answer(service, photo, expected):
+    for worker in workers_of(service.process):
+        os.kill(worker, signal.SIGKILL)
+    for _ in range(3):
+        status, _, body = service.post("/localize", "a.jpg", photo)
+        assert status == 200
+        assert _same(json.loads(body), expected)
+
+
+def test_a_full_queue_asks_to_come_again(scene, folder, photo):
+    words = ["--jobs", "1", "--max-waiting", "2", "--keep", folder]
+    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
+        with ThreadPoolExecutor(8) as pool:
+            answers = list(pool.map(lambda k: client.post("/localize", f"{k}.jpg", photo), range(8)))
+        assert {status for status, *_ in answers} == {200, 503}
+        assert all(headers["retry-after"] == "2" for status, headers, _ in answers if status == 503)
+        kept = (folder / "results.jsonl").read_text().splitlines()
+        assert len(kept) == sum(status == 200 for status, *_ in answers)
+        assert all(Path(json.loads(line)["pano"]).read_bytes() == photo for line in kept)
+        # one that is at work is finished after SIGTERM
+        with ThreadPoolExecutor(1) as pool:
+            last = pool.submit(client.post, "/localize", "last.jpg", photo)
+            while json.loads(client.ask("GET", "/health")[2])["waiting"] == 0:
+                time.sleep(0.01)
+            client.process.send_signal(signal.SIGTERM)
+            assert last.result()[0] == 200
+    assert client.process.returncode == 143
+
+
+def test_a_photo_that_takes_too_long_is_given_up(scene, folder, photo):
+    words = ["--jobs", "1", "--max-seconds", "0.1"]
+    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
+        time.sleep(5)
+        status, _, body = client.post("/localize", "a.jpg", photo)
+        assert status == 500
+        assert "more than 0.1 s" in json.loads(body)["error"]
+
+
+def test_others_need_the_token(scene, folder):
+    words = ["--host", "0.0.0.0", "--jobs", "1"]
+    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
+        token = client.address.split("token=")[1]
+        for path in ("/", "/scan", "/report.js", "/app.js"):
+            assert client.ask("GET", path)[0] == 401
+            assert client.ask("GET", path, Authorization="Bearer wrong")[0] == 401
+            assert client.ask("GET", path, Authorization=f"Bearer {token}")[0] == 200
+        status, headers, _ = client.ask("GET", f"/enter?token={token}")
+        assert (status, headers["location"]) == (303, "/")
+        assert "httponly" in headers["set-cookie"].lower()
+        cookie = headers["set-cookie"].split(";")[0]
+        assert client.ask("GET", "/", Cookie=cookie)[0] == 200
+        assert client.ask("GET", "/health")[0] == 200
+
+
+def test_a_scan_that_is_replaced_is_opened_again(folder, scene, photo):
+    path = folder / "replaced.ply"
+    path.write_bytes((scene / "cloud.ply").read_bytes())
+    with serving("--cloud", path, "--cache", folder / "maps", "--jobs", "1") as client:
+        before = json.loads(client.post("/localize", "a.jpg", photo)[2])
+        path.write_bytes(b"ply\nnothing")
+        assert client.ask("GET", "/scan")[0] == 200
+        time.sleep(3.0)
+        assert json.loads(client.post("/localize", "a.jpg", photo)[2])["status"] == "localized"
+        assert json.loads(client.ask("GET", "/scan")[2])["scanSha256"] == before["cloud_sha256"]
+        rooms.write_cloud(path, 3)
+        deadline = time.monotonic() + 60.0
+        while json.loads(client.ask("GET", "/scan")[2])["scanSha256"] == before["cloud_sha256"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.2)
+        after = json.loads(client.post("/localize", "a.jpg", photo)[2])
+    assert (before["status"], after["status"]) == ("localized", "not_localized")
+    assert "can't be opened" in client.rest
