@@ -270,8 +270,12 @@ class Localizer:
 
     def open(self) -> Callable[[Task], Answer]:
         """Open the scan in this process; return what answers tasks."""
+        return self.answer_in(self.open_here())
+
+    def open_here(self) -> OpenedScan:
+        """Open the scan with a process's own threads and memory."""
         limit_memory(self.max_memory)
-        return self.answer_in(self.open_scan(Workers(self.num_threads)))
+        return self.open_scan(Workers(self.num_threads))
 
     def answer_in(self, scan: OpenedScan) -> Callable[[Task], Answer]:
         """Return what answers tasks in an opened scan."""

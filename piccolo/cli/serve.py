@@ -82,6 +82,7 @@ def main(arguments: Arguments) -> int:
         if not localizer.cache.is_used:  # the processes open what is prepared here
             localizer = replace(localizer, cache=CachePolicy(folder=folder))
         service = Service(partial(open_desk, localizer, a.jobs, limits, a.workers()), limits, a.keep)
+        a.warn(service.desk.scan_map.warnings)
         name, port = server.getsockname()[:2]
         query = f"enter?token={token}" if token else ""
         a.note(

@@ -147,6 +147,11 @@ class Processes:
         """Begin with an item as soon as a process is free; its future raises what `Pair` says."""
         return self._threads.submit(self._value_of, item)
 
+    def finish(self) -> None:
+        """Wait until all items that were submitted are done, then close."""
+        self._threads.shutdown()
+        self.close()
+
     def close(self) -> None:
         """Kill the processes, whatever they are doing."""
         with self._starting:

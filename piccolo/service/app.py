@@ -10,7 +10,7 @@ from dataclasses import fields, replace
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from starlette.applications import Starlette
 from starlette.datastructures import UploadFile
@@ -40,14 +40,6 @@ SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they
 RETRY = {"Retry-After": "2"}
 LINES = "application/x-ndjson"
 TYPES = {".js": "text/javascript", ".css": "text/css"}
-
-
-class Asked(NamedTuple):
-    """A photo that was sent."""
-
-    task: Task
-    content: bytes
-    time: float | None  # of a frame
 
 
 class Service:
@@ -92,7 +84,7 @@ class Service:
     async def scan(self, request: Request) -> Response:
         """Return what is known of the scan: storeys with plans, extent, coordinate system."""
         self.look_for_another_scan()
-        return JSONResponse({**self.desk.document, "extent": self.desk.extent})
+        return JSONResponse(self.desk.document)
 
     async def health(self, request: Request) -> Response:
         """Return that the service runs, and how many photos wait."""
@@ -105,22 +97,23 @@ class Service:
 
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it."""
-        async with self.asking(request) as (asked, desk):
-            result = await self.answer(desk, asked)
+        async with self.asking(request) as (task, _):
+            result = await self.answer(self.desk, task)
         return Response(result.to_json(), media_type="application/json")
 
     async def show(self, request: Request) -> Response:
         """Return a photo for the page: a line with its result, then a line with its pictures."""
-        async with self.asking(request) as (asked, desk):
-            result = await self.answer(desk, asked)
-        line = result.to_json()
-        entry = json.dumps(desk.describe(result, secrets.token_hex(16)))
+        desk = self.desk
+        async with self.asking(request) as (task, _):
+            result = await self.answer(desk, task)
+        (short,) = site.shorten_names([result.pano])
+        shown = site.Entry(result, None, 0.0)
+        entry = site.document_of_entry(shown, result.pano, secrets.token_hex(16), desk.scan_map)
+        about = json.dumps({**entry, "short": short, "hasPictures": True, "thumb": None})
 
         async def lines() -> AsyncIterator[str]:
-            yield f'{{"photo": {entry}, "result": {line}}}\n'
-            with desk.at_work():
-                pictures = await work(desk.processes, Drawing(asked.task, line))
-            yield f"{pictures}\n"
+            yield f'{{"photo": {about}, "result": {result.to_json()}}}\n'
+            yield f"{await work(desk.processes, Drawing(task, result))}\n"
 
         return StreamingResponse(lines(), media_type=LINES)
 
@@ -140,9 +133,8 @@ class Service:
     async def follow(self, request: Request) -> Response:
         """Return the line of a walk's next frame, by it and the frames before."""
         name, walk = self.find_walk(request)
-        async with self.asking(request) as (asked, _):
-            frame = walk.keep(asked.task.photo, asked.content, asked.time)
-            line = await self.step(name, walk, frame)
+        async with self.asking(request) as (task, time):
+            line = await self.step(name, walk, walk.keep(task, time))
         return Response(line, media_type="application/json")
 
     async def end_walk(self, request: Request) -> Response:
@@ -174,21 +166,19 @@ class Service:
             walk.close()
 
     @asynccontextmanager
-    async def asking(self, request: Request) -> AsyncIterator[tuple[Asked, Desk]]:
-        """Yield what a request asks, and the desk that is to answer it; HTTPException if too many do."""
+    async def asking(self, request: Request) -> AsyncIterator[tuple[Task, float | None]]:
+        """Yield the photo that was sent, and the time of a frame; HTTPException if too many are."""
         self.look_for_another_scan()
         if self.num_waiting >= self.limits.max_waiting:
             raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
         self.num_waiting += 1
         try:
-            asked = await self.read(request)
-            with self.desk.at_work():
-                yield asked, self.desk
+            yield await self.read(request)
         finally:
             self.num_waiting -= 1
 
-    async def read(self, request: Request) -> Asked:
-        """Return the photo in a form of the parts `picture` and `options`."""
+    async def read(self, request: Request) -> tuple[Task, float | None]:
+        """Return the photo, and the time, in a form of the parts `picture` and `options`."""
         async with request.form(max_files=1, max_fields=1, max_part_size=MAX_OPTIONS) as form:
             picture = form.get("picture")
             text = form.get("options", "")
@@ -198,9 +188,8 @@ class Service:
             content = await picture.read()
             name = clean_name(picture.filename or "")
         options = parse_options(text)
-        photo = make_photo(name, options)
-        task = Task(photo, self.settings_of(options), {name: content})
-        return Asked(task, content, options.get("time"))
+        task = Task(make_photo(name, options), self.settings_of(options), {name: content})
+        return task, options.get("time")
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
         """Return the service's settings with a request's own in their place."""
@@ -208,24 +197,16 @@ class Service:
         assert isinstance(settings, CoarseToFineSettings)
         return apply_options(settings, options)
 
-    async def answer(self, desk: Desk, asked: Asked) -> Result:
+    async def answer(self, desk: Desk, task: Task) -> Result:
         """Localize a photo; HTTPException for one that can't be read."""
-        result: Result = (await work(desk.processes, asked.task)).result
-        if result.status in (UNREADABLE, FAILED):
-            again = (
-                {"status_code": 503, "headers": RETRY} if result.status == FAILED else {"status_code": 422}
-            )
-            raise HTTPException(detail=result.error or "", **again)
+        result: Result = (await work(desk.processes, task)).result
+        if result.status == FAILED:
+            raise HTTPException(503, result.error, RETRY)
+        if result.status == UNREADABLE:
+            raise HTTPException(422, result.error)
         if self.keep:
-            await asyncio.to_thread(self.keep_photo, self.keep, asked, result)
+            await asyncio.to_thread(keep_photo, self.keep, task, result)
         return result
-
-    def keep_photo(self, folder: Path, asked: Asked, result: Result) -> None:
-        """Write a photo into a folder, under a name that no other has, and its line after those there."""
-        path = folder / f"{sha256(asked.content).hexdigest()[:12]}-{asked.task.photo.path.name}"
-        write_atomically(path, asked.content)
-        with (folder / "results.jsonl").open("a") as file:
-            file.write(f"{replace(result, pano=str(path)).to_json()}\n")
 
     def look_for_another_scan(self) -> None:
         """Begin to open the scan again if its files are others now; until it is open the old one answers."""
@@ -239,14 +220,15 @@ class Service:
         while seen != (seen := look_at(paths)):
             await asyncio.sleep(SETTLED_S)
         try:
-            desk = await asyncio.to_thread(self.open_desk)
-            self.desk.retire()
-            self.desk = desk
+            old, self.desk = self.desk, await asyncio.to_thread(self.open_desk)
             LOG.warning("the scan was replaced: photos are localized in the new one")
         except (InputError, OSError) as error:
-            self.desk.files = seen
+            self.desk = self.desk._replace(files=seen)
             LOG.warning("the scan was replaced by one that can't be opened, the old one stays: %s", error)
-        self.reopening = None
+        else:
+            await asyncio.to_thread(old.processes.finish)
+        finally:
+            self.reopening = None
 
 
 async def work(processes: Processes, item: object) -> Any:
@@ -257,6 +239,15 @@ async def work(processes: Processes, item: object) -> Any:
         raise HTTPException(422, str(error)) from error
     except (TooSlowError, WorkerLostError) as error:
         raise HTTPException(500, f"the photo was given up: {error}") from error
+
+
+def keep_photo(folder: Path, task: Task, result: Result) -> None:
+    """Write a photo into a folder, under a name that no other has, and its line after those there."""
+    content = (task.files or {})[task.photo.name]
+    path = folder / f"{sha256(content).hexdigest()[:12]}-{task.photo.name}"
+    write_atomically(path, content)
+    with (folder / "results.jsonl").open("a") as file:
+        file.write(f"{replace(result, pano=str(path)).to_json()}\n")
 
 
 def make_app(service: Service, token: str | None) -> Starlette:

@@ -1,4 +1,4 @@
-"""What a request asks for: a photo by its name and content, and its options as JSON."""
+"""A request: a photo by its name and content, and its options as JSON."""
 
 import json
 import re

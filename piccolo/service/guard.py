@@ -1,4 +1,4 @@
-"""What every request passes: who may ask, from which page, and how much may be sent."""
+"""The guard at the door of the service: who may ask, from which page, and how much may be sent."""
 
 import asyncio
 import secrets
