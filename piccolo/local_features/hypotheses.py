@@ -201,62 +201,60 @@ def rough_poses(
         votes[k] = agreeing_weight(m, is_near, rotations[k], centers[k])
 
 
-@inline_kernel
-def count_exact(m: Matches, members: Int64s, columns: Array32, is_near: Mask, R: Array, t: Array) -> int:
-    """Count the photo's features of which a match among `members` (n,) agrees with a pose within a degree.
-
-    `columns` (6, n) are the members' points and rays; `is_near` (n,) is overwritten.
-    """
-    count = 0
-    last = -1
-    find_near(columns[:3], columns[3:], R, t, COS2_CLOSE, is_near)
-    for k in range(len(members)):
-        j = members[k]
-        if is_near[k] and m.query[j] != last and agreement(m, j, R, t, COS_EXACT) > 0.0:
-            count += 1
-            last = m.query[j]
-    return count
-
-
 @kernel
-def sample_poses(
+def count_exact(
     matches: Matches,
     members: Int64s,
     columns: Array32,
-    up_cam: Array,
-    cos_tilt: float,
-    R_best: Array,
-    t_best: Array,
-) -> int:
-    """Write the pose, (3, 3) and (3,), of three members that most members agree with; return their number.
+    rotations: Array,
+    centers: Array,
+    counts: Int64s,
+) -> None:
+    """Count for each pose (n, 3, 3), (n, 3) the photo's features that a member agrees with within a degree.
 
-    `columns` (6, n) are the members' points and rays. Poses are left out if the cosine of the angle between
+    `columns` (6, m) are the members' points and rays; the counts (n,) are written.
+    """
+    is_near = np.empty(len(members), np.bool_)
+    for n in range(len(counts)):
+        count = 0
+        last = -1
+        find_near(columns[:3], columns[3:], rotations[n], centers[n], COS2_CLOSE, is_near)
+        for k in range(len(members)):
+            j = members[k]
+            is_other = is_near[k] and matches.query[j] != last
+            if is_other and agreement(matches, j, rotations[n], centers[n], COS_EXACT) > 0.0:
+                count += 1
+                last = matches.query[j]
+        counts[n] = count
+
+
+@kernel
+def sample_poses(columns: Array32, up_cam: Array, cos_tilt: float, rotations: Array, centers: Array) -> int:
+    """Write poses (n, 3, 3), (n, 3) of three matches each, at most 4 NUM_SAMPLES; return their number.
+
+    `columns` (6, m) are points and rays of the matches. Poses are left out if the cosine of the angle between
     their vertical and `up_cam` (3,) is below `cos_tilt`. The samples are the same in every run.
     """
-    best = 0
+    num_poses = 0
     bearings = np.empty((3, 3))
     points = np.empty((3, 3))
-    rotations = np.empty((4, 3, 3))
-    centers = np.empty((4, 3))
-    is_near = np.empty(len(members), np.bool_)
     state = np.uint32(12345)
     for _ in range(NUM_SAMPLES):
         for i in range(3):
             state = np.uint32(state * np.uint32(1664525) + np.uint32(1013904223))
-            drawn = np.int64(state >> np.uint32(8)) % len(members)
+            drawn = np.int64(state >> np.uint32(8)) % columns.shape[1]
             for c in range(3):
                 points[i, c] = columns[c, drawn]
                 bearings[i, c] = columns[3 + c, drawn]
-        for k in range(p3p(bearings, points, rotations, centers)):
+        num_found = p3p(bearings, points, rotations[num_poses:], centers[num_poses:])
+        end = num_poses + num_found
+        for k in range(num_poses, end):
             R = rotations[k]
-            if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] < cos_tilt:
-                continue
-            count = count_exact(matches, members, columns, is_near, R, centers[k])
-            if count > best:
-                best = count
-                copy_to(R_best, R)
-                copy_to(t_best, centers[k])
-    return best
+            if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] >= cos_tilt:
+                copy_to(rotations[num_poses], R)
+                copy_to(centers[num_poses], centers[k])
+                num_poses += 1
+    return num_poses
 
 
 @kernel
@@ -307,12 +305,17 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
     members = find_inliers(matches, rough, COS_ROUGH)
     if len(members) < LEAST_MATCHES:
         return None
-    pose = Pose(np.empty((3, 3)), np.empty(3))
+    columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
+    rotations = np.empty((4 * NUM_SAMPLES, 3, 3))
+    centers = np.empty((4 * NUM_SAMPLES, 3))
+    counts = np.empty(sample_poses(columns, up_cam, cos_tilt, rotations, centers), np.int64)
+    count_exact(matches, members, columns, rotations, centers, counts)
+    if max(counts, default=0) < LEAST_MATCHES:
+        return None
+    best = np.argmax(counts)
+    pose = Pose(rotations[best].copy(), centers[best].copy())
     R = pose.R_cam_from_world
     t = pose.center_world
-    columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
-    if sample_poses(matches, members, columns, up_cam, cos_tilt, R, t) < LEAST_MATCHES:
-        return None
     for _ in range(2):
         members = find_inliers(matches, pose, COS_EXACT)
         rays = matches.rays[members].astype(np.float64)
