@@ -10,6 +10,7 @@ from dataclasses import fields, replace
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from starlette.applications import Starlette
@@ -36,6 +37,7 @@ from .guard import COOKIE, Guard, refuse
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
 MAX_WALKS = 4  # at once, each with a process
+IDLE_S = 600.0  # [s] after which a walk that nobody goes on with makes room for another
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
 RETRY = {"Retry-After": "2"}
 LINES = "application/x-ndjson"
@@ -119,6 +121,8 @@ class Service:
 
     async def begin_walk(self, request: Request) -> Response:
         """Begin a walk; return its name."""
+        for name in [name for name, walk in self.walks.items() if monotonic() - walk.used_s > IDLE_S]:
+            self.forget(name)
         if len(self.walks) >= MAX_WALKS:
             raise HTTPException(503, f"found {MAX_WALKS} walks at once, wanted fewer: end one", RETRY)
         options = parse_options((await request.body()).decode(errors="replace"))
@@ -149,6 +153,7 @@ class Service:
         name = request.path_params["walk"]
         if name not in self.walks:
             raise HTTPException(404, "found no such walk, wanted one that POST /walks began")
+        self.walks[name].used_s = monotonic()
         return name, self.walks[name]
 
     async def step(self, name: str, walk: WalkDesk, frame: object) -> Any:

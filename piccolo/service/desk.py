@@ -9,6 +9,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
+from time import monotonic
 from typing import Any, NamedTuple
 
 from ..batch.localizer import Answer, Localizer, Task
@@ -167,6 +168,7 @@ class WalkDesk:
         self._end = ExitStack()
         self._folder = self._end.enter_context(temporary_folder())
         self._count = 0
+        self.used_s = monotonic()  # [s] when it was asked last
 
     def keep(self, task: Task, time: float | None) -> Frame:
         """Write a frame, which lasts as long as the walk."""
