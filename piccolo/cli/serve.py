@@ -81,7 +81,8 @@ def main(arguments: Arguments) -> int:
     with listening(a.host, a.port) as server, temporary_folder() as folder:
         if not localizer.cache.is_used:  # the processes open what is prepared here
             localizer = replace(localizer, cache=CachePolicy(folder=folder))
-        service = Service(partial(open_desk, localizer, a.jobs, limits, a.workers()), limits, a.keep)
+        desk = partial(open_desk, localizer, a.jobs, limits, a.keep is not None, a.workers())
+        service = Service(desk, limits, a.keep)
         a.warn(service.desk.scan_map.warnings)
         name, port = server.getsockname()[:2]
         query = f"enter?token={token}" if token else ""

@@ -67,7 +67,9 @@ class Desk(NamedTuple):
     files: object  # what `look_at` said of the scan's files
 
 
-def open_desk(localizer: Localizer, num_jobs: int, limits: Limits, workers: Workers) -> Desk:
+def open_desk(
+    localizer: Localizer, num_jobs: int, limits: Limits, keeps_photos: bool, workers: Workers
+) -> Desk:
     """Open a scan, with its local features, so that no photo waits for these; InputError if it can't be."""
     files = look_at(localizer.paths)
     opened = localizer.open_scan(workers)
@@ -81,7 +83,8 @@ def open_desk(localizer: Localizer, num_jobs: int, limits: Limits, workers: Work
     points = scan_map.points
     extent = [[float(axis.min()), float(axis.max())] for axis in (points.x, points.y, points.z)]
     about = {"scanSha256": scan_map.scan_sha256, "scans": list(scan_map.scan_names), "extent": extent}
-    service = {"note": "", "photos": [], "service": {"maxBytes": limits.max_bytes}}
+    terms = {"maxBytes": limits.max_bytes, "keepsPhotos": keeps_photos}
+    service = {"note": "", "photos": [], "service": terms}
     answering = partial(open_answering, localizer, limits.max_pixels)
     processes = Processes(answering, num_jobs, localizer.num_threads, limits.seconds)
     for _ in range(num_jobs):
