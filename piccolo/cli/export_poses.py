@@ -114,9 +114,7 @@ def main(arguments: Arguments) -> int:
         options = options_from(arguments)
     results = read_results(arguments.results)
     beside = offset_file(arguments.out) if options.offset else None
-    points = (
-        points_file(arguments.out) if options.points and not FORMATS[arguments.format].is_folder else None
-    )
+    points = points_file(arguments.out) if options.points and arguments.format == "nerfstudio" else None
     outputs = {"--out": arguments.out, "the offset": beside, "the points": points}
     files = {Path(name) for result in results for name in (result.pano, result.cloud_name)}
     check_distinct(outputs, [*arguments.results, *files])

@@ -1,4 +1,4 @@
-"""Poses as tables, trajectories, Potree, COLMAP, nerfstudio, OpenSfM, points and tracks on maps, in JPEGs.
+"""Poses as tables, trajectories, models and recordings of other programs, points on maps, in JPEGs.
 
 Numbers are written so that the same float64 is read back. Where a format has no place for the offset, it is
 written beside it: <name>.offset.txt.
@@ -43,6 +43,7 @@ from .reconstructions import (
     write_nerfstudio,
     write_opensfm,
 )
+from .rerun_file import check_float32, write_rerun
 
 COLUMNS = (
     *("image", "cloud", "status", "confidence", "score", "x", "y", "z"),
@@ -259,7 +260,11 @@ GPX_TEXT = "track of the positions in WGS84; needs `crs` and the library pyproj"
 GPX = Format("gpx", GPX_TEXT, write_gpx, frozenset({"crs"}), has_unique_names=False, forbidden="")
 GPANO_TEXT = "copies of the JPEGs with heading, pitch and roll as Photo Sphere XMP; `out` is a new folder"
 GPANO = Format("gpano", GPANO_TEXT, write_gpano, is_folder=True, forbidden="", cameras="spheres", check=_copy)
-_ALL = COLMAP, NERFSTUDIO, OPENSFM, TUM, KITTI, CSV, GEOJSON, GPX, POTREE, GPANO
+RERUN_TEXT = "recording for Rerun's viewer, with the pictures; needs the library rerun-sdk"
+RERUN = Format(
+    "rerun", RERUN_TEXT, write_rerun, MODEL | {"points", "timestamps"}, cameras="own", check=check_float32
+)
+_ALL = COLMAP, NERFSTUDIO, OPENSFM, RERUN, TUM, KITTI, CSV, GEOJSON, GPX, POTREE, GPANO
 FORMATS: dict[str, Format] = {form.name: form for form in _ALL}
 
 
