@@ -1,7 +1,8 @@
 """Tables of given poses as programs write them, which can be written again with other poses.
 
 These are Potree's coordinates.txt, tables with omega, phi, kappa (Metashape, Pix4D), Metashape's csv with
-yaw, pitch, roll, and trajectories in TUM's form. Positions are in the scan's coordinates.
+yaw, pitch, roll, trajectories in TUM's form, and E57 files with images. Positions are in the scan's
+coordinates.
 """
 
 import re
@@ -14,16 +15,21 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
+from ..cloud.e57_poses import write_image_poses
+from ..cloud.readers.e57 import E57Image, list_images
 from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
+from ..files.atomic import write_lines
 from ..files.json_file import read_text
-from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_pose
+from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_pose, turn_axes
 from .relative_poses import COLUMNS, find_columns, naming
 
 WANTED = (
     "wanted Potree's coordinates.txt, a TUM trajectory, or a table with a header that names x, y, z and "
     "omega, phi, kappa or yaw, pitch, roll"
 )
+# of images in E57 files: a sphere's middle is its +x, a pinhole looks along -z (ASTM E2807)
+IMAGE_FROM_CAM = {"spherical": np.eye(3), "pinhole": OPENGL_FROM_CAM}
 STALE = re.compile("r[123][123]")  # a matrix beside angles
 
 
@@ -110,8 +116,8 @@ class PoseTable:
                 poses.append(check_pose(Pose(self.form.read(values), center), f"row {number}"))
         return poses
 
-    def with_poses(self, poses: Sequence[Pose]) -> str:
-        """Return the text of the file with other poses in their order; columns r11 .. r33 are left out."""
+    def write(self, out: Path, poses: Sequence[Pose]) -> None:
+        """Write the file with other poses in their order; columns r11 .. r33 are left out."""
         heads = [_split(line.lstrip("#"), self.separator) for line in self.head]
         stale = {at for words in heads for at, word in enumerate(words) if STALE.fullmatch(word)}
 
@@ -125,11 +131,37 @@ class PoseTable:
             for name, value in zip((*"xyz", *self.form.names), values, strict=True):
                 words[self.columns[name]] = repr(float(value))
             lines.append(join(words))
-        return "".join(f"{line}\n" for line in lines)
+        write_lines(out, lines)
 
 
-def read_pose_table(path: Path) -> PoseTable:
-    """Return the table of poses in a file, its columns by a header, else by their number."""
+@dataclass(frozen=True)
+class ImagePoses:
+    """The images of an E57 file that have a pose, as spheres and pinholes."""
+
+    path: Path
+    rows: tuple[E57Image, ...]
+    times: None = None
+
+    def column(self, name: str) -> list[str] | None:
+        """Return the names of the files that tools/e57_images.py writes; None of another column."""
+        return [image.file_name for image in self.rows] if name == "name" else None
+
+    @property
+    def poses(self) -> list[Pose]:
+        """The given poses, turned to our camera axes."""
+        return [turn_axes(image.pose, IMAGE_FROM_CAM[image.kind].T) for image in self.rows if image.pose]
+
+    def write(self, out: Path, poses: Sequence[Pose]) -> None:
+        """Write a copy of the file with other poses in their order."""
+        turned = [turn_axes(p, IMAGE_FROM_CAM[row.kind]) for row, p in zip(self.rows, poses, strict=True)]
+        write_image_poses(self.path, out, {row.node[0]: p for row, p in zip(self.rows, turned, strict=True)})
+
+
+def read_pose_table(path: Path) -> PoseTable | ImagePoses:
+    """Return the table of poses in a file, its columns by a header, else by their number; or an E57's."""
+    if path.suffix.lower() == ".e57":
+        posed = tuple(image for image in list_images(path) if image.pose and image.kind in IMAGE_FROM_CAM)
+        return ImagePoses(path, posed)
     lines = read_text(path, WANTED).splitlines()
     text = next((line for line in reversed(lines) if line.strip()), "")
     separator = next((mark for mark in ("\t", ",", ";") if text.count(mark) >= len(OPK) - 1), " ")

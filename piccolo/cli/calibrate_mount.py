@@ -10,22 +10,21 @@ import numpy as np
 from ..arrays import Array
 from ..batch.inputs import times_of
 from ..batch.mount import Sighting, Trajectory, fit_mount
-from ..batch.pose_table import PoseTable, read_pose_table
+from ..batch.pose_table import ImagePoses, PoseTable, read_pose_table
 from ..batch.relative_poses import match_names
 from ..errors import InputError
-from ..files.atomic import write_atomically
 from ..geometry.pose import log_so3, quaternion_wxyz
 from ..result import Result, read_results
-from .command import Arguments, check_outputs, command, option
+from .command import Arguments, check_outputs, check_suffix, command, option
 
 EPILOG = """\
 example:
   python tools/calibrate_mount.py --results poses.jsonl --given coordinates.txt --out corrected.txt
 
 Given poses are in the scan's coordinates: Potree's coordinates.txt, a table with a header that names x, y, z
-and omega, phi, kappa or yaw, pitch, roll [deg] (Metashape, Pix4D), or a trajectory in TUM's form (time x y z
-qx qy qz qw), which needs the photos' times. Photos are found by their names. --out has the same rows, the
-camera's poses in place of the given ones.
+and omega, phi, kappa or yaw, pitch, roll [deg] (Metashape, Pix4D), a trajectory in TUM's form (time x y z qx
+qy qz qw), which needs the photos' times, or an E57 file, whose images tools/e57_images.py writes. Photos are
+found by their names. --out is the same file with the camera's poses in place of the given ones.
 
 Prints one JSON object: cam_from_body as a quaternion and a rotation vector [deg], axes of both +x forward, +y
 left, +z up, as those of the camera that the given poses mean; the lever arm [m] in the body's axes; the clock
@@ -46,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def find_times(
-    results: Sequence[Result], table: PoseTable, clock: Array, source: str | None
+    results: Sequence[Result], table: PoseTable | ImagePoses, clock: Array, source: str | None
 ) -> list[float | None]:
     """Return the time of each photo; None of one that the table has not."""
     photos = [Path(result.pano) for result in results]
@@ -65,6 +64,8 @@ def main(arguments: Arguments) -> int:
     outputs = {"--out": arguments.out}
     check_outputs(outputs, [*arguments.results, arguments.given])
     table = read_pose_table(arguments.given)
+    if isinstance(table, ImagePoses):
+        check_suffix("--out", arguments.out, (".e57",))
     times = table.times
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
@@ -78,7 +79,7 @@ def main(arguments: Arguments) -> int:
     fit = fit_mount(list(sightings.values()), trajectory)
     if arguments.out:
         poses = [fit.cam_from_body @ trajectory.at(float(time) + fit.clock) for time in clock]
-        write_atomically(arguments.out, table.with_poses(poses).encode())
+        table.write(arguments.out, poses)
     std = np.sqrt(np.diag(fit.covariance))
     R = fit.cam_from_body.R_cam_from_world
     report = {

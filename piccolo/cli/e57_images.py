@@ -1,7 +1,6 @@
 """List the images inside an E57 file, one JSON object a line, and write them as files if asked."""
 
 import json
-import re
 from argparse import ArgumentParser
 from pathlib import Path
 
@@ -19,7 +18,6 @@ example:
 is_usable: the image is spherical, so localize.py can read it; fov_deg is 360 for a full sphere.
 pose: that of the file, x_world = R_world_from_image @ x_image + center_world.
 """
-SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 
 
 def image_json(index: int, image: E57Image) -> dict[str, object]:
@@ -45,16 +43,15 @@ def main(arguments: Arguments) -> int:
     check_folder_name("--extract", arguments.extract)
     images = list_images(arguments.e57)
     exit_code = 0
-    stem = re.sub(r"[^\w.-]", "_", arguments.e57.stem)
-    names = [f"{stem}_{index}{SUFFIX[image.encoding]}" for index, image in enumerate(images)]
     if arguments.extract:
-        check_distinct({name: arguments.extract / name for name in names}, [arguments.e57])
+        files = {image.file_name: arguments.extract / image.file_name for image in images}
+        check_distinct(files, [arguments.e57])
         arguments.extract.mkdir(exist_ok=True)
     for index, image in enumerate(images):
         row = image_json(index, image)
         if arguments.extract:
             try:
-                file = arguments.extract / names[index]
+                file = files[image.file_name]
                 write_atomically(file, read_image(arguments.e57, index))
                 row["file"] = str(file)
             except InputError as error:

@@ -1,6 +1,7 @@
 """E57 files, decoded by libE57: the coloured points of all scans, each at its pose, and the images."""
 
 import math
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
@@ -44,6 +45,7 @@ KINDS = {
     "cylindrical": "cylindricalRepresentation",
     "visual-reference": "visualReferenceRepresentation",
 }
+SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 ENCODINGS = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
 MAX_SIDE = 1 << 20  # [px]
 
@@ -236,6 +238,7 @@ def _read_scan(file: E57File, scan: E57Scan) -> Iterator[dict[str, Array]]:
 class E57Image(NamedTuple):
     """One representation of one image of a file."""
 
+    file_name: str  # of what tools/e57_images.py writes
     name: str
     kind: str  # of KINDS
     encoding: str  # of ENCODINGS
@@ -250,8 +253,11 @@ class E57Image(NamedTuple):
 
 def list_images(path: Path) -> list[E57Image]:
     """Return the images of an E57 file, in the order of the file."""
+    stem = re.sub(r"[^\w.-]", "_", path.stem)
     with open_file(path) as file:
-        return list(_images(file))
+        images = list(_images(file))
+    names = [f"{stem}_{index}{SUFFIX[image.encoding]}" for index, image in enumerate(images)]
+    return [image._replace(file_name=name) for image, name in zip(images, names, strict=True)]
 
 
 def read_image(path: Path, index: int) -> bytes:
@@ -286,6 +292,7 @@ def _images(file: E57File) -> Iterator[E57Image]:
         if kind == "spherical" and across is not None and down is not None:
             fov_deg = math.degrees(across * width), math.degrees(down * height)
         yield E57Image(
+            file_name="",
             name=_text(element, "name"),
             kind=kind,
             encoding=encoding,

@@ -70,6 +70,11 @@ def refusing(path: Path, libe57: ModuleType) -> Iterator[None]:
 
 def read_xml(path: Path) -> Element:
     """Return the root of a file's XML section."""
+    return _parse_xml(path, read_section(path))
+
+
+def read_section(path: Path) -> bytes:
+    """Return a file's XML section; InputError if the header is damaged."""
     with path.open("rb") as file:
         head = file.read(HEADER.size)
         if len(head) < HEADER.size or not head.startswith(MAGIC):
@@ -88,7 +93,7 @@ def read_xml(path: Path) -> Element:
         file.seek(offset - offset % PAGE_SIZE)
         pages = file.read(num_bytes)
     content = b"".join(pages[k : k + PAGE_CONTENT] for k in range(0, len(pages), PAGE_SIZE))
-    return _parse_xml(path, content[offset % PAGE_SIZE :][:length])
+    return content[offset % PAGE_SIZE :][:length].rstrip(b"\0")
 
 
 class _Limited(TreeBuilder):
@@ -125,7 +130,7 @@ class _Limited(TreeBuilder):
 def _parse_xml(path: Path, xml: bytes) -> Element:
     parser = XMLParser(target=_Limited())
     try:
-        parser.feed(xml.rstrip(b"\0"))
+        parser.feed(xml)
         root = parser.close()
     except (ParseError, ValueError, LookupError) as error:
         raise InputError(f"{path}: the XML section is broken ({quote_line(str(error).encode())})") from error
