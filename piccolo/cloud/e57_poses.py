@@ -5,7 +5,6 @@ The new XML section is appended, with its checksums (CRC-32C), and the header le
 
 import shutil
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.dom import minidom
@@ -14,9 +13,15 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..files.atomic import replacing
-from ..geometry.pose import Pose
+from ..geometry.pose import Pose, quaternion_wxyz
 from .readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section, read_xml
 
+POSE = f"""\
+<pose type="Structure">
+<rotation type="Structure">{"".join(f'<{name} type="Float">%r</{name}>' for name in "wxyz")}</rotation>
+<translation type="Structure">{"".join(f'<{name} type="Float">%r</{name}>' for name in "xyz")}</translation>
+</pose>
+"""
 POLYNOMIAL = 0x82F63B78  # of CRC-32C, reflected
 
 
@@ -24,14 +29,15 @@ def write_image_poses(path: Path, out: Path, poses: Mapping[int, Pose]) -> None:
     """Write a copy of an E57 file with poses of images by their numbers in images2D, in the images' axes."""
     read_xml(path)  # refuses what no parser should read
     xml = _with_poses(read_section(path), poses)
+    pages = _seal(xml)
     size = path.stat().st_size
     with path.open("rb") as old, replacing(out) as file:
         shutil.copyfileobj(old, file)
-        file.write(_seal(xml))
+        file.write(pages)
         file.seek(0)
         page = bytearray(file.read(PAGE_CONTENT))
         magic, major, minor, *_, page_size = HEADER.unpack_from(page)
-        HEADER.pack_into(page, 0, magic, major, minor, size + len(_seal(xml)), size, len(xml), page_size)
+        HEADER.pack_into(page, 0, magic, major, minor, size + len(pages), size, len(xml), page_size)
         file.seek(0)
         file.write(_seal(bytes(page)))
 
@@ -44,21 +50,10 @@ def _with_poses(xml: bytes, poses: Mapping[int, Pose]) -> bytes:
     for number, pose in poses.items():
         for old in [node for node in elements[number].childNodes if node.nodeName == "pose"]:
             elements[number].removeChild(old)
-        rotation = Pose(pose.R_cam_from_world.T, pose.center_world).quaternion_wxyz
-        parts = {"rotation": ("wxyz", rotation), "translation": ("xyz", pose.center_world)}
-        text = "".join(
-            f'<{part} type="Structure">{_floats(names, values.tolist())}</{part}>'
-            for part, (names, values) in parts.items()
-        )
-        new: Any = minidom.parseString(f'<pose type="Structure">{text}</pose>').documentElement
+        text = POSE % (*quaternion_wxyz(pose.R_cam_from_world.T).tolist(), *pose.center_world.tolist())
+        new: Any = minidom.parseString(text).documentElement
         elements[number].appendChild(document.importNode(new, True))
     return document.toxml(encoding="UTF-8")
-
-
-def _floats(names: str, values: list[float]) -> str:
-    return "".join(
-        f'<{name} type="Float">{value!r}</{name}>' for name, value in zip(names, values, strict=True)
-    )
 
 
 def _seal(content: bytes) -> bytes:
@@ -67,14 +62,8 @@ def _seal(content: bytes) -> bytes:
     pages = np.frombuffer(filled, np.uint8).reshape(-1, PAGE_CONTENT)
     crc = np.full(len(pages), 0xFFFFFFFF, np.uint32)
     for column in pages.T:
-        crc = _crc_table()[(crc ^ column) & 255] ^ (crc >> np.uint32(8))
+        crc ^= column
+        for _ in range(8):
+            crc = (crc >> np.uint32(1)) ^ (crc & 1) * np.uint32(POLYNOMIAL)
     sums: Bytes = (~crc).astype(">u4").view(np.uint8).reshape(-1, PAGE_SIZE - PAGE_CONTENT)
     return np.hstack([pages, sums]).tobytes()
-
-
-@cache
-def _crc_table() -> np.ndarray[tuple[int], np.dtype[np.uint32]]:
-    table = np.arange(256, dtype=np.uint32)
-    for _ in range(8):
-        table = (table >> np.uint32(1)) ^ np.where(table & 1, np.uint32(POLYNOMIAL), np.uint32(0))
-    return table

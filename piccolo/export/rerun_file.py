@@ -45,11 +45,8 @@ def write_rerun(images: Sequence[PosedImage], out: Path, options: Options) -> No
     for image in images:
         is_timed = _set_time(recording, image, options)
         place = ["photos", *image.name.split("/")]
-        confidence = image.result.confidence
-        for part in (*_frame(rr, image), rr.AnyValues(status=image.result.status, confidence=confidence)):
-            recording.log(place, part, static=not is_timed)
-        for part in _picture(rr, image, options):
-            recording.log([*place, "image"], part, static=not is_timed)
+        recording.log(place, *_frame(rr, image), static=not is_timed)
+        recording.log([*place, "image"], *_picture(rr, image, options), static=not is_timed)
     write_atomically(out, content.read())
 
 
@@ -67,50 +64,44 @@ def _set_time(recording: Any, image: PosedImage, options: Options) -> bool:
     if options.timestamps != "index":
         recording.set_time("time", duration=float(image.time))
     elif taken is not None:
-        moment = datetime.fromisoformat(taken)
-        moment = moment if moment.tzinfo else moment.replace(tzinfo=UTC)
-        recording.set_time("taken", timestamp=moment)
+        time = datetime.fromisoformat(taken)
+        recording.set_time("taken", timestamp=time if time.tzinfo else time.replace(tzinfo=UTC))
     return options.timestamps != "index" or taken is not None
 
 
 def _frame(rr: Any, image: PosedImage) -> list[Any]:
-    """Return the camera's place, its axes, and a point with its name."""
+    """Return the camera's place and axes, a point with its name, and how sure it is."""
     pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
     transform = rr.Transform3D(translation=pose.center_world, mat3x3=pose.R_cam_from_world.T)
     label = rr.Points3D([[0.0, 0.0, 0.0]], labels=[image.name], show_labels=False, radii=2.0 * POINT)
-    return [transform, rr.TransformAxes3D(SHOWN), label]
+    sure = rr.AnyValues(status=image.result.status, confidence=image.result.confidence)
+    return [transform, rr.TransformAxes3D(SHOWN), label, sure]
 
 
 def _picture(rr: Any, image: PosedImage, options: Options) -> list[Any]:
-    """Return the pinhole without distortion, if there is one, and the picture, unless `size` replaces it."""
+    """Return the pinhole, if the lens is one, and the picture as it takes it; with `size` none is opened."""
+    lens = image.lens.scale_to_width(min(image.lens.width, MAX_WIDTH))
+    size = lens.width, lens.height
     parts = []
-    camera = image.camera
-    is_pinhole = camera is not None and camera.lens == PERSPECTIVE
-    rgb = None if options.size else read_picture(image.path).rgb
-    if camera is not None and is_pinhole:
-        camera = camera.scale_to_width(min(camera.width, MAX_WIDTH))
-        size = camera.width, camera.height
-        wide = {"focal_length": camera.focal, "principal_point": camera.center, "resolution": size}
-        parts.append(rr.Pinhole(**wide, image_plane_distance=SHOWN))
-    elif rgb is not None:
-        width = min(rgb.shape[1], MAX_WIDTH)
-        size = width, max(1, round(width * rgb.shape[0] / rgb.shape[1]))
-    if rgb is not None:
-        rgb = np.asarray(cv2.resize(rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
-        rgb = _undistort(rgb, camera) if camera is not None and is_pinhole else rgb
-        parts.append(rr.EncodedImage(contents=encode_image(rgb, ".jpg"), media_type="image/jpeg"))
+    if lens.lens == PERSPECTIVE:
+        own = {"focal_length": lens.focal, "principal_point": lens.center, "resolution": size}
+        parts.append(rr.Pinhole(**own, image_plane_distance=SHOWN))
+    if options.size is None:
+        rgb = np.asarray(
+            cv2.resize(read_picture(image.path).rgb, size, interpolation=cv2.INTER_AREA), np.uint8
+        )
+        content = encode_image(_undistort(rgb, lens), ".jpg")
+        parts.append(rr.EncodedImage(contents=content, media_type="image/jpeg"))
     return parts
 
 
-def _undistort(rgb: Bytes, camera: Camera) -> Bytes:
-    """Return a camera's picture as a pinhole of its focal length takes it, black where it shows nothing."""
-    if camera.distortion == Distortion():
+def _undistort(rgb: Bytes, lens: Camera) -> Bytes:
+    """Return a picture as a pinhole takes it, black where the lens shows nothing; of other lenses itself."""
+    if lens.lens != PERSPECTIVE or lens.distortion == Distortion():
         return rgb
-    u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    x, y = (
-        (pixels - middle) / f for pixels, middle, f in zip((u, v), camera.center, camera.focal, strict=True)
-    )
-    places, is_in = camera.pixels(np.stack([np.ones_like(x), -x, -y], axis=-1))
+    ideal = Camera("PINHOLE", lens.width, lens.height, (*lens.focal, *lens.center))
+    grid = np.stack(np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5), axis=-1)
+    places, is_in = lens.pixels(ideal.rays(grid)[0])
     columns, rows = np.moveaxis(places.astype(np.float32) - np.float32(0.5), -1, 0)
     found = np.asarray(cv2.remap(rgb, columns, rows, cv2.INTER_LINEAR), np.uint8)
     found[~is_in] = 0
