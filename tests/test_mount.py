@@ -16,6 +16,7 @@ from piccolo.cloud.readers.e57 import read_image
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.geometry.pose import (
     Pose,
+    angle_between,
     exp_so3,
     pose_errors,
     rotation_from_quaternion_wxyz,
@@ -158,6 +159,42 @@ def test_a_trajectory_and_photos_with_times_in_their_names(tmp_path, capsys):
     assert pose_errors(written.poses[at], MOUNT @ body_at(10.0 + CLOCK)) < (0.06, 0.02)
     assert calibrate_mount.main(arguments[:4]) == 3
     assert "--times: found none" in capsys.readouterr().err
+
+
+def test_a_mount_on_a_base_with_x_ahead_has_the_axes_of_the_base(tmp_path, capsys):
+    """Poses of a base as ROS has them, written by their own matrix: forward, left, up in the world."""
+    times = np.linspace(0.0, 20.0, 12)
+    mount = Pose(yaw_rotation(2.0) @ MOUNT.R_cam_from_world, np.array([0.1, 0.2, 0.5]))
+    bases = [Pose(yaw_rotation(0.6 * time), ORIGIN + np.array([time, 0.1 * time**2, 0.0])) for time in times]
+    rows = []
+    for time, base in zip(times, bases, strict=True):
+        w, x, y, z = Pose(base.R_cam_from_world.T, np.zeros(3)).quaternion_wxyz.tolist()
+        rows.append(" ".join(map(repr, [float(time), *base.center_world.tolist(), x, y, z, w])))
+    given = tmp_path / "base.txt"
+    given.write_text("\n".join(rows) + "\n")
+    photos = [result(f"{t}.jpg", mount @ base) for t, base in zip(times, bases, strict=True)]
+    results = write_results(tmp_path / "r.jsonl", photos)
+    words = ["--results", str(results), "--given", str(given), "--times", "names"]
+    outs = [tmp_path / "1.txt", tmp_path / "2.txt"]
+    assert calibrate_mount.main([*words, "--out", str(outs[0])]) == 0
+    wrong, err = capsys.readouterr()
+    assert f"{given}: found poses that turn about their z, as those of a base do whose z is up (ROS)" in err
+    assert "then give --axes piccolo" in err
+    assert calibrate_mount.main([*words, "--axes", "piccolo", "--out", str(outs[1])]) == 0
+    out, err = capsys.readouterr()
+    assert err == ""
+    report, other = json.loads(out), json.loads(wrong)
+    assert report["lever_arm_m"] == pytest.approx([0.1, 0.2, 0.5], abs=1e-5)
+    z, x, y = other["std_m"]  # of forward, left, up, as which they were read
+    assert report["std_m"] == pytest.approx([x, y, z])
+    R = rotation_from_quaternion_wxyz(report["quaternion_wxyz_cam_from_body"])
+    assert angle_between(R, mount.R_cam_from_world) < 1e-5
+    assert outs[0].read_text() == outs[1].read_text()  # of the camera, right, down, forward
+    for photo, pose in zip(photos, read_pose_table(outs[1]).poses, strict=True):
+        assert pose_errors(pose, photo.pose) == pytest.approx((0.0, 0.0), abs=1e-5)
+    given.write_text(_text_of("opk", ["a.jpg"], [0.0], bases[:1]))
+    assert calibrate_mount.main([*words, "--axes", "piccolo"]) == 2
+    assert "--axes: not an option of tables with angles" in capsys.readouterr().err
 
 
 def test_what_is_no_table_and_too_few_photos_are_refused(tmp_path):

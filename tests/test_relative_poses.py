@@ -14,7 +14,7 @@ from piccolo.batch.relative_poses import find_scale, read_odometry, read_relativ
 from piccolo.errors import InputError
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
-from piccolo.geometry.pose import rotation_from_quaternion_wxyz
+from piccolo.geometry.pose import exp_so3, quaternion_wxyz, rotation_from_quaternion_wxyz, yaw_rotation
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
 PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]
@@ -215,6 +215,32 @@ def test_one_clock_goes_before_the_time_since_the_first_frame_and_without_one_th
         found = read_odometry(path, [Path("a.jpg")] * len(times), np.array(times, float), has_clock)
         expected = times if has_clock else step * np.arange(10)
         np.testing.assert_allclose([pose.center_world[0] for pose in found], expected, atol=1e-6)
+
+
+def _turning(path, axes):
+    """What turns once about the vertical, and sways by 5 degrees; axes (3, 3) by forward, left, up."""
+    world = exp_so3(np.array([1.0, -2.0, 0.5]))
+    lines = []
+    for k in range(24):
+        sway = exp_so3(np.radians([5.0 * np.sin(k), 5.0 * np.cos(k), 0.0]))
+        w, x, y, z = quaternion_wxyz(world @ yaw_rotation(k * np.pi / 12.0).T @ sway @ axes)
+        lines.append(f"{k} {0.1 * k} 0 0 {x} {y} {z} {w}\n")
+    return _write(path, "".join(lines))
+
+
+def test_poses_of_a_base_are_told_from_those_of_a_camera(tmp_path, caplog):
+    photos = [Path(f"{k}.jpg") for k in range(3)]
+    base = _turning(tmp_path / "base.txt", np.eye(3))
+    camera = _turning(
+        tmp_path / "camera.txt", np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    )
+    for path in (base, camera, _trajectory(tmp_path / "still.txt", np.arange(3.0))):
+        read_odometry(path, photos, [0.0, 1.0, 2.0])
+    read_relative_poses(base, photos)
+    read_relative_poses(camera, photos)
+    text = "found poses that turn about their z, as those of a base do whose z is up (ROS), wanted a camera's"
+    starts = [record.getMessage()[: len(f"{base}: {text}")] for record in caplog.records]
+    assert starts == [f"{base}: {text}"] * 2
 
 
 def test_what_is_no_odometry_of_the_frames_is_refused(tmp_path):

@@ -1,5 +1,6 @@
 """Relative poses of photos, as other tools write them."""
 
+import logging
 import math
 import re
 from collections import defaultdict
@@ -43,6 +44,10 @@ COLUMNS = {  # of a header, without what is no letter
     **{f"q{axis}": re.compile(f"(q|rot|ori|quat).*{axis}") for axis in "xyzw"},
 }
 NOT_IN_NAMES = re.compile(r"[\[(].*|[^a-z]")
+LOG = logging.getLogger("piccolo")
+TURNING = "found poses that turn about their z, as those of a base do whose z is up (ROS)"
+LEVEL = math.cos(math.radians(15.0))  # of an axis that stays as it is while the others turn
+TURNED = math.cos(math.radians(45.0))
 UNIT_LENGTH = 0.01  # by which the length of a quaternion may differ from 1
 NamedPose = tuple[str, Pose]
 Value = TypeVar("Value")
@@ -110,7 +115,7 @@ def read_odometry(
         rows = _rows(path)
         is_kitti = all(len(row) == NUM_KITTI for row in rows)
         with naming(path, ODOMETRY):
-            poses = [read_kitti_row(row) if is_kitti else read_tum_row(row) for row in rows]
+            poses = [read_kitti_row(row) for row in rows] if is_kitti else _read_tum(path, rows)
             clock = np.array([] if is_kitti else [row[0] for row in rows], float)
         numbers = match_times(clock, np.array(times, float), has_clock, len(poses) == len(frames))
         found = [None if k is None else poses[k][1] for k in numbers]
@@ -134,6 +139,23 @@ def find_nearest(clock: Array, times: Array) -> list[int | None]:
     slack = 0.5 * float(np.median(np.diff(times))) if len(times) > 1 else 0.0
     nearest = [int(np.abs(clock - time).argmin()) for time in times]
     return [k if abs(clock[k] - time) <= slack else None for k, time in zip(nearest, times, strict=True)]
+
+
+def turn_about_view(poses: Sequence[Pose]) -> bool:
+    """Return True if poses turn about what was read as their view: of a base with z up it is the vertical."""
+    axes = np.array([pose.R_cam_from_world for pose in poses])  # (N, 3, 3): forward, left, up in the world
+    middle = axes[:, 0].sum(axis=0)
+    is_level = (axes[:, 0] @ middle).min() > LEVEL * np.linalg.norm(middle)
+    return bool(is_level and (axes[:, 1] @ axes[0, 1]).min() < TURNED)
+
+
+def _read_tum(path: Path, rows: Sequence[Sequence[str]]) -> list[NamedPose]:
+    """Return the poses of rows with their times; a warning is logged if they seem to be of a base."""
+    poses = [read_tum_row(row) for row in rows]
+    if len(poses) > 1 and turn_about_view([pose for _, pose in poses]):
+        wanted = "wanted a camera's: x right, y down, z ahead, as tools/calibrate_mount.py writes them"
+        LOG.warning("%s: %s, %s", path, TURNING, wanted)
+    return poses
 
 
 @contextmanager
@@ -181,7 +203,7 @@ def read_lines(path: Path) -> list[NamedPose]:
             return [read_colmap_row(row) for row in rows if not all(map(is_number, row))]  # else points
         if _are_hloc(rows):
             return [read_colmap_row(["", *row[1:], "", row[0]]) for row in rows]
-        return [read_tum_row(row) for row in rows]
+        return _read_tum(path, rows)
 
 
 def read_xml(path: Path) -> ElementTree.Element:

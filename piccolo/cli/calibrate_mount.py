@@ -11,11 +11,11 @@ from ..arrays import Array
 from ..batch.inputs import times_of
 from ..batch.mount import Sighting, Trajectory, fit_mount
 from ..batch.pose_table import ImagePoses, PoseTable, read_pose_table
-from ..batch.relative_poses import match_names
+from ..batch.relative_poses import TURNING, match_names, turn_about_view
 from ..errors import InputError
-from ..geometry.pose import log_so3, quaternion_wxyz
+from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, log_so3, quaternion_wxyz
 from ..result import Result, read_results
-from .command import Arguments, check_outputs, check_suffix, command, option
+from .command import Arguments, UsageError, check_outputs, check_suffix, command, option
 
 EPILOG = """\
 example:
@@ -38,6 +38,10 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     option(parser, "--given FILE", "given poses, see below", required=True)
     option(parser, "--out FILE", "write the file again with the mount applied")
+    text = (
+        "a trajectory's axes: optical (default): right, down, forward; piccolo: forward, left, up, as ROS has"
+    )
+    option(parser, "--axes", text, choices=CAMERA_AXES)
     text = (
         "times of photos, for a trajectory: exif, names (the last number in each) or a CSV file of name and "
     )
@@ -66,6 +70,11 @@ def main(arguments: Arguments) -> int:
     table = read_pose_table(arguments.given)
     if isinstance(table, ImagePoses):
         check_suffix("--out", arguments.out, (".e57",))
+    is_trajectory = isinstance(table, PoseTable) and not table.form.axes
+    if arguments.axes and not is_trajectory:
+        raise UsageError("--axes: not an option of tables with angles or E57 files, whose axes are known")
+    if is_trajectory and not arguments.axes and turn_about_view(table.poses):
+        arguments.note(f"{arguments.given}: {TURNING}; then give --axes piccolo")
     times = table.times
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
@@ -81,14 +90,18 @@ def main(arguments: Arguments) -> int:
         poses = [fit.cam_from_body @ trajectory.at(float(time) + fit.clock) for time in clock]
         table.write(arguments.out, poses)
     std = np.sqrt(np.diag(fit.covariance))
-    R = fit.cam_from_body.R_cam_from_world
+    mount = fit.cam_from_body
+    if arguments.axes == "piccolo":  # they were read as optical ones
+        mount = mount @ Pose(OPTICAL_FROM_CAM.T, np.zeros(3))
+        std[3:6] = np.abs(OPTICAL_FROM_CAM) @ std[3:6]
+    R = mount.R_cam_from_world
     report = {
         "photos": len(sightings),
         "contradicting": list(compress(sightings, fit.is_odd)),
         "quaternion_wxyz_cam_from_body": quaternion_wxyz(R).tolist(),
         "rotation_deg": np.degrees(log_so3(R)).tolist(),
         "std_deg": np.degrees(std[:3]).tolist(),
-        "lever_arm_m": fit.cam_from_body.center_world.tolist(),
+        "lever_arm_m": mount.center_world.tolist(),
         "std_m": std[3:6].tolist(),
         "clock_s": fit.clock if trajectory.has_clock else None,
         "std_s": float(std[6]) if trajectory.has_clock else None,

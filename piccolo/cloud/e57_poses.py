@@ -64,6 +64,6 @@ def _seal(content: bytes) -> bytes:
     for column in pages.T:
         crc ^= column
         for _ in range(8):
-            crc = (crc >> np.uint32(1)) ^ (crc & 1) * np.uint32(POLYNOMIAL)
+            crc = (crc >> np.uint32(1)) ^ (crc & np.uint32(1)) * np.uint32(POLYNOMIAL)
     sums: Bytes = (~crc).astype(">u4").view(np.uint8).reshape(-1, PAGE_SIZE - PAGE_CONTENT)
     return np.hstack([pages, sums]).tobytes()
