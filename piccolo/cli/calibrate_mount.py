@@ -38,9 +38,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     option(parser, "--given FILE", "given poses, see below", required=True)
     option(parser, "--out FILE", "write the file again with the mount applied")
-    text = (
-        "a trajectory's axes: optical (default): right, down, forward; piccolo: forward, left, up, as ROS has"
-    )
+    text = "axes of a trajectory: optical (default): right, down, forward; piccolo: forward, left, up (ROS)"
     option(parser, "--axes", text, choices=CAMERA_AXES)
     text = (
         "times of photos, for a trajectory: exif, names (the last number in each) or a CSV file of name and "

@@ -16,12 +16,9 @@ from ..files.atomic import replacing
 from ..geometry.pose import Pose, quaternion_wxyz
 from .readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section, read_xml
 
-POSE = f"""\
-<pose type="Structure">
-<rotation type="Structure">{"".join(f'<{name} type="Float">%r</{name}>' for name in "wxyz")}</rotation>
-<translation type="Structure">{"".join(f'<{name} type="Float">%r</{name}>' for name in "xyz")}</translation>
-</pose>
-"""
+ROTATION, TRANSLATION = ("".join(f'<{k} type="Float">%r</{k}>' for k in names) for names in ("wxyz", "xyz"))
+POSE = f"""<pose type="Structure"><rotation type="Structure">{ROTATION}</rotation>
+<translation type="Structure">{TRANSLATION}</translation></pose>"""
 POLYNOMIAL = 0x82F63B78  # of CRC-32C, reflected
 
 
@@ -58,8 +55,7 @@ def _with_poses(xml: bytes, poses: Mapping[int, Pose]) -> bytes:
 
 def _seal(content: bytes) -> bytes:
     """Return whole pages with their checksums, the last filled with zeros."""
-    filled = content + bytes(-len(content) % PAGE_CONTENT)
-    pages = np.frombuffer(filled, np.uint8).reshape(-1, PAGE_CONTENT)
+    pages = np.frombuffer(content + bytes(-len(content) % PAGE_CONTENT), np.uint8).reshape(-1, PAGE_CONTENT)
     crc = np.full(len(pages), 0xFFFFFFFF, np.uint32)
     for column in pages.T:
         crc ^= column

@@ -44,8 +44,11 @@ def write_rerun(images: Sequence[PosedImage], out: Path, options: Options) -> No
         recording.log("scan", rr.Points3D(found.xyz, colors=found.rgb, radii=POINT), static=True)
     for image in images:
         is_timed = _set_time(recording, image, options)
+        pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
+        transform = rr.Transform3D(translation=pose.center_world, mat3x3=pose.R_cam_from_world.T)
+        sure = rr.AnyValues(status=image.result.status, confidence=image.result.confidence)
         place = ["photos", *image.name.split("/")]
-        recording.log(place, *_frame(rr, image), static=not is_timed)
+        recording.log(place, transform, rr.TransformAxes3D(SHOWN), sure, static=not is_timed)
         recording.log([*place, "image"], *_picture(rr, image, options), static=not is_timed)
     write_atomically(out, content.read())
 
@@ -63,19 +66,11 @@ def _set_time(recording: Any, image: PosedImage, options: Options) -> bool:
     taken = image.result.source.capture_time
     if options.timestamps != "index":
         recording.set_time("time", duration=float(image.time))
-    elif taken is not None:
+        return True
+    if taken is not None:
         time = datetime.fromisoformat(taken)
         recording.set_time("taken", timestamp=time if time.tzinfo else time.replace(tzinfo=UTC))
-    return options.timestamps != "index" or taken is not None
-
-
-def _frame(rr: Any, image: PosedImage) -> list[Any]:
-    """Return the camera's place and axes, a point with its name, and how sure it is."""
-    pose = turn_axes(image.pose, OPTICAL_FROM_CAM)
-    transform = rr.Transform3D(translation=pose.center_world, mat3x3=pose.R_cam_from_world.T)
-    label = rr.Points3D([[0.0, 0.0, 0.0]], labels=[image.name], show_labels=False, radii=2.0 * POINT)
-    sure = rr.AnyValues(status=image.result.status, confidence=image.result.confidence)
-    return [transform, rr.TransformAxes3D(SHOWN), label, sure]
+    return taken is not None
 
 
 def _picture(rr: Any, image: PosedImage, options: Options) -> list[Any]:
