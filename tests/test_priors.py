@@ -113,6 +113,8 @@ def test_a_photo_says_what_it_is_and_when_and_where_it_was_taken(tmp_path):
     assert photo.gps == GpsPosition(pytest.approx(-48.5), pytest.approx(9.75), 4.0)
     bare = read_photo_facts(write_photo(tmp_path / "b.jpg", rgb, time=("soon", "", "")))
     assert (bare.capture_time, bare.gps) == (None, None)
+    unset = read_photo_facts(write_photo(tmp_path / "d.jpg", rgb, time=("0000:00:00 00:00:00", "", "")))
+    assert unset.capture_time is None
     assert read_photo_facts(write_photo(tmp_path / "c.jpg", rgb, (0.0, 0.0))).gps is None
 
 

@@ -11,27 +11,32 @@ from importlib import import_module
 from pathlib import Path
 
 import cv2
+import e57_files
 import numpy as np
 import pycolmap
 import pytest
 import rooms
 from batches import ROOT, main_of
+from e57_files import ImageToWrite, ScanToWrite
 from poses import result, write_results
 
 from piccolo.cli.command import new_parser, parse
+from piccolo.cloud.readers.e57 import list_images
 from piccolo.cloud.writers import vertex_rows
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.export.formats import export, tum_lines
 from piccolo.export.posed_images import Options
-from piccolo.geometry.pose import Pose, yaw_rotation
+from piccolo.geometry.pose import Pose, pose_errors, yaw_rotation
 from piccolo.result import read_results
 
 RECIPES = sorted((ROOT / "docs" / "recipes").glob("*.md"))
 SEED = 3
 NAMES = [f"photos/clean_{k}.jpg" for k in range(4)] + ["more/clean_4.jpg"]
+INSIDE = [f"inside/scan_{k}.jpg" for k in range(4)]  # images of the E57 file
 SLOW = ("localize.py", "tools/prepare_map.py", "tools/color_scan.py")
 INPUTS = ("cloud", "pano", "relative", "results", "given")
 COVARIANCE = PoseCovariance(np.diag(np.repeat([1e-3, 4e-3], 3) ** 2), "")
+SIDES = {"imageWidth": 64, "imageHeight": 32}  # [px]
 WORLD_FROM_MODEL = 1.0 / 0.37
 
 
@@ -67,6 +72,14 @@ def folder(tmp_path, monkeypatch):
     )
     rows = [(str(t), pose) for t, pose in zip(times, true.values(), strict=False)]
     Path("trajectory.txt").write_text("\n".join(tum_lines(rows, "optical")) + "\n")
+    turned = [yaw_rotation(0.5) @ pose.R_cam_from_world for _, pose in rows]
+    wxyz = [Pose(R.T, np.zeros(3)).quaternion_wxyz for R in turned]
+    images = [
+        ImageToWrite(Path(name).read_bytes(), numbers=SIDES, rotation_wxyz=q, center_world=pose.center_world)
+        for name, q, (_, pose) in zip(NAMES, wxyz, rows, strict=False)
+    ]
+    columns = {f"cartesian{axis}": values for axis, values in zip("XYZ", points.T, strict=True)}
+    e57_files.write(Path("scan.e57"), [ScanToWrite(columns)], images)
     return tmp_path
 
 
@@ -89,7 +102,8 @@ def _check(program, words):
         for path in ([word] if Path(word).is_file() else Path(word).glob("*.jpg"))
     ]
     cloud = str(arguments.cloud[0])
-    found = [result(p, poses()[str(p)], cloud=cloud, covariance=COVARIANCE) for p in sorted(map(str, asked))]
+    true = poses() | dict(zip(INSIDE, poses().values(), strict=False))
+    found = [result(p, true[p], cloud=cloud, covariance=COVARIANCE) for p in sorted(map(str, asked))]
     if arguments.out is None:
         return found[0].to_json()
     write_results(arguments.out, found)
@@ -139,9 +153,13 @@ def _check_sure(printed):
     assert read_results([Path("pose.json")])[0].confidence == 0.9
 
 
-def _check_robot(printed):
-    report = json.loads(printed)
+def _check_mount(printed):
+    report = json.loads(Path("mount.json").read_text())
     assert report["lever_arm_m"] == pytest.approx([0.0, 0.0, 0.0], abs=0.01)
+    inside = json.loads(Path("inside.json").read_text())
+    assert inside["rotation_deg"] == pytest.approx([0.0, 0.0, np.degrees(0.5)], abs=0.1)
+    for image, pose in zip(list_images(Path("corrected.e57")), poses().values(), strict=False):
+        assert pose_errors(image.pose, pose) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
 CHECKS = {
@@ -149,7 +167,7 @@ CHECKS = {
     "splat": _check_splat,
     "align_model": _check_aligned,
     "how_sure": _check_sure,
-    "robot": _check_robot,
+    "mount": _check_mount,
 }
 
 

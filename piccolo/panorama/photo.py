@@ -11,6 +11,8 @@ import hashlib
 import math
 import re
 from collections.abc import Mapping
+from contextlib import suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any, NamedTuple, SupportsFloat, cast
 
@@ -121,7 +123,11 @@ def _capture_time(exif: Mapping[int, Any]) -> str | None:
     year, month, day, clock = found.groups()
     digits = re.sub(r"\D", "", str(exif.get(Base.SubsecTimeOriginal, "")))[:6]
     offset = OFFSET.fullmatch(str(exif.get(Base.OffsetTimeOriginal, "")).strip("\0 "))
-    return f"{year}-{month}-{day}T{clock}" + (f".{digits}" if digits else "") + (offset[0] if offset else "")
+    time = f"{year}-{month}-{day}T{clock}" + (f".{digits}" if digits else "") + (offset[0] if offset else "")
+    with suppress(ValueError):  # a clock that was not set writes zeros
+        datetime.fromisoformat(time)
+        return time
+    return None
 
 
 def _gps_position(gps: Mapping[int, Any]) -> GpsPosition | None:
