@@ -98,7 +98,7 @@ def test_refusals_leave_nothing(run, scene, tmp_path):
         (2, [*at, *out, "--heading", "nan"], "must be finite"),
         (2, ["--pose", "T.txt", *out, "--heading", 3], "only with --at"),
         (2, [*at, *out, "--units", 0], "--units: found 0"),
-        (3, [*result, *out], "2 poses; choose one"),
+        (3, [*result, *out], "2 poses, wanted one"),
         (3, [*result, "--pano", "x.jpg", *out], "no pose of x.jpg"),
         (3, [*result, "--out", scene], "found a folder that is not empty"),
         (3, [*at, "--out", tmp_path / "no" / "a.png"], "found no folder"),

@@ -26,9 +26,7 @@ MAX_CAMERAS = 64
 Rows = tuple[tuple[float, ...], ...]
 FORMAT = "piccolo-camera/1"
 MAX_SIZE = 1 << 22  # [byte] of a file
-WANTED = (
-    f"wanted COLMAP's cameras.txt or .bin, OpenSfM's camera_models.json, {foreign.READ} (docs/CAMERAS.md)"
-)
+WANTED = f"wanted COLMAP's cameras.txt or .bin, OpenSfM's camera_models.json, {foreign.READ}: docs/CAMERAS.md"
 MARKUP = (".yaml", ".yml", ".xml")
 WANTED_RIG = "wanted COLMAP's rig_config.json, or the JSON of docs/CAMERAS.md with an image for each camera"
 ANY_SIZE = 1, 1  # of cameras whose file does not say it

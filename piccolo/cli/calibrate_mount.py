@@ -40,9 +40,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--out FILE", "write the file again with the mount applied")
     text = "axes of a trajectory: optical (default): right, down, forward; piccolo: forward, left, up (ROS)"
     option(parser, "--axes", text, choices=CAMERA_AXES)
-    text = (
-        "times of photos, for a trajectory: exif, names (the last number in each) or a CSV file of name and "
-    )
+    text = "photos' times, for a trajectory: exif, names (the last number in each) or a CSV file of name and "
     option(parser, "--times SOURCE", text + "time [s] (default: of a walk its own, else exif)")
 
 

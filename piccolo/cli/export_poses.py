@@ -61,9 +61,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--crs EPSG", f"coordinate system of the cloud, such as EPSG:25832 ({_takers('crs')})")
     text = f"also write N points of the scan that the pictures show, at most ({_takers('points')})"
     option(group, "--points N", text)
-    text = (
-        "write pinhole pictures of each sphere, and masks: 6 as of a cube, 8 around the horizon, 14 also at "
-    )
+    text = "write pinhole pictures of spheres, and masks: 6 as of a cube, 8 around the horizon, 14 also at "
     option(group, "--faces N", f"{text}the cube's corners ({_takers('faces')})", choices=FACES)
     text = "folder of a model in the scan's coordinates, of which --out is a copy with the pictures added"
     option(group, "--into FOLDER", f"{text} ({_takers('into')})")

@@ -82,9 +82,7 @@ def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     ranges = ["auto", *(f"{value:g}" for value in RANGES)]
     text = "full brightness of the cloud's colours (default auto: by the file, then by their values)"
     option(group, "--color-range", text, choices=ranges, default=ranges[0])
-    text = (
-        "columns of text, PTS and .npy files, such as x,y,z,i,r,g,b; - for others (default: by a header or "
-    )
+    text = "columns of text, PTS and .npy files, as x,y,z,i,r,g,b; - for others (default: by a header or "
     option(group, "--columns NAMES", text + "their values)", type=lambda names: names.split(","), default=[])
     text = "compare semantic labels instead of colours: of points (PLY, LAS, LAZ, PCD) and label images (PNG)"
     option(group, "--labels N ...", f"{text}; points and pixels with labels N are left out", nargs="*")
@@ -107,9 +105,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     group.add_argument("--projection", choices=get_args(Projection), help=text)
     text = "focal length of a pinhole photo, in its pixels, known to 1 %%"
     option(group, "--focal PX", text, type=float, dest="focal_px")
-    text = (
-        "refine the focal length (known within 20 %%) and k1, if the model has it; takes three times longer"
-    )
+    text = "refine the focal length (known within 20 %%) and k1, if the model has it; takes 3 times longer"
     option(group, "--refine-focal", text)
     text = "calibration: of COLMAP, OpenSfM, nerfstudio, OpenCV and others, or JSON as in docs/CAMERAS.md; "
     text += "or a folder with NAME.camera.json or NAME.json for each photo"

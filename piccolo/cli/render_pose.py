@@ -139,9 +139,7 @@ def poses_from(arguments: Arguments) -> list[Shot]:
     if not found:
         raise InputError(f"{arguments.result}: no pose" + (f" of {arguments.pano}" if arguments.pano else ""))
     if len(found) > 1 and not is_folder(arguments.out):
-        raise InputError(
-            f"{arguments.result}: {len(found)} poses; choose one with --pano NAME, or give --out FOLDER"
-        )
+        raise InputError(f"{arguments.result}: {len(found)} poses, wanted one: --pano NAME, or --out FOLDER")
     return found
 
 

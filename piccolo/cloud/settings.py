@@ -44,9 +44,7 @@ class CloudSettings:
             raise InputError(f"`color_range`: found {self.color_range}, wanted 1, 255 or 65535")
         if self.columns and not {*"xyz"} <= {*self.columns}:
             found = ",".join(self.columns)
-            raise InputError(
-                f"`columns`: found {found[:80]!r}, wanted x, y, z among them, as in x,y,z,i,r,g,b"
-            )
+            raise InputError(f"`columns`: found {found[:80]!r}, wanted x, y, z among them, as x,y,z,i,r,g,b")
         if self.crs:
             check_crs(self.crs)
 

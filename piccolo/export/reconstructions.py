@@ -38,9 +38,7 @@ def write_nerfstudio(images: Sequence[PosedImage], out: Path, options: Options) 
     models = {NERFSTUDIO_LENSES[image.lens.lens][0] for image in images}
     if len(models) > 1:
         found = f"found the camera models {', '.join(sorted(models))}"
-        raise InputError(
-            f"{images[0].path}: {found}, wanted one for nerfstudio; `faces` makes spheres pinholes"
-        )
+        raise InputError(f"{images[0].path}: {found}, wanted one for nerfstudio; `faces` makes pinholes")
     document: dict[str, object] = {"camera_model": next(iter(models))}
     is_one_lens = len({image.lens for image in images}) == 1
     if is_one_lens:

@@ -49,7 +49,8 @@ def write_rerun(images: Sequence[PosedImage], out: Path, options: Options) -> No
         sure = rr.AnyValues(status=image.result.status, confidence=image.result.confidence)
         place = ["photos", *image.name.split("/")]
         recording.log(place, transform, rr.TransformAxes3D(SHOWN), sure, static=not is_timed)
-        recording.log([*place, "image"], *_picture(rr, image, options), static=not is_timed)
+        for part in _picture(rr, image, options):
+            recording.log([*place, "image"], part, static=not is_timed)
     write_atomically(out, content.read())
 
 
@@ -82,10 +83,8 @@ def _picture(rr: Any, image: PosedImage, options: Options) -> list[Any]:
         own = {"focal_length": lens.focal, "principal_point": lens.center, "resolution": size}
         parts.append(rr.Pinhole(**own, image_plane_distance=SHOWN))
     if options.size is None:
-        rgb = np.asarray(
-            cv2.resize(read_picture(image.path).rgb, size, interpolation=cv2.INTER_AREA), np.uint8
-        )
-        content = encode_image(_undistort(rgb, lens), ".jpg")
+        rgb = cv2.resize(read_picture(image.path).rgb, size, interpolation=cv2.INTER_AREA)
+        content = encode_image(_undistort(np.asarray(rgb, np.uint8), lens), ".jpg")
         parts.append(rr.EncodedImage(contents=content, media_type="image/jpeg"))
     return parts
 

@@ -178,9 +178,7 @@ def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> Exif
         cut = film / FILM_DIAGONAL * _largest_diagonal(size)
         if cut == focal:
             return ExifFocal(focal, math.hypot(lens, rounding), source)
-        source += (
-            f" ({focal:.0f} px for this shape of sensor, up to {cut:.0f} if a wider or higher one was cut)"
-        )
+        source += f" ({focal:.0f} px for this shape of sensor, up to {cut:.0f} if a larger one was cut)"
         deviation = math.hypot(lens, rounding, math.log(cut / focal) / 2.0)
         return ExifFocal(math.sqrt(focal * cut), deviation, source)
     return None

@@ -193,9 +193,7 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
         wanted = "wanted equirectangular, or of a cylinder `projection` cylindrical and `fov_deg`"
         raise InputError(f"{photo.path}: its metadata names the projection {name!r}, {wanted}")
     if width == height and shows_twice(picture.rgb, 0):
-        raise InputError(
-            f"{photo.path}: two panoramas above each other, one for each eye, wanted one of them"
-        )
+        raise InputError(f"{photo.path}: two panoramas above each other, one for each eye, wanted one")
     notes = []
     region = gpano.crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height

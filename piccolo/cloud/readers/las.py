@@ -312,9 +312,7 @@ def open_las(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     if field == "class":
         return reader.make_source(path, read, channel, options, header.num_points)
     if field == "rgb" and not header.has_colors:
-        raise MissingChannelError(
-            f"{path}: has no colours: point format {header.point_format} has none, {WANTED}"
-        )
+        raise MissingChannelError(f"{path}: point format {header.point_format} has no colours, {WANTED}")
     samples = [part for part in _read(header, layout, field, is_sample=True) if len(part[1])]
     if not any(values.any() for _, values in samples):
         is_zero = f"0 in all {sum(len(values) for _, values in samples)} points checked"
