@@ -9,6 +9,7 @@ from refusals import assert_refused, mutated, read_or_refused
 from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
+from piccolo.camera.calibration import find_calibration
 from piccolo.cli import e57_images
 from piccolo.cloud.readers import e57, e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image
@@ -319,6 +320,21 @@ def test_images_are_written_as_files(tmp_path, capsys):
     assert names == ["a_scan_0.jpg", "a_scan_1.png", "a_scan_2.png", "a_scan_3.jpg"]
     assert (folder / "a_scan_0.jpg").read_bytes() == JPEG
     assert rows[0]["file"] == str(folder / "a_scan_0.jpg")
+
+
+def test_pinholes_are_written_with_their_calibration(tmp_path, capsys):
+    lengths = {"focalLength": 0.012, "pixelWidth": 1e-5, "pixelHeight": 1.25e-5}
+    whole = SMALL | lengths | {"principalPointX": 14.5, "principalPointY": 9.75}
+    kind = "pinholeRepresentation", "pngImage"
+    images = [ImageToWrite(PNG, *kind, whole), ImageToWrite(PNG, *kind, SMALL)]
+    path = write(tmp_path / "a.e57", [], images)
+    assert e57_images.main([str(path), "--extract", str(tmp_path)]) == 0
+    rows = [json.loads(line) for line in capsys.readouterr().out.splitlines()]
+    assert [row["is_usable"] for row in rows] == [True, False]
+    (mount,) = find_calibration(tmp_path, tmp_path / "a_0.png").mounts
+    assert (mount.camera.width, mount.camera.height) == (30, 20)
+    assert (*mount.camera.focal, *mount.camera.center) == pytest.approx((1200.0, 960.0, 14.5, 9.75))
+    assert not (tmp_path / "a_1.camera.json").exists()
 
 
 @pytest.mark.parametrize(

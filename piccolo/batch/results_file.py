@@ -54,9 +54,7 @@ def describe_changes(found: Mapping[str, Any], wanted: Mapping[str, Any]) -> str
     new = _by_option(wanted)
     names = sorted(name for name in {*old, *new} if old.get(name) != new.get(name))
     names = ["`preset`"] if "`preset`" in names else names
-    return "; ".join(
-        f"{_say(name, old.get(name), 'with ')}, now {_say(name, new.get(name))}" for name in names
-    )
+    return "; ".join(f"{_say(k, old.get(k), 'with ')}, now {_say(k, new.get(k))}" for k in names)
 
 
 def _by_option(settings: Mapping[str, Any]) -> dict[str, Any]:

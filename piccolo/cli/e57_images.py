@@ -4,8 +4,11 @@ import json
 from argparse import ArgumentParser
 from pathlib import Path
 
+from ..camera import Camera, Mount
+from ..camera.calibration import document_of
 from ..cloud.readers.e57 import E57Image, list_images, read_image
 from ..errors import InputError
+from ..export.reconstructions import write_json
 from ..files.atomic import write_atomically
 from ..geometry.pose import quaternion_wxyz
 from .command import Arguments, check_distinct, check_folder_name, command, option
@@ -15,7 +18,8 @@ example:
   python tools/e57_images.py scan.e57 --extract photos
   python localize.py --cloud scan.e57 --pano photos/scan_0.jpg
 
-is_usable: the image is spherical, so localize.py can read it; fov_deg is 360 for a full sphere.
+is_usable: the image is spherical (fov_deg is 360 for a full sphere), or a pinhole, whose calibration is
+written beside it: localize.py reads it by --camera photos.
 pose: that of the file, x_world = R_world_from_image @ x_image + center_world.
 """
 
@@ -28,7 +32,12 @@ def image_json(index: int, image: E57Image) -> dict[str, object]:
     }
     names = "name", "kind", "width", "height", "fov_deg", "encoding"
     row = {"index": index, **{name: getattr(image, name) for name in names}, "bytes": image.size}
-    return {**row, "is_usable": image.kind == "spherical", "pose": pose, "scan_guid": image.scan_guid or None}
+    return {
+        **row,
+        "is_usable": image.kind == "spherical" or bool(image.pinhole),
+        "pose": pose,
+        "scan_guid": image.scan_guid or None,
+    }
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -54,6 +63,9 @@ def main(arguments: Arguments) -> int:
                 file = files[image.file_name]
                 write_atomically(file, read_image(arguments.e57, index))
                 row["file"] = str(file)
+                if image.pinhole:
+                    camera = Camera("PINHOLE", image.width, image.height, image.pinhole)
+                    write_json(file.with_suffix(".camera.json"), document_of([Mount(camera)]))
             except InputError as error:
                 exit_code = arguments.error(str(error))
         print(json.dumps(row, allow_nan=False), flush=True)

@@ -183,9 +183,7 @@ def _transform(columns: dict[str, Values], T_target_from_source: Array) -> dict[
     target = columns.copy()
     for names, T in ((AXES, T_target_from_source), (NORMALS, turn)):
         if set(names) <= columns.keys():
-            points = transform_points(
-                np.stack([columns[name] for name in names], axis=1, dtype=np.float64), T
-            )
+            points = transform_points(np.stack([columns[k] for k in names], axis=1, dtype=np.float64), T)
             target.update(zip(names, points.T, strict=True))
     return target
 

@@ -247,6 +247,7 @@ class E57Image(NamedTuple):
     height: int  # [px]
     fov_deg: tuple[float, float] | None  # of a spherical image, across and down
     pose: Pose | None
+    pinhole: tuple[float, ...]  # focal lengths and principal point [px] of a pinhole image, or empty
     scan_guid: str  # of the scan it belongs to, or empty
     node: tuple[int, str, str]  # index in images2D, names of the representation and the blob
 
@@ -301,9 +302,17 @@ def _images(file: E57File) -> Iterator[E57Image]:
             height=height,
             fov_deg=fov_deg,
             pose=e57_file.pose_of(file.path, element),
+            pinhole=_pinhole(file.path, representation, across or 0.0, down or 0.0),
             scan_guid=_text(element, "associatedData3DGuid"),
             node=(number, place, f"{encoding}Image"),
         )
+
+
+def _pinhole(path: Path, representation: Element, across: float, down: float) -> tuple[float, ...]:
+    """Return fx, fy, cx, cy [px] from lengths [m] of an image and its pixels; empty if one is missing."""
+    names = "focalLength", "principalPointX", "principalPointY"
+    focal, *center = (read_number(path, representation, name) or 0.0 for name in names)
+    return (focal / across, focal / down, *center) if min(focal, across, down) > 0.0 else ()
 
 
 def _text(element: Element, place: str) -> str:
