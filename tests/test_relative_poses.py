@@ -238,7 +238,7 @@ def test_poses_of_a_base_are_told_from_those_of_a_camera(tmp_path, caplog):
         read_odometry(path, photos, [0.0, 1.0, 2.0])
     read_relative_poses(base, photos)
     read_relative_poses(camera, photos)
-    text = "found poses that turn about their z, as those of a base do whose z is up (ROS), wanted a camera's"
+    text = "found poses that turn about their z, as those of a base with z up (ROS), wanted a camera's"
     starts = [record.getMessage()[: len(f"{base}: {text}")] for record in caplog.records]
     assert starts == [f"{base}: {text}"] * 2
 

@@ -15,21 +15,18 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..arrays import Array
-from ..cloud.e57_poses import write_image_poses
-from ..cloud.readers.e57 import E57Image, list_images
+from ..cloud.e57_poses import list_posed_images, write_image_poses
 from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
 from ..files.atomic import write_lines
 from ..files.json_file import read_text
-from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_pose, turn_axes
+from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_pose
 from .relative_poses import COLUMNS, find_columns, naming
 
 WANTED = (
     "wanted Potree's coordinates.txt, a TUM trajectory, or a table with a header that names x, y, z and "
     "omega, phi, kappa or yaw, pitch, roll"
 )
-# of images in E57 files: a sphere's middle is its +x, a pinhole looks along -z (ASTM E2807)
-IMAGE_FROM_CAM = {"spherical": np.eye(3), "pinhole": OPENGL_FROM_CAM}
 STALE = re.compile("r[123][123]")  # a matrix beside angles
 
 
@@ -118,6 +115,9 @@ class PoseTable:
 
     def write(self, out: Path, poses: Sequence[Pose]) -> None:
         """Write the file with other poses in their order; columns r11 .. r33 are left out."""
+        if self.path.suffix.lower() == ".e57":
+            write_image_poses(self.path, out, poses)
+            return
         heads = [_split(line.lstrip("#"), self.separator) for line in self.head]
         stale = {at for words in heads for at, word in enumerate(words) if STALE.fullmatch(word)}
 
@@ -134,34 +134,11 @@ class PoseTable:
         write_lines(out, lines)
 
 
-@dataclass(frozen=True)
-class ImagePoses:
-    """The images of an E57 file that have a pose, as spheres and pinholes."""
-
-    path: Path
-    rows: tuple[E57Image, ...]
-    times: None = None
-
-    def column(self, name: str) -> list[str] | None:
-        """Return the names of the files that tools/e57_images.py writes; None of another column."""
-        return [image.file_name for image in self.rows] if name == "name" else None
-
-    @property
-    def poses(self) -> list[Pose]:
-        """The given poses, turned to our camera axes."""
-        return [turn_axes(image.pose, IMAGE_FROM_CAM[image.kind].T) for image in self.rows if image.pose]
-
-    def write(self, out: Path, poses: Sequence[Pose]) -> None:
-        """Write a copy of the file with other poses in their order."""
-        turned = [turn_axes(p, IMAGE_FROM_CAM[row.kind]) for row, p in zip(self.rows, poses, strict=True)]
-        write_image_poses(self.path, out, {row.node[0]: p for row, p in zip(self.rows, turned, strict=True)})
-
-
-def read_pose_table(path: Path) -> PoseTable | ImagePoses:
+def read_pose_table(path: Path) -> PoseTable:
     """Return the table of poses in a file, its columns by a header, else by their number; or an E57's."""
     if path.suffix.lower() == ".e57":
-        posed = tuple(image for image in list_images(path) if image.pose and image.kind in IMAGE_FROM_CAM)
-        return ImagePoses(path, posed)
+        rows = tuple(_row_of(image.file_name, pose) for image, pose in list_posed_images(path))
+        return PoseTable(path, (), rows, " ", {n: at for at, n in enumerate(("name", *TUM[1:]))}, FORMS[0])
     lines = read_text(path, WANTED).splitlines()
     text = next((line for line in reversed(lines) if line.strip()), "")
     separator = next((mark for mark in ("\t", ",", ";") if text.count(mark) >= len(OPK) - 1), " ")
@@ -179,6 +156,11 @@ def read_pose_table(path: Path) -> PoseTable | ImagePoses:
         if form is not None:
             return PoseTable(path, tuple(lines[:first]), rows, separator, columns, form)
     raise InputError(f"{path}: found {len(rows)} rows of poses and no known columns, {WANTED}")
+
+
+def _row_of(name: str, pose: Pose) -> tuple[str, ...]:
+    values = [*pose.center_world, *FORMS[0].write(pose.R_cam_from_world)]
+    return name, *(repr(float(value)) for value in values)
 
 
 def _split(line: str, separator: str) -> list[str]:

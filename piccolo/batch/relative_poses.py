@@ -45,7 +45,6 @@ COLUMNS = {  # of a header, without what is no letter
 }
 NOT_IN_NAMES = re.compile(r"[\[(].*|[^a-z]")
 LOG = logging.getLogger("piccolo")
-TURNING = "found poses that turn about their z, as those of a base do whose z is up (ROS)"
 LEVEL = math.cos(math.radians(15.0))  # of an axis that stays as it is while the others turn
 TURNED = math.cos(math.radians(45.0))
 UNIT_LENGTH = 0.01  # by which the length of a quaternion may differ from 1
@@ -141,20 +140,20 @@ def find_nearest(clock: Array, times: Array) -> list[int | None]:
     return [k if abs(clock[k] - time) <= slack else None for k, time in zip(nearest, times, strict=True)]
 
 
-def turn_about_view(poses: Sequence[Pose]) -> bool:
-    """Return True if poses turn about what was read as their view: of a base with z up it is the vertical."""
-    axes = np.array([pose.R_cam_from_world for pose in poses])  # (N, 3, 3): forward, left, up in the world
+def warn_of_axes(path: Path, poses: Sequence[Pose]) -> None:
+    """Log a warning if poses turn about what was read as their view: of a base it is the vertical."""
+    axes = np.array([pose.R_cam_from_world for pose in poses]).reshape(-1, 3, 3)  # forward, left, up
     middle = axes[:, 0].sum(axis=0)
-    is_level = (axes[:, 0] @ middle).min() > LEVEL * np.linalg.norm(middle)
-    return bool(is_level and (axes[:, 1] @ axes[0, 1]).min() < TURNED)
+    is_level = axes[:, 0] @ middle > LEVEL * np.linalg.norm(middle)
+    if is_level.all() and (axes[:, 1] @ axes[:1, 1].T < TURNED).any():
+        found = "found poses that turn about their z, as those of a base with z up (ROS)"
+        wanted = "wanted a camera's: x right, y down, z ahead; tools/calibrate_mount.py has `axes` piccolo"
+        LOG.warning("%s: %s, %s", path, found, wanted)
 
 
 def _read_tum(path: Path, rows: Sequence[Sequence[str]]) -> list[NamedPose]:
-    """Return the poses of rows with their times; a warning is logged if they seem to be of a base."""
     poses = [read_tum_row(row) for row in rows]
-    if len(poses) > 1 and turn_about_view([pose for _, pose in poses]):
-        wanted = "wanted a camera's: x right, y down, z ahead, as tools/calibrate_mount.py writes them"
-        LOG.warning("%s: %s, %s", path, TURNING, wanted)
+    warn_of_axes(path, [pose for _, pose in poses])
     return poses
 
 

@@ -10,12 +10,12 @@ import numpy as np
 from ..arrays import Array
 from ..batch.inputs import times_of
 from ..batch.mount import Sighting, Trajectory, fit_mount
-from ..batch.pose_table import ImagePoses, PoseTable, read_pose_table
-from ..batch.relative_poses import TURNING, match_names, turn_about_view
+from ..batch.pose_table import PoseTable, read_pose_table
+from ..batch.relative_poses import match_names, warn_of_axes
 from ..errors import InputError
 from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, log_so3, quaternion_wxyz
 from ..result import Result, read_results
-from .command import Arguments, UsageError, check_outputs, check_suffix, command, option
+from .command import Arguments, UsageError, check_outputs, command, option
 
 EPILOG = """\
 example:
@@ -45,7 +45,7 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 
 def find_times(
-    results: Sequence[Result], table: PoseTable | ImagePoses, clock: Array, source: str | None
+    results: Sequence[Result], table: PoseTable, clock: Array, source: str | None
 ) -> list[float | None]:
     """Return the time of each photo; None of one that the table has not."""
     photos = [Path(result.pano) for result in results]
@@ -64,13 +64,11 @@ def main(arguments: Arguments) -> int:
     outputs = {"--out": arguments.out}
     check_outputs(outputs, [*arguments.results, arguments.given])
     table = read_pose_table(arguments.given)
-    if isinstance(table, ImagePoses):
-        check_suffix("--out", arguments.out, (".e57",))
-    is_trajectory = isinstance(table, PoseTable) and not table.form.axes
+    is_trajectory = not table.form.axes and table.column("name") is None
     if arguments.axes and not is_trajectory:
-        raise UsageError("--axes: not an option of tables with angles or E57 files, whose axes are known")
-    if is_trajectory and not arguments.axes and turn_about_view(table.poses):
-        arguments.note(f"{arguments.given}: {TURNING}; then give --axes piccolo")
+        raise UsageError("--axes: only an option of trajectories; the axes of other files are known")
+    if is_trajectory and not arguments.axes:
+        warn_of_axes(arguments.given, table.poses)
     times = table.times
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)

@@ -4,7 +4,7 @@ The new XML section is appended, with its checksums (CRC-32C), and the header le
 """
 
 import shutil
-from collections.abc import Mapping
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 from xml.dom import minidom
@@ -13,23 +13,43 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..files.atomic import replacing
-from ..geometry.pose import Pose, quaternion_wxyz
-from .readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section, read_xml
+from ..geometry.pose import OPENGL_FROM_CAM, Pose, quaternion_wxyz, turn_axes
+from .readers.e57 import E57Image, list_images
+from .readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section
 
 ROTATION, TRANSLATION = ("".join(f'<{k} type="Float">%r</{k}>' for k in names) for names in ("wxyz", "xyz"))
 POSE = f"""<pose type="Structure"><rotation type="Structure">{ROTATION}</rotation>
 <translation type="Structure">{TRANSLATION}</translation></pose>"""
+# a sphere's middle is its +x, a pinhole looks along -z (ASTM E2807)
+IMAGE_FROM_CAM = {"spherical": np.eye(3), "pinhole": OPENGL_FROM_CAM}
 POLYNOMIAL = 0x82F63B78  # of CRC-32C, reflected
 
 
-def write_image_poses(path: Path, out: Path, poses: Mapping[int, Pose]) -> None:
-    """Write a copy of an E57 file with poses of images by their numbers in images2D, in the images' axes."""
-    read_xml(path)  # refuses what no parser should read
-    xml = _with_poses(read_section(path), poses)
+def list_posed_images(path: Path) -> list[tuple[E57Image, Pose]]:
+    """Return the spheres and pinholes in an E57 file that have a pose, with it in our camera axes."""
+    images = [image for image in list_images(path) if image.kind in IMAGE_FROM_CAM]
+    return [(image, turn_axes(image.pose, IMAGE_FROM_CAM[image.kind].T)) for image in images if image.pose]
+
+
+def write_image_poses(path: Path, out: Path, poses: Sequence[Pose]) -> None:
+    """Write a copy of an E57 file with other poses of the images of `list_posed_images`, in their order."""
+    images = [image for image, _ in list_posed_images(path)]
+    document = minidom.parseString(read_section(path))  # a DOM keeps namespaces, prefixes and CDATA
+    (vector,) = document.getElementsByTagNameNS(NAMESPACE.strip("{}"), "images2D")
+    elements = [node for node in vector.childNodes if node.nodeType == node.ELEMENT_NODE]
+    for image, pose in zip(images, poses, strict=True):
+        element = elements[image.node[0]]
+        for old in [node for node in element.childNodes if node.nodeName == "pose"]:
+            element.removeChild(old)
+        R_image_from_world = IMAGE_FROM_CAM[image.kind] @ pose.R_cam_from_world
+        text = POSE % (*quaternion_wxyz(R_image_from_world.T).tolist(), *pose.center_world.tolist())
+        new: Any = minidom.parseString(text).documentElement
+        element.appendChild(document.importNode(new, True))
+    xml = document.toxml(encoding="UTF-8")
     pages = _seal(xml)
     size = path.stat().st_size
-    with path.open("rb") as old, replacing(out) as file:
-        shutil.copyfileobj(old, file)
+    with path.open("rb") as old_file, replacing(out) as file:
+        shutil.copyfileobj(old_file, file)
         file.write(pages)
         file.seek(0)
         page = bytearray(file.read(PAGE_CONTENT))
@@ -37,20 +57,6 @@ def write_image_poses(path: Path, out: Path, poses: Mapping[int, Pose]) -> None:
         HEADER.pack_into(page, 0, magic, major, minor, size + len(pages), size, len(xml), page_size)
         file.seek(0)
         file.write(_seal(bytes(page)))
-
-
-def _with_poses(xml: bytes, poses: Mapping[int, Pose]) -> bytes:
-    """Return an XML section with other poses; a DOM keeps namespaces, prefixes and CDATA as they are."""
-    document = minidom.parseString(xml)
-    (images,) = document.getElementsByTagNameNS(NAMESPACE.strip("{}"), "images2D")
-    elements = [node for node in images.childNodes if node.nodeType == node.ELEMENT_NODE]
-    for number, pose in poses.items():
-        for old in [node for node in elements[number].childNodes if node.nodeName == "pose"]:
-            elements[number].removeChild(old)
-        text = POSE % (*quaternion_wxyz(pose.R_cam_from_world.T).tolist(), *pose.center_world.tolist())
-        new: Any = minidom.parseString(text).documentElement
-        elements[number].appendChild(document.importNode(new, True))
-    return document.toxml(encoding="UTF-8")
 
 
 def _seal(content: bytes) -> bytes:
