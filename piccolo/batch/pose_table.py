@@ -1,8 +1,7 @@
 """Tables of given poses as programs write them, which can be written again with other poses.
 
 These are Potree's coordinates.txt, tables with omega, phi, kappa (Metashape, Pix4D), Metashape's csv with
-yaw, pitch, roll, trajectories in TUM's form, and E57 files with images. Positions are in the scan's
-coordinates.
+yaw, pitch, roll, trajectories in TUM's form, E57 files with images. Positions are in the scan's frame.
 """
 
 import re
