@@ -282,3 +282,5 @@ def test_images_of_an_e57_file_are_given_and_come_out_with_the_mount_applied(tmp
     out.rename(tmp_path / "photos" / path.name)  # photos are found by its name
     assert calibrate_mount.main([*words[:3], str(tmp_path / "photos" / path.name)]) == 0
     assert json.loads(capsys.readouterr().out)["rotation_deg"] == pytest.approx([0.0] * 3, abs=1e-6)
+    assert calibrate_mount.main([*words, "--out", str(tmp_path / "out.txt")]) == 2
+    assert "--out out.txt: wanted a name that ends with .e57" in capsys.readouterr().err

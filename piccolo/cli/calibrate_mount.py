@@ -15,7 +15,7 @@ from ..batch.relative_poses import match_names, warn_of_axes
 from ..errors import InputError
 from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, log_so3, quaternion_wxyz
 from ..result import Result, read_results
-from .command import Arguments, UsageError, check_outputs, command, option
+from .command import Arguments, UsageError, check_outputs, check_suffix, command, option
 
 EPILOG = """\
 example:
@@ -64,6 +64,8 @@ def main(arguments: Arguments) -> int:
     outputs = {"--out": arguments.out}
     check_outputs(outputs, [*arguments.results, arguments.given])
     table = read_pose_table(arguments.given)
+    if table.path.suffix.lower() == ".e57":
+        check_suffix("--out", arguments.out, (".e57",))
     is_trajectory = not table.form.axes and table.column("name") is None
     if arguments.axes and not is_trajectory:
         raise UsageError("--axes: only an option of trajectories; the axes of other files are known")

@@ -32,12 +32,8 @@ def image_json(index: int, image: E57Image) -> dict[str, object]:
     }
     names = "name", "kind", "width", "height", "fov_deg", "encoding"
     row = {"index": index, **{name: getattr(image, name) for name in names}, "bytes": image.size}
-    return {
-        **row,
-        "is_usable": image.kind == "spherical" or bool(image.pinhole),
-        "pose": pose,
-        "scan_guid": image.scan_guid or None,
-    }
+    is_usable = image.kind == "spherical" or bool(image.pinhole)
+    return {**row, "is_usable": is_usable, "pose": pose, "scan_guid": image.scan_guid or None}
 
 
 def add_arguments(parser: ArgumentParser) -> None:
