@@ -55,6 +55,12 @@ const PATHS: Record<string, string> = {
   expand: "M14 4h6v6M10 20H4v-6M20 4l-7 7M4 20l7-7",
   differences: "M12 3l9 16H3zM12 10v4M12 16.5v.5",
   up: "M5 15l7-7 7 7",
+  pin: "M12 21.5s-7.5-6.3-7.5-11.7a7.5 7.5 0 0 1 15 0c0 5.4-7.5 11.7-7.5 11.7zM12 7a2.8 2.8 0 1 0 0 5.6 2.8 2.8 0 0 0 0-5.6z",
+  camera: "M4 8h3.5L9 5h6l1.5 3H20v11H4zM12 10a3.3 3.3 0 1 0 0 6.6 3.3 3.3 0 0 0 0-6.6z",
+  photos: "M3 7h14v13H3zM7 7V4h14v13h-4M3 16l4-4 6 6M12 12h.5",
+  tune: "M4 8h9M17 8h3M4 16h3M11 16h9M15 5.5v5M9 13.5v5",
+  again: "M19 12a7 7 0 1 1-2-5l2.5 2.5M20 4v5.5h-5.5",
+  results: "M6 3h8l4 4v14H6zM12 10v7M9 14l3 3 3-3",
 };
 
 /** A line drawing of 24 x 24, of the text's colour. */

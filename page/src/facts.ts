@@ -34,6 +34,8 @@ export class Facts {
   constructor(
     private readonly model: Model,
     private readonly box: HTMLElement,
+    /** What can be done about a photo; null in a report. */
+    private readonly remedies: (photo: Photo) => HTMLElement | null,
   ) {
     model.on("selected alternative", () => this.render());
   }
@@ -45,7 +47,8 @@ export class Facts {
     this.box.replaceChildren(
       ...[
         this.heading(photo),
-        photo.error ? h("p", { class: "error" }, photo.error) : null,
+        photo.error ? h("p", { class: `error ${photo.status}` }, photo.error) : null,
+        this.remedies(photo),
         pose ? this.place(photo, pose) : null,
         photo.spread && alternative === null ? this.spread(photo) : null,
         photo.alternatives.length ? this.alternatives(photo) : null,
@@ -179,7 +182,7 @@ function chunked(rows: number[]): number[][] {
   return [rows.slice(0, 3), rows.slice(3, 6), rows.slice(6, 9)];
 }
 
-function section(title: string, ...children: (Node | null)[]): HTMLElement {
+export function section(title: string, ...children: (Node | null)[]): HTMLElement {
   return h("section", {}, h("h3", {}, title), ...children);
 }
 

@@ -103,6 +103,7 @@ export class List {
   }
 
   private facts(photo: Photo): string {
+    if (this.model.report.service && photo.error) return photo.error;
     const storey = this.model.report.storeys.length > 1 && photo.pose ? this.model.report.storeys[photo.storey ?? 0].name : null;
     const sure = photo.pose ? `${percent(photo.confidence)}` : null;
     const spread = photo.spread ? `±${length(photo.spread.largest)}` : null;

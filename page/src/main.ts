@@ -1,5 +1,6 @@
 /** The page of a report: puts its parts together. */
 import { byId, h, icon, iconButton } from "./dom";
+import { Drop } from "./drop";
 import { Facts } from "./facts";
 import { follow, linkOf } from "./link";
 import { List } from "./list";
@@ -10,7 +11,7 @@ import { labelOf } from "./plan_painter";
 import { fillPrint } from "./print";
 import { download } from "./table";
 import { text } from "./text";
-import { STATUSES, type Report } from "./types";
+import { STATUSES, type Report, type Status } from "./types";
 import { Viewer } from "./viewer";
 
 const MODES: Mode[] = ["photo", "blend", "split", "scan"];
@@ -25,15 +26,21 @@ const model = new Model(reportOf());
 const root = document.documentElement;
 const plan = new Plan(model, byId<HTMLCanvasElement>("plan"), showScale);
 
+function countOf(status: Status): number {
+  return model.report.photos.filter((photo) => photo.status === status).length;
+}
+
+function fillCounts(): void {
+  const count = (status: Status) => h("span", { class: `count ${status}` }, badge(status), String(countOf(status)), h("span", { class: "count-word" }, text.status[status].toLowerCase()));
+  byId("counts").replaceChildren(...STATUSES.filter(countOf).map(count));
+}
+
 function fillHead(): void {
   const { report } = model;
   document.title = report.title;
   byId("title").textContent = report.title;
   byId("skip").textContent = text.skip;
-  const counts = STATUSES.map((status) => [status, report.photos.filter((photo) => photo.status === status).length] as const);
-  byId("counts").replaceChildren(
-    ...counts.filter(([, count]) => count).map(([status, count]) => h("span", { class: `count ${status}` }, badge(status), String(count), h("span", { class: "count-word" }, text.status[status].toLowerCase()))),
-  );
+  model.on("list", fillCounts);
   byId("note").textContent = text.note(report.note);
   byId("note").hidden = !report.note;
   const theme = iconButton(isDark() ? "sun" : "moon", isDark() ? text.light : text.dark, () => {
@@ -77,6 +84,15 @@ function savedTheme(): void {
   }
 }
 
+function fillChip(chip: HTMLElement, status: Status): void {
+  const count = countOf(status);
+  const label = text.filterStatus(text.status[status], count);
+  chip.hidden = !count;
+  chip.setAttribute("aria-pressed", String(model.statuses.has(status)));
+  for (const name of ["aria-label", "title"]) chip.setAttribute(name, label);
+  chip.replaceChildren(badge(status), String(count));
+}
+
 function fillFilters(): void {
   const { report } = model;
   const relist = () => model.list();
@@ -86,15 +102,12 @@ function fillFilters(): void {
     relist();
   });
   const chips = STATUSES.map((status) => {
-    const count = report.photos.filter((photo) => photo.status === status).length;
-    const label = text.filterStatus(text.status[status], count);
-    const chip = h("button", { type: "button", class: `chip ${status}`, "aria-pressed": "true", "aria-label": label, title: label }, badge(status), String(count));
+    const chip = h("button", { type: "button", class: `chip ${status}` });
     chip.addEventListener("click", () => {
       if (model.statuses.has(status)) model.statuses.delete(status);
       else model.statuses.add(status);
       relist();
     });
-    chip.hidden = !count;
     return chip;
   });
   const storey = h("select", { "aria-label": text.storey }, h("option", { value: "" }, text.allStoreys), ...report.storeys.map((one, index) => h("option", { value: index }, one.name)));
@@ -104,7 +117,7 @@ function fillFilters(): void {
     relist();
   });
   storey.hidden = report.storeys.length < 2;
-  const sorts = Object.entries(text.sorts).filter(([value]) => value !== "taken" || report.photos.some((photo) => photo.captured));
+  const sorts = Object.entries(text.sorts).filter(([value]) => value !== "taken" || report.service || report.photos.some((photo) => photo.captured));
   const sort = h("select", { "aria-label": text.sort }, ...sorts.map(([value, label]) => h("option", { value }, label)));
   sort.addEventListener("change", () => {
     model.sort = sort.value as Sort;
@@ -131,7 +144,7 @@ function fillFilters(): void {
   model.on("list", () => {
     shown.textContent = text.shown(model.listed.length, report.photos.length);
     clear.hidden = model.listed.length === report.photos.length;
-    chips.forEach((chip, index) => chip.setAttribute("aria-pressed", String(model.statuses.has(STATUSES[index]))));
+    chips.forEach((chip, index) => fillChip(chip, STATUSES[index]));
   });
   byId("filters").append(
     h("div", { class: "search" }, icon("search"), search),
@@ -308,7 +321,8 @@ byId("list").setAttribute("aria-label", text.list);
 byId("facts").setAttribute("aria-label", text.details);
 const list = new List(model, byId("list"));
 const viewer = new Viewer(model, byId("viewer"));
-const facts = new Facts(model, byId("facts"));
+const drop = model.report.service ? new Drop(model, plan) : null;
+const facts = new Facts(model, byId("facts"), (photo) => drop?.remedies(photo) ?? null);
 fillViewerHead();
 fillHelp();
 model.on("selected", onSelected);

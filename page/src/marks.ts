@@ -1,4 +1,4 @@
-/** A status as a colour and a shape: circle, diamond, triangle, cross. The same in list, plan and print. */
+/** A status as a colour and a shape: circle, diamond, triangle, square, hourglass. The same in list, plan and print. */
 import { svg } from "./dom";
 import type { Status } from "./types";
 
@@ -8,6 +8,7 @@ const CORNERS: Record<Status, [number, number][]> = {
   ambiguous: [[0, -1.2], [1.2, 0], [0, 1.2], [-1.2, 0]],
   not_localized: [[0, -1.15], [1.1, 0.85], [-1.1, 0.85]],
   unreadable: [[-0.85, -0.85], [0.85, -0.85], [0.85, 0.85], [-0.85, 0.85]],
+  waiting: [[-0.9, -1.1], [0.9, -1.1], [-0.9, 1.1], [0.9, 1.1]],
 };
 
 /** Trace the shape of a status around (x, y). */

@@ -80,6 +80,25 @@ export class Model {
     this.changed("list");
   }
 
+  /** Add a photo, or put it in the place of another. */
+  put(photo: Photo, old?: Photo): void {
+    const { photos } = this.report;
+    const at = old ? photos.indexOf(old) : photos.length;
+    photos[at] = photo;
+    this.list();
+    if (at !== this.selected) return;
+    this.selected = null; // so that it is looked at from its front
+    this.select(at);
+  }
+
+  remove(photo: Photo): void {
+    const at = this.report.photos.indexOf(photo);
+    if (this.photo === photo) this.select(null);
+    this.report.photos.splice(at, 1);
+    if (this.selected !== null && this.selected > at) this.selected--;
+    this.list();
+  }
+
   /** Open a photo; `view` is kept if none is given, so that a step along a walk goes on looking ahead. */
   select(index: number | null, view: Partial<View> | null = null): void {
     const before = this.selected;

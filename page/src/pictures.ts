@@ -58,6 +58,8 @@ async function bitmap(data: string, type: string, most: number): Promise<ImageBi
 function load(key: string): Promise<Pictures> {
   const within = document.getElementById(`photo-${key}`);
   if (within) return Promise.resolve(JSON.parse(within.textContent!) as Pictures);
+  const dropped = window.PICCOLO_PHOTOS?.[key]; // and may still be on its way
+  if (dropped) return Promise.resolve(dropped);
   return new Promise((resolve, reject) => {
     const script = document.createElement("script");
     script.src = `photos/${key}.js`;

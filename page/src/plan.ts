@@ -10,6 +10,8 @@ export class Plan extends PlanPainter {
   private pointers = new Map<number, Point>();
   private moved = 0;
   private fitted = "";
+  /** Takes the next click on the plan, a place in its frame [m], instead of opening what is there. */
+  onPick: ((x: number, y: number) => void) | null = null;
 
   constructor(
     model: Model,
@@ -160,7 +162,9 @@ export class Plan extends PlanPainter {
   private up(event: PointerEvent, isClick: boolean): void {
     if (!this.pointers.delete(event.pointerId) || this.pointers.size) return;
     if (!isClick || this.moved > CLICK) return;
-    const found = this.photoAt(this.at(event), event.pointerType === "touch" ? 26 : 14);
+    const at = this.at(event);
+    if (this.onPick) return this.onPick((at.x - this.left) / this.scale, (this.top - at.y) / this.scale);
+    const found = this.photoAt(at, event.pointerType === "touch" ? 26 : 14);
     if (found !== null) this.model.select(found);
   }
 

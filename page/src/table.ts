@@ -12,8 +12,13 @@ export function download({ listed, report }: Model): void {
     return [name, status, confidence, storey === null ? "" : report.storeys[storey].name, ...where, spread?.largest ?? ""];
   });
   const text = [COLUMNS, ...rows].map((row) => row.map(cell).join(",")).join("\r\n");
-  const href = URL.createObjectURL(new Blob([`${text}\r\n`], { type: "text/csv" }));
-  h("a", { href, download: `${report.title}.csv` }).click();
+  save(`${report.title}.csv`, `${text}\r\n`, "text/csv");
+}
+
+/** Save a text as a file. */
+export function save(name: string, text: string, type: string): void {
+  const href = URL.createObjectURL(new Blob([text], { type }));
+  h("a", { href, download: name }).click();
   setTimeout(() => URL.revokeObjectURL(href), 1000);
 }
 

@@ -1,7 +1,8 @@
 /** What a report's data hold: see piccolo/report/build.py and entries.py, which write them. */
 
-export type Status = "localized" | "ambiguous" | "not_localized" | "unreadable";
-export const STATUSES: readonly Status[] = ["localized", "ambiguous", "not_localized", "unreadable"];
+/** A photo that was dropped is waiting until the service has answered. */
+export type Status = "localized" | "ambiguous" | "not_localized" | "unreadable" | "waiting";
+export const STATUSES: readonly Status[] = ["localized", "ambiguous", "not_localized", "unreadable", "waiting"];
 export type Vector = [number, number, number];
 
 export interface Pose {
@@ -95,8 +96,14 @@ export interface Report {
   /** What is wrong with all of it, in words; empty if nothing is. */
   note: string;
   north: [number, number] | null;
+  /** Of the plan's frame: x_plan = R (x_world - origin), R row by row. */
+  origin: Vector;
+  R: number[];
   storeys: Storey[];
   photos: Photo[];
+  /** Only where a service serves the page: the largest photo that it takes, and the scan that it has. */
+  service?: { maxBytes: number };
+  scanSha256?: string;
 }
 
 export interface Pictures {
@@ -111,6 +118,6 @@ export interface Pictures {
 declare global {
   interface Window {
     PICCOLO_REPORT?: Report;
-    PICCOLO_PHOTOS?: Record<string, Pictures>;
+    PICCOLO_PHOTOS?: Record<string, Pictures | Promise<Pictures>>;
   }
 }
