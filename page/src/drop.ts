@@ -188,7 +188,7 @@ export class Drop {
 
   private found(job: Job, { photo, result, pictures }: Found): void {
     if (!this.jobs.includes(job)) return;
-    if (result.source.scan_sha256 !== this.model.report.scanSha256) {
+    if (result.cloud_sha256 && result.cloud_sha256 !== this.model.report.scanSha256) {
       this.sayReplaced();
       throw new Refusal(REPLACED, words.replaced);
     }

@@ -19,7 +19,7 @@ export interface Options {
 
 export interface Found {
   photo: Photo;
-  result: { source: { scan_sha256: string | null } };
+  result: { cloud_sha256: string | null };
   /** Come a little later. */
   pictures: Promise<{ pictures: Pictures; thumb: string }> | null;
 }
