@@ -48,12 +48,13 @@ export class Facts {
       ...[
         this.heading(photo),
         photo.error ? h("p", { class: `error ${photo.status}` }, photo.error) : null,
-        this.remedies(photo),
+        photo.status === "localized" ? null : this.remedies(photo),
         pose ? this.place(photo, pose) : null,
         photo.spread && alternative === null ? this.spread(photo) : null,
         photo.alternatives.length ? this.alternatives(photo) : null,
         photo.evidence ? this.evidence(photo) : null,
         this.about(photo),
+        photo.status === "localized" ? this.remedies(photo) : null,
         photo.warnings.length ? section(text.warnings, h("ul", { class: "notes" }, ...photo.warnings.map((w) => h("li", {}, w)))) : null,
       ].filter((part) => part !== null),
     );

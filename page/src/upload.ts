@@ -1,34 +1,28 @@
-/** Sends a photo to the service that served the page, and reads what it finds line by line. */
+/** Sends a photo to the service that served the page, and reads its answer line by line. */
 import { text } from "./text";
 import type { Photo, Pictures } from "./types";
 
-export const LOST = 0; // in place of a status of HTTP: the network's
+export const LOST = 0; // the network, in place of a status of HTTP
 export const REPLACED = 409;
 export const TOO_LARGE = 413;
 const BUSY = 503;
-const PATIENCE = 5; // s, where a busy service does not say how long
+const RADIUS = 5; // m around a place, unless another is told
 
-/** What is known of a photo that its file does not say; empty is unknown. */
-export interface Options {
-  fov?: number;
-  focal?: number;
-  x?: number;
-  y?: number;
-  radius?: number;
-}
+/** What a person knows that a photo's file does not say, by the names of the dialog's fields; "" is unknown. */
+export type Options = Record<string, string>;
 
 export interface Found {
   photo: Photo;
   result: { cloud_sha256: string | null };
   /** Come a little later. */
-  pictures: Promise<{ pictures: Pictures; thumb: string }> | null;
+  pictures: Promise<{ pictures: Pictures; thumb: string }>;
 }
 
-/** Why there is no result; `seconds` after which to ask again, if the service is busy. */
 export class Refusal extends Error {
   constructor(
     readonly status: number,
     words: string,
+    /** After which to ask again; null unless the service is busy. */
     readonly seconds: number | null = null,
   ) {
     super(words);
@@ -39,37 +33,32 @@ export class Refusal extends Error {
   }
 }
 
-/** Localize a photo; the camera's options count for photos that are not spheres. */
-export async function send(file: File, options: Options, isSphere: boolean, signal: AbortSignal): Promise<Found> {
+/** Localize a photo; throws a Refusal. */
+export async function send(file: File, options: object, signal: AbortSignal): Promise<Found> {
   const form = new FormData();
   form.append("picture", file);
-  const told = JSON.stringify(asJson(options, isSphere));
-  if (told !== "{}") form.append("options", told);
+  form.append("options", JSON.stringify(options));
   try {
     const response = await fetch("show", { method: "POST", body: form, signal });
-    if (!response.ok) throw await refusalOf(response);
+    if (!response.ok) {
+      const wait = response.status === BUSY ? Number(response.headers.get("Retry-After")) || 5 : null;
+      throw new Refusal(response.status, (await response.json()).error, wait);
+    }
     const lines = linesOf(response.body!);
     const next = async () => JSON.parse((await lines.next()).value as string);
-    const { photo, result } = await next();
-    return { photo, result, pictures: photo.hasPictures ? next() : null };
+    return { ...(await next()), pictures: next() };
   } catch (error) {
     throw error instanceof Refusal ? error : new Refusal(LOST, text.drop.lost);
   }
 }
 
-function asJson({ fov, focal, x, y, radius }: Options, isSphere: boolean): object {
-  const lens = { fov_deg: fov, focal_px: focal, projection: "pinhole" };
-  const isNear = x !== undefined && y !== undefined;
+/** Options as the service reads them; those of the lens are for photos that are not spheres. */
+export function asJson({ fov, focal, x, y, radius }: Options, isSphere: boolean): object {
+  const lens = { fov_deg: fov ? Number(fov) : undefined, focal_px: focal ? Number(focal) : undefined, projection: "pinhole" };
   return {
-    photo: !isSphere && (fov || focal) ? lens : undefined,
-    prior: isNear ? { near: [x, y, null], radius: radius || 5 } : undefined,
+    photo: (fov || focal) && !isSphere ? lens : undefined,
+    prior: x && y ? { near: [Number(x), Number(y), null], radius: Number(radius) || RADIUS } : undefined,
   };
-}
-
-async function refusalOf(response: Response): Promise<Refusal> {
-  const said = (await response.json().catch(() => ({}))) as { error?: string };
-  const wait = Number(response.headers.get("Retry-After")) || PATIENCE;
-  return new Refusal(response.status, said.error ?? response.statusText, response.status === BUSY ? wait : null);
 }
 
 async function* linesOf(body: ReadableStream<Uint8Array>): AsyncGenerator<string> {
@@ -80,7 +69,7 @@ async function* linesOf(body: ReadableStream<Uint8Array>): AsyncGenerator<string
     const { done, value } = await reader.read();
     const lines = (rest + decoder.decode(value, { stream: !done })).split("\n");
     rest = lines.pop()!;
-    yield* lines.filter(Boolean);
+    yield* lines;
     if (done) return;
   }
 }
