@@ -8,10 +8,11 @@ import { labelOf } from "./plan_painter";
 import { save } from "./table";
 import { text } from "./text";
 import type { Photo } from "./types";
-import { asJson, type Found, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
+import { asJson, type Found, NO_PICTURE, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
 
 const AT_ONCE = 2;
 const TRIES = 6; // of a photo that a busy service sends away
+const FOV = "65"; // degrees, of most phones
 const NARROW = "(max-width: 860px)";
 const ENDING = /\.[A-Za-z0-9]{3,4}( \(\d+\))?$/;
 const NONE = ["probabilityNone", "scan", "captured", "size", "walk", "time", "pose", "storey", "height", "evidence", "spread"];
@@ -122,7 +123,7 @@ export class Drop {
       ...(Object.fromEntries(NONE.map((key) => [key, null])) as unknown as Photo),
       ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, warnings: [], alternatives: [] },
       ...{ name, short: name.replace(ENDING, "$1"), key: `dropped-${this.count++}` },
-      ...{ status: "waiting", error: words.queued, thumb: URL.createObjectURL(file) },
+      ...{ status: "waiting", error: words.queued, thumb: isImage(file) ? URL.createObjectURL(file) : null },
     };
   }
 
@@ -152,20 +153,19 @@ export class Drop {
   }
 
   private show(job: Job, { photo, result, pictures }: Found): void {
-    pictures.then(
-      ({ thumb }) => {
-        job.photo.thumb = thumb;
-        this.model.list();
-      },
-      () => undefined, // the viewer says it
-    );
+    const own = pictures.then((line) => {
+      job.photo.thumb = line.thumb;
+      this.model.list();
+      return line.pictures;
+    });
+    own.catch(() => undefined); // the viewer says it
     if (result.cloud_sha256 !== this.model.report.scanSha256) {
       const reload = h("button", { type: "button", class: "link", onclick: () => location.reload() }, words.reload);
       byId("note").replaceChildren(words.replacedNote, reload);
       byId("note").hidden = false;
       throw new Refusal(REPLACED, words.replaced);
     }
-    (window.PICCOLO_PHOTOS ??= {})[photo.key] = pictures.then((line) => line.pictures);
+    (window.PICCOLO_PHOTOS ??= {})[photo.key] = own;
     const { name, short, thumb } = job.photo;
     job.result = result;
     this.replace(job, { ...photo, name, short, thumb });
@@ -180,8 +180,8 @@ export class Drop {
       setTimeout(() => job.state === "resting" && this.queue(job), 1000 * refusal.seconds);
       return;
     }
-    const more: Partial<Photo> = refusal.mayPass ? {} : { status: "unreadable", thumb: null };
-    this.replace(job, { error: refusal.message, ...more });
+    const error = refusal.message.replace(`${job.file.name}: `, "");
+    this.replace(job, { error, status: refusal.mayPass ? "waiting" : "unreadable" });
     this.finish(job);
   }
 
@@ -220,6 +220,8 @@ export class Drop {
     if (matchMedia(NARROW).matches && photo.status !== "localized") document.body.classList.add("showing-facts");
     const { refusal, result, state } = job;
     const isUnsure = result && photo.status !== "localized";
+    const isLensUnknown = refusal?.status === NO_PICTURE && isImage(job.file);
+    const known = isLensUnknown ? { fov: FOV, ...job.options } : job.options;
     const advice = isUnsure ? words.notSure : refusal && (words.remedies[refusal.status] ?? words.otherRemedy);
     const retry = (options: Options) => {
       job.options = options;
@@ -229,7 +231,7 @@ export class Drop {
     const buttons = h(
       "div",
       { class: "copies" },
-      isUnsure ? action("tune", words.tell, () => this.dialog.open(job.options, retry)) : null,
+      isUnsure || isLensUnknown ? action("tune", words.tell, () => this.dialog.open(known, retry)) : null,
       state === "done" && refusal?.mayPass ? action("again", words.again, () => retry(job.options)) : null,
       action("close", words.remove, () => this.remove(job)),
     );
@@ -247,11 +249,15 @@ function action(drawing: string, label: string, onclick: () => void, kind = ""):
   return h("button", { type: "button", class: `copy ${kind}`, onclick }, icon(drawing), label);
 }
 
+function isImage(file: File): boolean {
+  return file.type.startsWith("image/");
+}
+
 /** True of a photo twice as wide as high, as spheres are; not of one that the browser can't read. */
 async function isSphere({ options, photo }: Job): Promise<boolean> {
   if (!options.fov && !options.focal) return false; // not worth the reading
   const image = new Image();
-  image.src = photo.thumb!;
+  image.src = photo.thumb ?? "";
   await image.decode().catch(() => undefined);
   return image.naturalWidth > 0 && image.naturalWidth === 2 * image.naturalHeight;
 }

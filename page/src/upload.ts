@@ -5,6 +5,7 @@ import type { Photo, Pictures } from "./types";
 export const LOST = 0; // the network, in place of a status of HTTP
 export const REPLACED = 409;
 export const TOO_LARGE = 413;
+export const NO_PICTURE = 422;
 const BUSY = 503;
 const RADIUS = 5; // m around a place, unless another is told
 
@@ -46,17 +47,20 @@ export async function send(file: File, options: object, signal: AbortSignal): Pr
     }
     const lines = linesOf(response.body!);
     const next = async () => JSON.parse((await lines.next()).value as string);
-    return { ...(await next()), pictures: next() };
+    const found = await next();
+    const pictures = next();
+    pictures.then(() => lines.next(), () => undefined); // to its end, or the browser counts it as broken off
+    return { ...found, pictures };
   } catch (error) {
     throw error instanceof Refusal ? error : new Refusal(LOST, text.drop.lost);
   }
 }
 
-/** Options as the service reads them; those of the lens are for photos that are not spheres. */
+/** Options as the service reads them: those of the lens are for photos that are not spheres, and a field is known about. */
 export function asJson({ fov, focal, x, y, radius }: Options, isSphere: boolean): object {
-  const lens = { fov_deg: fov ? Number(fov) : undefined, focal_px: focal ? Number(focal) : undefined, projection: "pinhole" };
+  const lens = focal ? { focal_px: Number(focal) } : { fov_deg: Number(fov), refine_focal: true };
   return {
-    photo: (fov || focal) && !isSphere ? lens : undefined,
+    photo: (fov || focal) && !isSphere ? { ...lens, projection: "pinhole" } : undefined,
     prior: x && y ? { near: [Number(x), Number(y), null], radius: Number(radius) || RADIUS } : undefined,
   };
 }

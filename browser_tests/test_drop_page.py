@@ -1,0 +1,284 @@
+"""The page of a service: photos are dropped on it, and it says where they were taken, or why it can not."""
+
+import re
+import subprocess
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+from report_scenes import House
+
+from piccolo.result import read_results
+
+ROOT = Path(__file__).resolve().parents[1]
+FLAT = ROOT / "examples" / "flat"
+AXE = ROOT / "page" / "node_modules" / "axe-core" / "axe.min.js"
+SLOW_MS = 180_000  # for a photo, on a machine that does much else
+CHOOSER = "input[type=file][multiple]"
+PHONE = {"width": 360, "height": 740, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
+# a file as a person drops it, put together in the page
+DROP = """([name, type, content]) => {
+  const data = new DataTransfer();
+  data.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name, { type }));
+  for (const kind of ["dragover", "drop"]) {
+    document.body.dispatchEvent(new DragEvent(kind, { dataTransfer: data, bubbles: true, cancelable: true }));
+  }
+}"""
+
+# keeps the options that are sent in window.told
+LISTEN = """() => {
+  const send = window.fetch;
+  window.fetch = (url, how) => {
+    window.told = JSON.parse(how.body.get("options"));
+    return send(url, how);
+  };
+}"""
+
+
+@pytest.fixture(scope="session")
+def service(tmp_path_factory):
+    """The address of a service of the sample flat."""
+    words = ["--cloud", str(FLAT / "cloud.ply"), "--port", "0", "--jobs", "2"]
+    words += ["--cache", str(tmp_path_factory.mktemp("cache"))]
+    serve = [sys.executable, str(ROOT / "tools" / "serve.py"), *words]
+    with subprocess.Popen(serve, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stderr:
+            if found := re.search(r"open (http://\S+) in a browser", line):
+                break
+        yield found[1]
+        process.terminate()
+        process.communicate(timeout=30)
+
+
+@pytest.fixture
+def visit(browser, service):
+    """A function that opens the service's page; at the end nothing may have been asked of anywhere else."""
+    contexts, wrong = [], []
+
+    def visit(width=1400, height=860, **more):
+        context = browser.new_context(viewport={"width": width, "height": height}, **more)
+        contexts.append(context)
+        page = context.new_page()
+        page.set_default_timeout(SLOW_MS)
+        page.on("pageerror", lambda error: wrong.append(str(error)))
+        page.on("request", lambda asked: _is_own(asked.url, service) or wrong.append(asked.url))
+        page.goto(service)
+        page.wait_for_selector("html[data-ready]")
+        return page
+
+    yield visit
+    for context in contexts:
+        context.close()
+    assert wrong == []
+
+
+def _is_own(url, service):
+    return url.startswith((service, "data:", "blob:"))
+
+
+@pytest.fixture(scope="session")
+def elsewhere(tmp_path_factory):
+    """A panorama of a room that is not in the scan."""
+    house = House(tmp_path_factory.mktemp("elsewhere"), 1024)
+    house.add(0, "elsewhere.jpg")
+    return house.folder / "photos" / "elsewhere.jpg"
+
+
+def _choose(page, *files):
+    page.set_input_files(CHOOSER, [str(file) for file in files])
+
+
+def _wait(page, *statuses):
+    """Wait until the list says these, in order."""
+    for index, status in enumerate(statuses):
+        page.wait_for_selector(f"#row-{index} .row-status.{status}")
+
+
+def _names(page):
+    return page.locator(".row-name").all_inner_texts()
+
+
+@contextmanager
+def _answering(page, answer):
+    """Within this, requests to localize a photo are answered by a function of their route."""
+    page.route("**/show", answer)
+    yield
+    page.unroute("**/show")
+
+
+def test_panorama_phone_photo_and_photo_of_another_place(visit, elsewhere, shoot):
+    page = visit()
+    assert page.locator(".drop h2").is_visible()
+    assert not page.locator("#filters").is_visible()
+    page.wait_for_timeout(400)
+    shoot(page, "drop-empty")
+    photos = [FLAT / "images" / "living_room.jpg", elsewhere, FLAT / "images" / "phone.jpg"]
+    _choose(page, *photos)
+    assert _names(page) == ["living_room", "elsewhere", "phone"]
+    assert page.locator(".row-status").all_inner_texts() == ["Waiting"] * 3
+    sent = page.locator(".row-facts").all_inner_texts()
+    assert sent == ["Being localized", "Being localized", "Waiting for its turn"]
+    shoot(page, "drop-waiting")
+    _wait(page, "localized", "not_localized", "localized")
+    page.wait_for_selector("#viewer[data-shown]")  # the last one to finish is opened by itself
+    page.wait_for_timeout(700)
+    shoot(page, "drop-found")
+    page.click("#row-0")
+    page.wait_for_selector('#viewer[data-shown="0"]')
+    for mode in ("blend", "split", "scan", "photo"):
+        page.click(f"[data-mode={mode}]")
+    assert page.locator("#row-0 img").get_attribute("src").startswith("data:image/jpeg")
+    assert "photo=living_room.jpg" in page.evaluate("location.hash")
+    page.click("#row-1")
+    page.wait_for_selector("#facts >> text=What would help")
+    assert page.locator("#facts >> text=tell its field of view").is_visible()
+    page.wait_for_selector('#viewer[data-shown="1"]')
+    shoot(page, "drop-elsewhere")
+    with page.expect_download() as saved:
+        page.click('button[aria-label^="Download the results"]')
+    assert saved.value.suggested_filename == "results.jsonl"
+    results = read_results([saved.value.path()])
+    assert [result.pano for result in results] == [photo.name for photo in photos]
+    assert [result.status for result in results] == ["localized", "not_localized", "localized"]
+    page.click("text=Take off the list")
+    page.wait_for_selector("body:not(.viewing)")
+    assert _names(page) == ["living_room", "phone"]
+
+
+def test_what_is_refused_says_why(visit, tmp_path, shoot):
+    page = visit()
+    asked = []
+    page.on("request", lambda request: asked.append(request.url))
+    large = tmp_path / "large.jpg"
+    with large.open("wb") as file:
+        file.truncate(200_000_000)
+    _choose(page, large)
+    page.wait_for_selector("#facts >> text=The file has 200 MB; the service takes 100 MB at most.")
+    assert page.locator("#facts >> text=Save the photo smaller").is_visible()
+    assert not any(url.endswith("/show") for url in asked)
+    page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
+    _wait(page, "unreadable", "unreadable")
+    page.click("#row-1")
+    page.wait_for_selector("#facts >> text=wanted a whole JPEG")
+    assert page.locator("#facts >> text=Drop a JPEG").is_visible()
+    assert page.locator("text=Tell field of view or place").count() == 0
+    assert page.locator("text=Try again").count() == 0
+    shoot(page, "drop-refused")
+
+
+def test_a_phone_photo_without_focal_length_is_localized_once_its_field_is_told(visit, tmp_path, shoot):
+    content = (FLAT / "images" / "phone.jpg").read_bytes()
+    start = content.index(b"\xff\xe1")
+    length = int.from_bytes(content[start + 2 : start + 4], "big")
+    bare = tmp_path / "bare.jpg"
+    bare.write_bytes(content[:start] + content[start + 2 + length :])
+    page = visit()
+    _choose(page, bare)
+    page.wait_for_selector("#facts >> text=no focal length in EXIF")
+    page.click("text=Tell field of view or place")
+    assert page.locator("[name=fov]").input_value() == "65"
+    page.wait_for_timeout(200)
+    shoot(page, "drop-options")
+    page.evaluate(LISTEN)
+    page.click(".options .main")
+    _wait(page, "localized")
+    lens = {"fov_deg": 65, "refine_focal": True, "projection": "pinhole"}
+    assert page.evaluate("told") == {"photo": lens}
+
+
+def test_a_place_is_shown_on_the_plan(visit):
+    page = visit()
+    page.click(".drop >> text=Options")
+    page.click("text=Show the place on the plan")
+    box = page.locator("#plan").bounding_box()
+    page.mouse.click(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    x, y = (float(page.locator(f"[name={name}]").input_value()) for name in "xy")
+    [plan] = [storey["plan"] for storey in page.evaluate("PICCOLO_REPORT.storeys")]
+    origin = page.evaluate("PICCOLO_REPORT.origin")
+    a, _, _, d, e, f = plan["matrix"]
+    assert x == pytest.approx(origin[0] + e + a * plan["width"] / 2, abs=0.05)
+    assert y == pytest.approx(origin[1] + f + d * plan["height"] / 2, abs=0.05)
+    page.click(".options .main")
+    page.evaluate(LISTEN)
+    _choose(page, FLAT / "images" / "bedroom.jpg")
+    _wait(page, "not_localized")  # it was not taken there
+    assert page.evaluate("told") == {"prior": {"near": [x, y, None], "radius": 5}}
+
+
+def test_a_full_service_is_asked_again_and_a_lost_one_when_told_to(visit, shoot):
+    page = visit()
+    busy = {"status": 503, "headers": {"Retry-After": "1"}, "body": '{"error": "found 32 photos that wait"}'}
+    with _answering(page, lambda route: route.fulfill(**busy)):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector("#row-0 >> text=The service is busy; next try in 1 s")
+    _wait(page, "localized")
+    with _answering(page, lambda route: route.abort()):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector("#row-1 >> text=The connection to the service was lost.")
+    assert _names(page) == ["bedroom", "bedroom (2)"]
+    page.click("#row-1")
+    shoot(page, "drop-lost")
+    page.click("text=Try again")
+    _wait(page, "localized", "localized")
+
+
+def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit):
+    page = visit()
+
+    def answer(route):
+        body = re.sub(rb'"cloud_sha256": ?"\w+"', b'"cloud_sha256": "%s"' % (b"0" * 64), route.fetch().body())
+        route.fulfill(status=200, body=body)
+
+    with _answering(page, answer):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        _wait(page, "unreadable")
+    assert "The scan was replaced after this page was loaded" in page.inner_text("#note")
+    page.click("text=load the page again")
+    page.wait_for_selector("body.no-photos")
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_axe_finds_nothing(visit, shoot, scheme):
+    page = visit(color_scheme=scheme)
+    source = AXE.read_text()
+    for state in ("empty", "options", "refused"):
+        if state == "options":
+            page.click(".drop >> text=Options")
+        if state == "refused":
+            page.keyboard.press("Escape")
+            page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
+            page.wait_for_selector("#facts >> text=What would help")
+        page.wait_for_timeout(400)
+        page.evaluate(source)
+        found = page.evaluate("axe.run({ preload: false }).then(result => result.violations)")
+        told = [(v["id"], v["impact"], [node["html"][:150] for node in v["nodes"][:3]]) for v in found]
+        assert [v for v in told if v[1] in ("serious", "critical", "moderate")] == [], state
+        shoot(page, f"drop-axe-{scheme}-{state}")
+
+
+def test_a_phone(visit, shoot):
+    page = visit(**PHONE)
+    page.wait_for_timeout(400)
+    shoot(page, "drop-phone-empty")
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    for label in ("Choose photos", "Take a photo"):
+        assert page.locator(f".drop >> text={label}").is_visible()
+    page.set_input_files("input[capture=environment]", str(FLAT / "images" / "phone.jpg"))
+    page.wait_for_selector(".count.waiting")
+    shoot(page, "drop-phone-waiting")
+    page.wait_for_selector("#viewer[data-shown]")
+    page.wait_for_timeout(500)
+    shoot(page, "drop-phone-found")
+    page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
+    page.wait_for_selector(".facts >> text=What would help")
+    page.wait_for_timeout(400)
+    assert page.locator(".facts >> text=Take off the list").is_visible()
+    assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
+    shoot(page, "drop-phone-refused")
+
+
+def test_a_report_on_disk_shows_none_of_it(odd, open_page):
+    page = open_page(odd)
+    assert page.locator(".drop, .veil, .pick, .options, input[type=file]").count() == 0
+    assert page.locator('button[aria-label^="Download the results"]').count() == 0
