@@ -46,6 +46,9 @@ export class Drop {
     this.dialog = new OptionsDialog(model.report, plan);
     this.fill();
     this.listen();
+    model.on("selected", () => {
+      if (model.photo !== this.opened) this.opened = null;
+    });
     model.on("list", () => document.body.classList.toggle("no-photos", !model.report.photos.length));
   }
 
@@ -105,7 +108,8 @@ export class Drop {
   private add(files: File[]): void {
     const most = this.model.report.service!.maxBytes;
     for (const file of files) {
-      const job: Job = { file, photo: this.blank(file), options: this.options, state: "queued", tries: 0, stop: new AbortController() };
+      const { options } = this;
+      const job: Job = { file, options, photo: this.blank(file), state: "queued", tries: 0, stop: new AbortController() };
       this.jobs.push(job);
       this.model.put(job.photo);
       if (file.size <= most) continue;
