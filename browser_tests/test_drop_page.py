@@ -115,6 +115,7 @@ def _answering(page, answer):
 def test_panorama_phone_photo_and_photo_of_another_place(visit, elsewhere, shoot):
     page = visit()
     assert page.locator(".drop h2").is_visible()
+    assert page.locator(".drop >> text=The service keeps no photo.").is_visible()
     assert not page.locator("#filters").is_visible()
     page.wait_for_timeout(400)
     shoot(page, "drop-empty")

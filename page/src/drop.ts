@@ -53,6 +53,7 @@ export class Drop {
   }
 
   private fill(): void {
+    const { maxBytes, keepsPhotos } = this.model.report.service!;
     const chooser = (how: Record<string, string | boolean>) => {
       const input = h("input", { type: "file", accept: "image/*", hidden: true, ...how });
       input.addEventListener("change", () => {
@@ -75,9 +76,9 @@ export class Drop {
       { class: "drop" },
       h("span", { class: "drop-mark" }, icon("pin")),
       h("h2", {}, words.title),
-      h("p", {}, words.lead(words.megabytes(this.model.report.service!.maxBytes))),
+      h("p", {}, words.lead(words.megabytes(maxBytes))),
       h("div", { class: "copies" }, ...buttons),
-      h("p", { class: "quiet" }, words.kept),
+      h("p", { class: "quiet" }, keepsPhotos ? words.kept : words.notKept),
       files,
       camera,
     );

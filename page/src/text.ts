@@ -126,7 +126,8 @@ export const text = {
   drop: {
     title: "Where was it taken?",
     lead: (size: string) => `Drop photos anywhere on this page: 360° photos and phone photos, several at once, up to ${size} each.`,
-    kept: "What is found stays in this page until you close it.",
+    kept: "The service keeps the photos and what it finds.",
+    notKept: "The service keeps no photo. What it finds stays in this page until you close it.",
     here: "Drop to localize",
     choose: "Choose photos",
     take: "Take a photo",

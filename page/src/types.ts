@@ -101,8 +101,8 @@ export interface Report {
   R: number[];
   storeys: Storey[];
   photos: Photo[];
-  /** Only where a service serves the page: the largest photo that it takes, and the scan that it has. */
-  service?: { maxBytes: number };
+  /** Only where a service serves the page: the largest request that it takes, and the scan that it has. */
+  service?: { maxBytes: number; keepsPhotos: boolean };
   scanSha256?: string;
 }
 
