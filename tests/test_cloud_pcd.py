@@ -1,14 +1,13 @@
 import struct
 
+import lzf
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from refusals import assert_refused
 from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
 from piccolo.cloud.readers import reader as raw, text
-from piccolo.cloud.readers.pcd import MAX_RATIO, decompress_lzf
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
@@ -48,7 +47,7 @@ def content_of(fields, encoding, num_points=1200, **lines):
         body = np.hstack([column.view(np.uint8) for column in columns]).tobytes()
     else:
         table = b"".join(c.tobytes() for c, field in zip(columns, fields, strict=True) if field[0] != "_")
-        packed = compress(table)
+        packed = lzf.compress(table, 2 * len(table))
         body = struct.pack("<II", len(packed), len(table)) + packed
     return b"# .PCD v0.7 - Point Cloud Data file format\n" + text.encode() + body
 
@@ -191,6 +190,15 @@ def test_compressed_sizes_are_checked_before_memory_is_taken(tmp_path, packed_si
     assert_refused(r"wanted 19200 for 1200 points|compressed data are broken", read, path)
 
 
+def test_what_packs_best_is_read_and_broken_data_are_refused(tmp_path):
+    fields = [(name, type_, 1, np.zeros(1200)) for name, type_, *_ in COLORS["float r g b"]]
+    path = write(tmp_path / "a.pcd", fields, "binary_compressed")
+    assert not read(path)[1].any()
+    head, line, packed = path.read_bytes().partition(b"binary_compressed\n")
+    path.write_bytes(head + line + packed[:8] + b"\xff" * (len(packed) - 8))  # copies of what is not there
+    assert_refused("the compressed data are broken", read, path)
+
+
 @pytest.mark.parametrize("encoding", ENCODINGS)
 def test_a_file_cut_while_it_is_read_is_refused(tmp_path, monkeypatch, encoding):
     monkeypatch.setattr(raw, "CHUNK", 50)
@@ -219,63 +227,6 @@ def test_long_records_come_in_smaller_chunks(tmp_path, monkeypatch):
     fields = separate("f4", 1)
     fields[4][3][107] = 1.5
     assert_refused("point 108 has the colour", read, write(path, fields))
-
-
-def compress(data):
-    """LZF data: the last place of each three bytes is remembered, and copied from as far as it goes."""
-    out, places, literals, i = bytearray(), {}, bytearray(), 0
-
-    def flush():
-        for k in range(0, len(literals), 32):
-            out.append(len(literals[k : k + 32]) - 1)
-            out.extend(literals[k : k + 32])
-        literals.clear()
-
-    while i < len(data):
-        at, key = places.get(data[i : i + 3], -9000), data[i : i + 3]
-        places[key] = i
-        length = 0
-        if i - at <= 8192 and len(key) == 3:
-            while length < 264 and i + length < len(data) and data[at + length] == data[i + length]:
-                length += 1
-        if length < 3:
-            literals.append(data[i])
-            i += 1
-            continue
-        flush()
-        high, low = divmod(i - at - 1, 256)
-        out.extend([(length - 2) * 32 + high, low] if length < 9 else [224 + high, length - 9, low])
-        i += length
-    flush()
-    return bytes(out)
-
-
-@settings(deadline=None, max_examples=60)
-@given(
-    words=st.lists(st.binary(min_size=1, max_size=12), min_size=1, max_size=4),
-    picks=st.lists(st.integers(0, 3), max_size=400),
-)
-def test_lzf_brings_back_what_was_compressed(words, picks):
-    data = b"".join(words[pick % len(words)] for pick in picks)
-    packed = compress(data)
-    assert decompress_lzf(packed, len(data)) == data
-    for cut, size in ((0, len(data) - 1), (0, len(data) + 1), (1, len(data))):
-        assert decompress_lzf(packed[: len(packed) - cut], size) is None or not data
-
-
-def test_lzf_copies_far_and_long():
-    noise = np.random.default_rng(1).bytes(8192)
-    for data in (noise + noise, bytes(100_000), noise[:4000] + bytes(3000) + noise[:4000]):
-        assert decompress_lzf(compress(data), len(data)) == data
-    assert len(compress(bytes(100_000))) > 100_000 / MAX_RATIO
-    assert decompress_lzf(b"\x00a\xe0\xff\x00", 264 + 1) == b"a" * 265
-
-
-@settings(deadline=None, max_examples=100)
-@given(data=st.binary(max_size=60), size=st.integers(0, 3000))
-def test_any_bytes_are_lzf_of_that_size_or_broken(data, size):
-    found = decompress_lzf(data, size)
-    assert found is None or len(found) == size
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "binary"])

@@ -1,7 +1,6 @@
 """PCD files of the Point Cloud Library, 0.5 to 0.7: ascii, binary and binary_compressed.
 
-VIEWPOINT is the sensor's pose; the points are already in the cloud's frame, so it is not applied. The
-compression is LZF: literal runs of bytes, and copies of earlier ones.
+VIEWPOINT is the sensor's pose; the points are already in the cloud's frame, so it is not applied.
 """
 
 import re
@@ -13,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...errors import InputError
+from ...errors import InputError, import_optional
 from ..settings import IN_METRES, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
@@ -23,9 +22,7 @@ MAX_HEADER_SIZE = MAX_ROW_SIZE = 1 << 16  # [byte]; a row is a point
 MAX_COUNT_DIGITS = 10
 ENCODINGS = ("ascii", "binary", "binary_compressed")
 WANTED = "wanted a PCD file with the fields x y z and rgb, rgba or r g b"
-MAX_RATIO = 88  # three bytes can stand for a copy of 264
-MAX_LITERALS = 32  # a control byte below it is a run of one more bytes than it says
-LONG_COPY = 9  # the length by the control byte's upper three bits that goes on in a byte of its own
+MAX_RATIO = 88  # of LZF, in which three bytes can stand for a copy of 264
 FIRST_LINES = re.compile(rb"(?:#[^\n]*\n|[ \t\r\n])*(?:# \.PCD|VERSION[ \t]+0?\.\d)")
 PADDING = "_"
 BROKEN = "the file is cut off or broken"
@@ -125,32 +122,6 @@ def _count(text: str) -> int | None:
     return int(text) if text.isdecimal() and len(text) <= MAX_COUNT_DIGITS else None
 
 
-def decompress_lzf(data: bytes, size: int) -> bytearray | None:
-    """Decompress data to `size` bytes; None if they make more or fewer, or copy from before the first."""
-    out = bytearray()
-    data = data + bytes(2)  # a last code that is cut off reads zeros, and makes too little or too much
-    i = 0
-    while i < len(data) - 2 and len(out) <= size:
-        control = data[i]
-        i += 1
-        if control < MAX_LITERALS:
-            out += data[i : i + control + 1]
-            i += control + 1
-            continue
-        length = (control >> 5) + 2
-        if length == LONG_COPY:
-            length += data[i]
-            i += 1
-        distance = ((control & 31) << 8) + data[i] + 1
-        i += 1
-        begin = len(out) - distance
-        if begin < 0:
-            return None
-        pattern = out[begin : begin + length]
-        out += (pattern * (length // distance + 1))[:length]  # one that reaches into itself repeats
-    return out if len(out) == size and i == len(data) - 2 else None
-
-
 def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
     """Return the points of a PCD file.
 
@@ -209,6 +180,7 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
     kept = [field for field in header.fields if field.name != PADDING]  # PCL leaves padding out
     promised = header.num_points * sum(field.size for field in kept)
     found = header.path.stat().st_size - header.size - 8
+    lzf = import_optional(header.path, "lzf")
     with header.path.open("rb") as file:
         file.seek(header.size)
         packed_size, size = reader.take_records(file, header.path, 2, np.dtype("<u4")).tolist()
@@ -216,8 +188,11 @@ def _read_compressed(header: PcdHeader, fields: tuple[PcdField, ...]) -> Iterato
             counts = f"found {found}, wanted {promised} for {header.num_points} points"
             raise InputError(f"{header.path}: {size} bytes packed into {packed_size}, {counts}; {BROKEN}")
         packed = reader.take_records(file, header.path, packed_size, np.dtype(np.uint8))
-    table = decompress_lzf(packed.tobytes(), size)
-    if table is None:
+    try:
+        table = lzf.decompress(packed, size)
+    except ValueError:
+        table = None
+    if table is None or len(table) != size:  # of data that make more, and fewer
         raise InputError(f"{header.path}: the compressed data are broken, {WANTED}")
     # all points' values of a field, then those of the next
     ends = np.cumsum([field.size * header.num_points for field in kept])
