@@ -8,7 +8,7 @@ from test_cloud_morton import read, seeded_cloud
 from test_cloud_text import write
 
 from piccolo.cloud.readers import reader as raw, text
-from piccolo.cloud.readers.text import line_blocks, open_pts, open_ptx
+from piccolo.cloud.readers.text import line_blocks, open_ptx, open_text
 from piccolo.cloud.stream import open_source
 from piccolo.errors import InputError
 
@@ -180,7 +180,7 @@ def test_broken_pts_are_refused(tmp_path, lines, message):
 
 def test_empty_files_and_scans_that_have_gone_between_two_readings_are_refused(tmp_path):
     (tmp_path / "a").touch()
-    for reader in (open_ptx, open_pts):
+    for reader in (open_ptx, open_text):
         assert_refused("no line of numbers.*, wanted", reader, tmp_path / "a")
     path = write(tmp_path / "a.ptx", TWO_SCANS)
     source = open_source(path)

@@ -1,17 +1,15 @@
 """Results of a batch, a line a panorama: on a stream, or in a file with which a stopped batch goes on."""
 
 import json
-import sys
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from ..errors import InputError
-from ..files.atomic import STDOUT, write_atomically
 from ..files.line_file import LineFile, whole_lines, whole_size
-from ..result import FAILED, FORMAT, Result
+from ..result import FAILED, FORMAT
 from .localizer import may_change
 
 LINE_BEGINS = f'{{"format": "{FORMAT}"'.encode()
@@ -246,13 +244,3 @@ class FileOutput:
 
 
 Output = StreamOutput | FileOutput
-
-
-def write_results(out: Path | None, results: Sequence[Result]) -> None:
-    """Write the results, whole or not at all."""
-    text = "".join(f"{result.to_json()}\n" for result in results)
-    if out is None or out == STDOUT:
-        sys.stdout.write(text)
-        sys.stdout.flush()
-    else:
-        write_atomically(out, text.encode())

@@ -16,11 +16,11 @@ from typing import Any, NamedTuple
 from ..batch.inputs import is_from_stdin, times_of
 from ..batch.localizer import Localizer
 from ..batch.relative_poses import find_scale, read_odometry, read_relative_poses
-from ..batch.results_file import WAYS, Records, write_results
+from ..batch.results_file import WAYS, Records
 from ..coloring import color_scan
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError
-from ..files.atomic import is_stream, temporary_folder
+from ..files.atomic import STDOUT, is_stream, temporary_folder, write_lines
 from ..files.line_file import Journal, keeping_steps
 from ..geometry.pose import Pose
 from ..jobs.processes import InFlight
@@ -101,7 +101,7 @@ def run_together(arguments: Arguments, job: Job) -> int:
         if isinstance(found, Interruption):
             return found.stop(arguments, f"some of {len(job.photos)} {job.what}", path is not None)
         results = found
-        write_results(out, results)
+        write_lines(out or STDOUT, [result.to_json() for result in results])
         if path and not any(result.status == FAILED for result in results):
             path.unlink(missing_ok=True)
     more, is_whole = job.report(results)

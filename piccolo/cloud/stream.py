@@ -6,6 +6,7 @@ A file's format follows from its first bytes, or else from its name.
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
@@ -254,7 +255,7 @@ FORMATS = (
     CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
     CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd, has_labels=True),
     CloudFormat("PTX", (".ptx",), text.has_ptx_magic, text.open_ptx),
-    CloudFormat("PTS", (".pts",), _begins(), text.open_pts, has_columns=True),
+    CloudFormat("PTS", (".pts",), _begins(), partial(text.open_text, has_counts=True), has_columns=True),
     CloudFormat("NumPy .npz", (".npz",), npz.has_npz_magic, npz.open_npz),
     CloudFormat("NumPy .npy", (".npy",), _begins(npz.NPY_MAGIC), npz.open_npy, has_columns=True),
     CloudFormat(

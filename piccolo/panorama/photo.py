@@ -168,7 +168,10 @@ def read_focal_length(exif: Mapping[int, object], size: tuple[int, int]) -> Exif
         plane = None
     if plane and film and abs(plane / diagonal * FILM_DIAGONAL / film - 1.0) > MAX_DISAGREEMENT:
         plane = None
-    lens = ZOOMING if _is_zoom(exif) else BREATHING
+    range_ = exif.get(Base.LensSpecification)
+    is_zoom = isinstance(range_, tuple) and len(range_) > 1 and range_[0] != range_[1]
+    is_enlarged = (_number(exif, Base.DigitalZoomRatio) or 1.0) > 1.0
+    lens = ZOOMING if is_zoom or is_enlarged else BREATHING
     if plane:
         return ExifFocal(plane, lens, "EXIF's focal length and the resolution of its sensor")
     if film:
@@ -192,13 +195,6 @@ def _largest_diagonal(size: tuple[int, int]) -> float:
         return math.hypot(size[0], size[1])
     sensors = [(max(longer, shorter * shape), max(shorter, longer / shape)) for shape in SENSOR_SHAPES]
     return max(math.hypot(*sensor) for sensor in sensors)
-
-
-def _is_zoom(exif: Mapping[int, object]) -> bool:
-    """Return True if the lens has several focal lengths, or a part of the picture was enlarged."""
-    lens = exif.get(Base.LensSpecification)
-    has_range = isinstance(lens, tuple) and len(lens) > 1 and lens[0] != lens[1]
-    return has_range or (_number(exif, Base.DigitalZoomRatio) or 1.0) > 1.0
 
 
 def _focal_by_plane(exif: Mapping[int, object], size: tuple[int, int]) -> float | None:

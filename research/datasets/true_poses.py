@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 
 from piccolo import InputError, Result
-from piccolo.batch.results_file import write_results
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.confidence.confidence import LOCALIZED
+from piccolo.files.atomic import write_lines
 from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import move
 
@@ -68,5 +68,5 @@ def main(arguments: Arguments) -> int:
             raise InputError(f"--transform: found {len(scenes)} scenes, wanted one")
         write_moved(arguments, scenes[0])
     else:
-        write_results(arguments.out, [result for scene in scenes for result in true_results(scene)])
+        write_lines(arguments.out, [r.to_json() for scene in scenes for r in true_results(scene)])
     return 0

@@ -65,7 +65,8 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     memory is reserved.
     """
     header = read_header(path)
-    if _has_faces(header):
+    num_faces = sum(count for element, count in header.pairs if element.name == "face")
+    if num_faces * MOST_STRAY > header.counts[header.index]:  # no cloud with a few stray faces
         if options.labels:
             raise InputError(f"{path}: found a mesh, wanted points with labels")
         return open_ply_mesh(path, options, channel)
@@ -75,16 +76,8 @@ def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     types = [header.vertices.ply_property(name).val_dtype for name in names]
     read = partial(read_columns, header, names)
     source = reader.Table(path, read, names, types, header.counts[header.index]).source(channel, options)
-    stray = sum(count for element, count in header.pairs if element.name == "face")
-    return (
-        source._replace(warnings=(f"{path}: {stray} faces left out", *source.warnings)) if stray else source
-    )
-
-
-def _has_faces(header: PlyHeader) -> bool:
-    """Return True for a mesh, not for a cloud with a few stray faces."""
-    num_faces = sum(count for element, count in header.pairs if element.name == "face")
-    return num_faces * MOST_STRAY > header.counts[header.index]
+    notes = [f"{path}: {num_faces} faces left out"] if num_faces else []
+    return source._replace(warnings=(*notes, *source.warnings))
 
 
 def read_columns(header: PlyHeader, names: Sequence[str]) -> Iterator[reader.Columns]:
@@ -128,16 +121,11 @@ def read_header(path: Path) -> PlyHeader:
         raise InputError(f"{path}: broken header ({quote_line(str(error).encode())}), {WANTED}") from error
     if len(ply.elements) != len(counts):
         raise InputError(f"{path}: broken header (an element's line), {WANTED}")
-    index = _vertex_index(path, ply.elements)
+    names = [element.name for element in ply.elements]
+    if "vertex" not in names:
+        raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
+    index = names.index("vertex")
     return PlyHeader(path, ply.elements, tuple(map(int, counts)), ply.byte_order, ply.text, size, index)
-
-
-def _vertex_index(path: Path, elements: Sequence[PlyElement]) -> int:
-    """Return the index of the vertices' element."""
-    for index, element in enumerate(elements):
-        if element.name == "vertex":
-            return index
-    raise InputError(f"{path}: the header has no element 'vertex', {WANTED}")
 
 
 def _property_names(header: PlyHeader, options: CloudSettings, channel: Channel) -> tuple[str, ...]:

@@ -183,25 +183,16 @@ def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
     ]
 
 
-def open_text(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_text(
+    path: Path, settings: CloudSettings = IN_METRES, channel: Channel = "colors", has_counts: bool = False
+) -> PointSource:
     """Return the points of a text file: whitespace, comma or semicolon between numbers.
 
     The columns are those of the options, or of a header line with names (x y z, r g b or red green blue, an
     intensity), or else follow from the values of all columns: with a warning, unless they are x y z r g b.
+    With counts, as PTS has them, a lone number may precede any line; it is not compared with the number of
+    lines, as many programs write a wrong one. All lines must have as many columns as the first one then.
     """
-    return _open_lines(path, options, channel, has_counts=False)
-
-
-def open_pts(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
-    """Return the points of all scans of a PTS file: lines x y z intensity r g b, or others as in a text file.
-
-    All lines must have as many columns as the first one. A lone count may precede any line; it is not
-    compared with the number of lines, as many programs write a wrong one.
-    """
-    return _open_lines(path, options, channel, has_counts=True)
-
-
-def _open_lines(path: Path, settings: CloudSettings, channel: Channel, has_counts: bool) -> PointSource:
     wanted = PTS_WANTED if has_counts else WANTED
     fields = text_columns.read_fields(path, wanted)
     num_columns = len(split(fields.spelling.plain(fields.first), fields.delimiter))
