@@ -150,8 +150,10 @@ def submit(num_threads: int, tasks: Sequence[Callable[[], Value]]) -> Iterator[l
 class Once(Generic[Value]):
     """A value that is worked out by the first thread that asks; others wait for it."""
 
-    def __init__(self, function: Callable[..., Value]) -> None:
+    def __init__(self, function: Callable[..., Value], *given: object) -> None:
+        """Remember the function with its first arguments, of which others of this class are asked then."""
         self._function: Callable[..., Value] | None = function
+        self._given = given
         self._lock = threading.Lock()
         self._value: Value
 
@@ -164,8 +166,10 @@ class Once(Generic[Value]):
         """Return the function's value. What it raises is raised, and it is asked again by the next."""
         with self._lock:
             if self._function is not None:
-                self._value = self._function(*arguments)
+                given = (one() if isinstance(one, Once) else one for one in self._given)
+                self._value = self._function(*given, *arguments)
                 self._function = None  # what it holds may be large
+                self._given = ()
         return self._value
 
 

@@ -76,7 +76,7 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
 def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
     """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
     first = brief_query(query)
-    of_mirror = Once(partial(score_mirror, query))
+    of_mirror = Once(score_mirror, query)
     with query.workers.beside(of_mirror):
         with watch.stage("search"):
             starts = search_poses(first, "known")

@@ -380,15 +380,14 @@ def recalibrate(query: Query, change: Array) -> Query:
     after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
     fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
-    features = tuple(Once(partial(_turn_features, part, before, after)) for part in query.features)
+    features = tuple(Once(_turn_features, part, before, after) for part in query.features)
     beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in query.beside)
     found = replace(fresh, features=features, beside=beside)
     return found if query.uses_matches else found.by_views()
 
 
-def _turn_features(part: Once[Features], before: Mount, after: Mount) -> Features:
+def _turn_features(found: Features, before: Mount, after: Mount) -> Features:
     """Give the features the rays that another calibration gives to their pixels."""
-    found = part()
     keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
     return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
 

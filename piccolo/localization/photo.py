@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import cv2
@@ -88,9 +87,9 @@ class Photo:
         return replace(
             self,
             panorama=panorama,
-            images=Images(*(Once(partial(mirror_image, image)) for image in self.images)),
+            images=Images(*(Once(Texels.mirror, image) for image in self.images)),
             small=small,
-            seen=Once(partial(find_seen, panorama, small, self.workers)),
+            seen=Once(find_seen, panorama, small, self.workers),
             R_cam_from_level=ACROSS @ self.R_cam_from_level @ ACROSS,
         )
 
@@ -109,7 +108,7 @@ def make_photo(
     panorama = resize(panorama, scales.full.width)
     least = reduce(panorama, scales.fine)
     small = pack_texels(least.rgb, least.is_valid)
-    seen = Once(partial(find_seen, panorama, small, workers))
+    seen = Once(find_seen, panorama, small, workers)
     images = make_images(panorama, scales)
     return Photo(panorama, images, small, seen, R_cam_from_level, has_tilt, scales, workers)
 
@@ -119,29 +118,14 @@ def make_images(panorama: Panorama, scales: ImageScales) -> Images:
     images = {}
     larger = Once(lambda: panorama)
     for name, scale in scales._asdict().items():
-        larger = Once(partial(reduce_larger, larger, scale))
-        images[name] = Once(partial(normalize_larger, larger, scale))
+        larger = Once(reduce, larger, scale)
+        images[name] = Once(normalize_panorama, larger, scale.cell_deg, scale.sigma_deg)
     return Images(**images)
-
-
-def reduce_larger(larger: Once[Panorama], scale: ImageScale) -> Panorama:
-    """Return a larger panorama at the size of an image."""
-    return reduce(larger(), scale)
-
-
-def normalize_larger(reduced: Once[Panorama], scale: ImageScale) -> Texels:
-    """Return the image of a panorama that is reduced to its size."""
-    return normalize_panorama(reduced(), scale.cell_deg, scale.sigma_deg)
 
 
 def reduce(panorama: Panorama, scale: ImageScale) -> Panorama:
     """Return a panorama at the size of one of its images, made of one that is wider or of the same size."""
     return resize(soften(panorama, scale.blur_px) if scale.blur_px else panorama, scale.width)
-
-
-def mirror_image(image: Once[Texels]) -> Texels:
-    """Return an image mirrored left for right."""
-    return image().mirror()
 
 
 def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:

@@ -112,7 +112,7 @@ class Query:
 
     def forget(self) -> "Query":
         """Return the query without what was computed for it but its features: that takes 100 MB."""
-        colors = Once(partial(make_texels, self.given))
+        colors = Once(make_texels, self.given)
         return replace(self, photo=self.photo.forget(), colors=colors, cache=Cache(make_views(self.scan_map)))
 
     def mask(self, is_hidden: Mask) -> "Query":
@@ -164,14 +164,14 @@ def prepare_query(
     photo = make_photo(panorama, method.scales, R_cam_from_level, has_tilt, workers)
     every = cover_sphere(method.scales.full.width)
     features = tuple(
-        Once(partial(find_features, photo.panorama, scan_map, workers, [every[k] for k in half]))
+        Once(find_features, photo.panorama, scan_map, workers, [every[k] for k in half])
         for half in (() if scan_map.has_shape else HALVES)
     )
     return Query(
         source,
         panorama,
         photo,
-        Once(partial(make_texels, panorama)),
+        Once(make_texels, panorama),
         scan_map,
         settings,
         workers,
