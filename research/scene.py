@@ -14,7 +14,7 @@ from piccolo.camera import Calibration, Mount
 from piccolo.camera.calibration import document_of, read_mounts
 from piccolo.errors import InputError
 from piccolo.files.atomic import write_atomically
-from piccolo.files.json_file import DAMAGE, describe, read_json
+from piccolo.files.json_file import naming, read_json
 from piccolo.geometry.pose import Pose, check_pose
 from piccolo.geometry.sphere import CONVENTION
 
@@ -70,13 +70,11 @@ def read_scene(folder: Path, name: str | None = None) -> Scene:
     """
     path = folder if folder.suffix == ".json" else folder / QUERIES_NAME
     document = read_json(path, WANTED)
-    try:
+    with naming(path, WANTED):
         queries = tuple(_query(path.parent, k, entry) for k, entry in enumerate(document["queries"]))
         cloud = path.parent / str(document.get("cloud", CLOUD_NAME))
         if len({query.image for query in queries}) < len(queries):
             raise ValueError("an image twice")
-    except DAMAGE as error:
-        raise InputError(f"{path}: found {describe(error)}, {WANTED}") from error
     return Scene(name or path.parent.resolve().name, path.parent, cloud, queries)
 
 

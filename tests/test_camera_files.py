@@ -284,7 +284,7 @@ def test_files_of_other_programs(tmp_path, name):
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("a.json", {"frames": []}, "found no camera with its size and focal length; wanted COLMAP's"),
+        ("a.json", {"frames": []}, "found no camera with its size and focal length, wanted COLMAP's"),
         ("a.yaml", "a: [", "found damaged YAML"),
         ("a.xml", "<a>", "found damaged XML"),
         ("a.xml", "<!DOCTYPE a []><a/>", "a document type, which is not read"),
@@ -304,7 +304,7 @@ def test_colmaps_binary_cameras(tmp_path):
     assert (first.model, first.params) == ("SIMPLE_RADIAL", (60.0, 32.0, 24.0, 0.1))
     assert (second.model, second.width, second.params) == ("OPENCV", 128, tuple(map(float, range(120, 128))))
     (tmp_path / "cameras.bin").write_bytes(content[:-1])
-    assert_refused("found a file that is cut off; wanted", read_calibration, tmp_path / "cameras.bin")
+    assert_refused("found a file that is cut off, wanted", read_calibration, tmp_path / "cameras.bin")
     (tmp_path / "cameras.bin").write_bytes(struct.pack("<QIiQQ", 1, 1, 11, 64, 48) + bytes(128))
     assert_refused(
         "the camera model number 11, which is not read", read_calibration, tmp_path / "cameras.bin"

@@ -18,9 +18,9 @@ from ..cloud.e57_poses import list_posed_images, write_image_poses
 from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
 from ..files.atomic import write_lines
-from ..files.json_file import read_text
+from ..files.json_file import naming, read_text
 from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, check_pose
-from .relative_poses import COLUMNS, find_columns, naming
+from .relative_poses import COLUMNS, find_columns
 
 WANTED = (
     "wanted Potree's coordinates.txt, a TUM trajectory, or a table with a header that names x, y, z and "

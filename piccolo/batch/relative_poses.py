@@ -4,8 +4,7 @@ import logging
 import math
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from itertools import takewhile
 from operator import eq
 from pathlib import Path, PurePosixPath
@@ -19,7 +18,7 @@ from ..arrays import Array
 from ..camera.foreign import parse_xml, read_binary_images
 from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
-from ..files.json_file import DAMAGE, MAX_SIZE, describe, read_bytes, read_json, read_text
+from ..files.json_file import MAX_SIZE, naming, read_bytes, read_json, read_text
 from ..geometry.pose import (
     OPENGL_FROM_CAM,
     OPTICAL_FROM_CAM,
@@ -155,19 +154,6 @@ def _read_tum(path: Path, rows: Sequence[Sequence[str]]) -> list[NamedPose]:
     poses = [read_tum_row(row) for row in rows]
     warn_of_axes(path, [pose for _, pose in poses])
     return poses
-
-
-@contextmanager
-def naming(path: Path, wanted: str) -> Iterator[None]:
-    """Within this, the error of a damaged row is an InputError that names the file."""
-    try:
-        yield
-    except InputError as error:
-        if str(error).startswith(f"{path}: "):  # it could not be read
-            raise
-        raise InputError(f"{path}, {error}; {wanted}") from error
-    except DAMAGE as error:
-        raise InputError(f"{path}: found {describe(error)}, {wanted}") from error
 
 
 def read_kitti_row(row: Sequence[str]) -> NamedPose:

@@ -4,8 +4,7 @@ These are COLMAP's cameras.txt and rig_config.json, OpenSfM's camera_models.json
 """
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError, unreadable
-from ..files.json_file import DAMAGE, describe, read_bytes, read_text
+from ..files.json_file import naming, read_bytes, read_text
 from ..geometry.pose import OPTICAL_FROM_CAM, Pose, check_pose, rotation_from_quaternion_wxyz
 from . import foreign
 from .model import Camera
@@ -198,10 +197,10 @@ def find_calibration(given: Calibration | Path | None, pano: Path) -> Calibratio
 def read_cameras(path: Path) -> Calibration:
     """Return the cameras in a file, told by its content; InputError if it holds none."""
     if path.suffix.lower() == ".bin":
-        with _naming(path, WANTED):
+        with naming(path, WANTED):
             return _of_colmap(path, foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_SIZE)))
     text = read_text(path, WANTED, MAX_SIZE)
-    with _naming(path, WANTED):
+    with naming(path, WANTED):
         if text.lstrip()[:1] in ("{", "["):
             return _of_document(path, json.loads(text))
         if path.suffix.lower() in MARKUP:
@@ -212,7 +211,7 @@ def read_cameras(path: Path) -> Calibration:
 def calibration_of(document: Any, label: str) -> Calibration:
     """Return the cameras in the JSON of a calibration's file, which errors call by a label."""
     path = Path(label)
-    with _naming(path, WANTED):
+    with naming(path, WANTED):
         return _of_document(path, document)
 
 
@@ -222,23 +221,13 @@ def read_rig(path: Path) -> Calibration:
     COLMAP's file does not say how large a picture is: its cameras fit a picture of any size, as they are.
     """
     text = read_text(path, WANTED_RIG, MAX_SIZE)
-    with _naming(path, WANTED_RIG):
+    with naming(path, WANTED_RIG):
         document = json.loads(text)
         is_colmap = isinstance(document, list) and "image_prefix" in document[0]["cameras"][0]
         rig = _of_colmap_rig(path, document) if is_colmap else _of_document(path, document)
     if not rig.is_rig:
         raise InputError(f"{path}: found a camera without an image, {WANTED_RIG}")
     return rig
-
-
-@contextmanager
-def _naming(path: Path, wanted: str) -> Iterator[None]:
-    """Turn what a damaged file raises into an InputError that names it."""
-    try:
-        yield
-    except DAMAGE as error:
-        text = str(error) if isinstance(error, InputError) else f"found {describe(error)}"
-        raise InputError(text if text.startswith(str(path)) else f"{path}: {text}; {wanted}") from error
 
 
 def document_of(mounts: Sequence[Mount]) -> dict[str, object]:
@@ -248,7 +237,7 @@ def document_of(mounts: Sequence[Mount]) -> dict[str, object]:
 
 
 def read_mounts(document: Mapping[str, Any]) -> tuple[Mount, ...]:
-    """Return the cameras of our own JSON; one of DAMAGE if it is none."""
+    """Return the cameras of our own JSON; the error of damaged JSON if it is none."""
     if document["format"] != FORMAT:
         raise ValueError(f"format {document['format']!r}, not {FORMAT!r}")
     return tuple(map(_mount_of, document.get("cameras", [document])))

@@ -95,6 +95,20 @@ def document_of(text: str, form: str, label: str) -> Iterator[Any]:
         raise InputError(f"{label}: found {found}, wanted one JSON object of format {form!r}") from error
 
 
+@contextmanager
+def naming(path: Path, wanted: str) -> Iterator[None]:
+    """Within this, the error of a part of a file is an InputError that names the file and what is wanted."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith((f"{path}: ", f"{path}, ")):
+            raise
+        mark = ":" if str(error).startswith("found") else ","  # behind which the part is named
+        raise InputError(f"{path}{mark} {error}; {wanted}") from error
+    except DAMAGE as error:
+        raise InputError(f"{path}: found {describe(error)}, {wanted}") from error
+
+
 def parse_lines(path: Path, content: bytes, parse: Callable[[str], Value]) -> list[Value]:
     """`parse` of each line of a file's content that is not blank; an error names the file and the line."""
     values = []
