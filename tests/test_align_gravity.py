@@ -267,8 +267,8 @@ def test_true_poses_go_along(run, tilted, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ("--up y --assume-nothing", "--assume-nothing can't be combined with --up"),
-        ("--up y --pano photo.jpg", "--pano can't be combined with --up"),
+        ("--up y --assume-nothing", "--assume-nothing: not with --up"),
+        ("--up y --pano photo.jpg", "--pano: not with --up"),
         ("--units -1", "--units"),
         ("--out o.json", "--out o.json: wanted a name that ends with .ply"),
     ],

@@ -11,7 +11,6 @@ from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
 from ..cloud.writers import write_transformed
 from ..confidence.confidence import LOCALIZED
-from ..errors import InputError
 from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
 from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
@@ -52,13 +51,8 @@ def add_arguments(parser: ArgumentParser) -> None:
 
 def check_arguments(a: Arguments) -> None:
     """Refuse options that do not go together."""
-    refusals = {
-        "--assume-nothing can't be combined with --up": a.up != "auto" and a.assume_nothing,
-        "--pano can't be combined with --up": a.up != "auto" and a.pano,
-    }
-    for text, is_wrong in refusals.items():
-        if is_wrong:
-            raise InputError(text)
+    if a.up != "auto":
+        a.refuse_given(("assume_nothing", "pano"), "not with --up")
     check_suffix("--out", a.out, (".ply",))
 
 

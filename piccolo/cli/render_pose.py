@@ -90,9 +90,9 @@ def check_usage(arguments: Arguments) -> None:
 
 def check_pose_options(arguments: Arguments) -> None:
     """Refuse options that do not go with where the pose is from."""
+    if not arguments.at:
+        arguments.refuse_given(("heading", "pitch", "roll"), "only with --at")
     angles = [arguments.heading, arguments.pitch, arguments.roll]
-    if not arguments.at and any(angle is not None for angle in angles):
-        raise InputError("--heading, --pitch, --roll: only with --at")
     if not np.isfinite([*(arguments.at or ()), *(angle or 0.0 for angle in angles)]).all():
         raise InputError("--at and angles must be finite numbers")
 
