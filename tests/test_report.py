@@ -309,7 +309,7 @@ def test_in_python(house, tmp_path):
     [
         ([], 2, "--out, --plan: found none"),
         (["--out", "{}/r", "--storeys", "one"], 3, "--storeys: found 1 names, wanted 2"),
-        (["--out", "{}", "--jobs", "1"], 3, "found a folder of something else"),
+        (["--out", "{}", "--jobs", "1"], 3, "found a folder that is not empty"),
         (["--out", "{}/no/r"], 3, "wanted one that exists"),
         (["--out", "{}/r.txt", "--self-contained"], 2, "wanted a name that ends with .html"),
         (["--plan", "{}/p.jpg"], 2, "wanted a name that ends with .png, .svg, .pdf, .dxf"),

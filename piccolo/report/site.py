@@ -21,8 +21,8 @@ import numpy as np
 from ..arrays import Array
 from ..confidence.confidence import NOT_LOCALIZED
 from ..confidence.covariance import PoseCovariance
-from ..errors import InputError, printable
-from ..files.atomic import is_stream, write_atomically
+from ..errors import printable
+from ..files.atomic import check_output_folder, write_atomically
 from ..geometry.pose import Pose, heading_pitch_roll_deg
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
@@ -197,12 +197,8 @@ def as_script_text(document: object) -> str:
 
 def check_folder(out: Path) -> None:
     """Refuse a folder that could not be made, or that has something in it which is no report."""
-    if is_stream(out) or (out.exists() and not out.is_dir()):
-        raise InputError(f"{out}: found a file or a device, wanted a folder")
-    if not out.parent.is_dir():
-        raise InputError(f"{out}: found no folder {out.parent}, wanted one that exists")
-    if out.exists() and any(out.iterdir()) and not (out / f".{MARK}").is_file():
-        raise InputError(f"{out}: found a folder of something else, wanted a new or empty one, or a report")
+    if not (out / f".{MARK}").is_file():
+        check_output_folder(out)
 
 
 def begin_folder(out: Path) -> None:
