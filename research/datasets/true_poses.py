@@ -3,16 +3,14 @@
 from argparse import ArgumentParser
 from dataclasses import replace
 
-import numpy as np
-
 from piccolo import InputError, Result
 from piccolo.cli.command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from piccolo.confidence.confidence import LOCALIZED
 from piccolo.files.atomic import write_lines
-from piccolo.files.json_file import read_text
 from piccolo.geometry.pose import move
 
 from ..scene import QUERIES_NAME, Scene, find_scenes, input_files, write_queries
+from .model import read_matrix
 
 EPILOG = """\
 examples:
@@ -23,7 +21,6 @@ examples:
 The lines are those of photos localized beyond doubt, for all tools that take --results. --transform is the
 file that tools/align_gravity.py has written beside an aligned cloud of one scene.
 """
-WANTED = "wanted four rows of four numbers, as tools/align_gravity.py writes them"
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -45,11 +42,7 @@ def true_results(scene: Scene) -> list[Result]:
 
 def write_moved(arguments: Arguments, scene: Scene) -> None:
     """Write a scene's queries in the coordinates of the cloud beside the transform."""
-    rows = read_text(arguments.transform, WANTED).splitlines()
-    try:
-        T = np.array([row.split() for row in rows], np.float64).reshape(4, 4)
-    except ValueError as error:
-        raise InputError(f"{arguments.transform}: found {error}, {WANTED}") from error
+    T = read_matrix(arguments.transform, 4)
     moved = [replace(q, pose=move(q.pose, T, arguments.metres_per_unit)) for q in scene.queries]
     write_queries(arguments.out.parent, moved, cloud=arguments.transform.with_suffix(".ply").name)
 
