@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from ..batch.localizer import Localizer
-from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, check_crs
+from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
@@ -26,10 +26,7 @@ def cloud_settings_from(arguments: Arguments) -> CloudSettings:
     """Return the options of add_cloud_reading_options."""
     scale = METRES["m"] if arguments.units is None else arguments.units
     crs = vars(arguments).get("crs")  # not of commands without photos
-    if crs == NONE:
-        crs = None
-    if crs:
-        check_crs(crs)
+    crs = None if crs == NONE else crs
     channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
     labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
     color_range = None if arguments.color_range == "auto" else float(arguments.color_range)

@@ -49,9 +49,9 @@ class CloudSettings:
             check_crs(self.crs)
 
 
-def check_crs(crs: str) -> Any:
+def check_crs(crs: str, what: str = "GPS in photos") -> Any:
     """Return pyproj's system of x and y that a text names; InputError if there is none."""
-    pyproj = import_optional("GPS in photos", "pyproj", "gps")
+    pyproj = import_optional(what, "pyproj", "gps")
     try:
         return pyproj.CRS.from_user_input(crs).to_2d()
     except pyproj.exceptions.CRSError as error:

@@ -14,6 +14,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ..cloud.settings import check_crs
 from ..errors import InputError, import_optional, printable
 from ..files.atomic import check_output, check_output_folder, replacing_folder, write_atomically, write_lines
 from ..files.json_file import read_bytes
@@ -145,10 +146,7 @@ def _in_degrees(what: str, images: Sequence[PosedImage], options: Options) -> tu
     """Return the ellipsoid, what turns positions into longitude and latitude, and the system's name."""
     pyproj = import_optional(what, "pyproj", "gps")
     crs = str(options.crs)
-    try:
-        system = pyproj.CRS.from_user_input(crs)
-    except pyproj.exceptions.CRSError as error:
-        raise InputError(f"`crs`: found {crs!r}, wanted a coordinate system such as EPSG:25832") from error
+    system = check_crs(crs, what)
     units = {axis.unit_name for axis in system.axis_info[:2]}
     if not system.is_projected or units != {"metre"}:
         raise InputError(f"`crs`: found {crs} ({system.name}), wanted a projected system in metres")
@@ -162,8 +160,7 @@ def _check_place(image: PosedImage, system: Any, transformer: Any, crs: str) -> 
     """Refuse a camera outside of the area where the system is used, as far as the system says it."""
     x, y = image.pose.center_world[:2].tolist()
     longitude, latitude = transformer.transform(x, y)
-    parts = [system, *system.sub_crs_list]  # a system with a height says it of its parts
-    area = next((part.area_of_use for part in parts if part.area_of_use), None)
+    area = system.area_of_use
     if not np.isfinite([longitude, latitude]).all() or (area and not _is_in(area, longitude, latitude, x, y)):
         name = str(system.name)
         if area:
