@@ -199,8 +199,7 @@ class PriorTable:
             try:
                 check_within(scan_map, prior.within)
             except InputError as error:
-                text = str(error).replace("`within`", f"{self.path}: within, of {name}")
-                raise InputError(text) from error
+                raise InputError(str(error).replace("`within`", f"{self.path}: within, of {name}")) from error
 
     @property
     def names_without_panorama(self) -> list[str]:

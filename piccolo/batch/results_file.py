@@ -129,8 +129,7 @@ class Records:
             self._others.setdefault(pano, []).append(line)
             self.size = span[1]
         if self._others and named is not None and named.isdisjoint(self._others):
-            text = f"it has no result of the photos given; {WAYS}"
-            raise InputError(f"{self.path}: {text}")
+            raise InputError(f"{self.path}: it has no result of the photos given; {WAYS}")
 
     def remaining(
         self, panoramas: Iterable[Name], compute_digest: Callable[[Name], str | None]

@@ -134,8 +134,7 @@ def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
 
 def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
     """Read and prepare the scan."""
-    arguments = run.arguments
-    workers = arguments.workers(num_threads)
+    workers = run.arguments.workers(num_threads)
     scan = localizer.open_scan(workers)
     for warning in scan.warnings:  # those of a map prepared earlier; others have been written
         workers.warn(warning)
@@ -230,8 +229,7 @@ def look_again(run: Run, executor: Executor, output: Output) -> Interruption:
         bar: dict[str, Any] = {"desc": "second look", "total": len(looks), "unit": ""}
         show = partial(terminal.show_progress, is_quiet=run.arguments.quiet, **bar)
         with execution.interruptible() as interruption:
-            digest = run.cloud_sha256
-            answers = execution.answer_all(executor, localizer, tasks, show, interruption, digest)
+            answers = execution.answer_all(executor, localizer, tasks, show, interruption, run.cloud_sha256)
             for look, answer in zip(looks, answers, strict=False):
                 record_second(run, look, answer, output)
         if interruption.number:

@@ -251,13 +251,11 @@ def make_walk_job(arguments: Arguments, frames: Sequence[WalkInput], walk: Walk)
         return interruption if interruption.number else walk.finish(arguments.progress())
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
-        warnings = {w for r in results for w in r.warnings if w.startswith("`odometry`")}
-        arguments.warn(warnings)
+        arguments.warn({w for r in results for w in r.warnings if w.startswith("`odometry`")})
         gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
         return f"; {gaps} gaps", True
 
-    photos = {frame.name: frame.photo for frame in frames}
-    return Job("frames", photos, lambda _: fields, run, report)
+    return Job("frames", {frame.name: frame.photo for frame in frames}, lambda _: fields, run, report)
 
 
 def follow_all(

@@ -265,8 +265,7 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
     """Align the photos that are localized, and return them as what gives colours."""
     found = [(result, result.pose) for result in results if result.pose is not None]
     if len(found) < LEAST_PHOTOS:
-        text = f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours"
-        raise InputError(text)
+        raise InputError(f"found {len(found)} localized photos, wanted {LEAST_PHOTOS} or more for colours")
     panoramas = [shrink(read_as_localized(found[0][0]), WIDTH)]
     bytes_each = PIXEL_BYTES * panoramas[0].is_valid.size + PHOTO_BYTES + PAIR_BYTES * len(found)
     check_memory(len(found) * bytes_each, f"colouring by {len(found)} photos", "localize fewer at once")

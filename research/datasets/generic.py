@@ -35,8 +35,7 @@ def list_scenes(options: model.ConvertOptions) -> model.SceneList:
     path = options.poses or options.inside(found[0])
     entries: dict[str, list[Entry]] = defaultdict(list)
     notes: list[str] = []
-    rows = _rows(path, options, notes)
-    for number, row in enumerate(rows, 1):
+    for number, row in enumerate(_rows(path, options, notes), 1):
         room, entry = _entry(f"{path}, row {number}", path, row, options)
         entries[room].append(entry)
     if not entries:

@@ -271,8 +271,7 @@ def main(arguments: Arguments) -> int:
         return compare(arguments, thresholds)
     if arguments.results:
         results = read_results([arguments.results])
-        report = arguments.error
-        rows = list(query_result.match_results(scenes, results, report))
+        rows = list(query_result.match_results(scenes, results, arguments.error))
         num_failed = len(results) - len(rows)
         check_clouds(scenes, rows, arguments)
         rows = [row for row in rows if not arguments.variants or row.variant in arguments.variants]

@@ -64,8 +64,7 @@ class Loaded:
         material = self.materials[int(given.name)]
         texture = self._texture(given.baseColorTexture)
         if material.texture is not None and (texture is None or visual.uv is None):
-            wrong = "a texture can't be read or its coordinates are missing"
-            raise InputError(f"{self.path}: {wrong}, {WANTED}")
+            raise InputError(f"{self.path}: a texture can't be read or its coordinates are missing, {WANTED}")
         return texture, None if material is NO_MATERIAL else np.array([material.factor])
 
     def _texture(self, image: Any) -> Texture | None:

@@ -355,8 +355,7 @@ def _read_labels(path: Path, read: PartReader, labels: Labels) -> Iterator[RawCl
         values = np.where(np.isfinite(points).all(axis=1), found, 0.0)  # the others are left out later
         is_whole = (np.abs(values) < MOST) & (values == np.floor(values))
         if not is_whole.all():
-            wrong = f"found the label {values[np.argmin(is_whole)]:g}"
-            raise InputError(f"{path}: {wrong}, wanted whole numbers")
+            raise InputError(f"{path}: found the label {values[np.argmin(is_whole)]:g}, wanted whole numbers")
         numbers = values.astype(np.int64)
         is_kept = labels.are_kept(numbers)
         yield RawCloud(points[is_kept], label_colors(numbers[is_kept]))
