@@ -1,5 +1,7 @@
 """Pictures of the cloud from surfels: kernel, closing, hiding; poses in files."""
 
+import math
+
 import cv2
 import naive
 import numpy as np
@@ -72,7 +74,10 @@ def test_splat_equals_its_twin_over_seam_and_poles():
     surfels = np.column_stack([center, normal, along, radius**-2.0, distance]).astype(np.float32)
     rgb = rng.integers(0, 256, (300, 3), dtype=np.uint8)
     angles = np.maximum(np.arcsin(radius / distance), MIN_RADIUS_PX * 2 * np.pi / 64)
-    extents = np.column_stack([*compute_pixels(center, 64), angles])
+    over = np.sin(angles) * distance / np.hypot(*center.T[:2])  # 1 or more: a pole is within
+    across = np.where(over < 1.0, np.arcsin(np.minimum(over, 1.0)), np.pi)
+    pixels = np.column_stack([across, angles]) * 64 / math.tau
+    extents = np.column_stack([*compute_pixels(center, 64), pixels]).astype(np.float32)
     axes = axes_of_pixels(64)
     depth, sums = np.full((32, 64), np.inf, np.float32), np.zeros((32, 64, 5), np.float32)
     packed = pack_points(center.astype(np.float32), rgb).rgbx

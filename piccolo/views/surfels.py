@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from ..arrays import Array, Array32, Int32s, Int64s, Mask
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
-from ..geometry.sphere import compute_pixels, compute_rays
+from ..geometry.sphere import compute_rays, direction_to_pixel
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import channel
-from .zbuffer import View, indices_in_front, nearest_depth
+from .zbuffer import Coordinates, View, indices_in_front, nearest_depth
 
 NUM_NEIGHBORS = 10
 CHUNK = 65_536
@@ -44,6 +44,7 @@ MIN_COSINE = 0.15  # a surfel seen flatter than this is turned towards the camer
 MAX_RADIUS = 1.5  # by the radius that 95 % of the surfels stay below
 MIN_RANGE = 1e-3  # [m] nearer to the camera nothing is drawn
 HIDING_WIDTHS = (360, 720)  # cells of 1 and 1/2 degrees; wider ones hide what is seen through a door ajar
+NOWHERE = np.float32(-1.0)  # extent of what is not drawn: no pixel is within -1
 FAR_ANGLE = 0.02  # [rad] as which a far surfel's radius is seen
 
 # of a surfel in the camera's frame: centre [m], normal, product of both, 1 / radius^2, range [m]
@@ -117,25 +118,11 @@ def hit(surfel: Disc, dx: Scalar, dy: Scalar, dz: Scalar, px_angle2: Scalar) -> 
     return min(q, gap2 / px_angle2), t
 
 
-@inline_kernel
-def half_width(rise: Scalar, angle: Scalar, cosines: Scalar) -> float:
-    """Return the azimuth [rad] to each side up to which a row is within `angle` of a centre; -1 if nowhere.
-
-    `rise` [rad] is the row's elevation above the centre's; `cosines` is the product of the cosines of both
-    elevations.
-    """
-    over = math.sin(0.5 * angle) ** 2 - math.sin(0.5 * rise) ** 2
-    if over < 0.0:
-        return -1.0
-    fraction = over / max(cosines, 1e-12)
-    return math.pi if fraction >= 1.0 else 2.0 * math.asin(math.sqrt(fraction))
-
-
 @kernel
 def splat(
     surfels: Array32,
     rgbx: Int32s,
-    extents: Array,
+    extents: Array32,
     columns: Array32,
     rows: Array32,
     first_row: int,
@@ -144,31 +131,28 @@ def splat(
 ) -> None:
     """Draw surfels into the rows from `first_row` on: into `depth`, or into `sums` if it is not empty.
 
-    surfels (N, 9): centre [m], normal, product of both, 1 / radius^2, range [m], in the camera's frame;
-    extents (N, 3): column and row of the centre [px], radius as seen [rad]; columns (W, 2), rows (W / 2, 2):
-    cosines and sines of azimuths and elevations. The nearest range [m] is written into depth (n, W), which
-    holds inf before; then sums (n, W, 5) gets R, G, B [8-bit levels], range [m] and 1 of what is near that
-    range, each times a weight, added.
+    surfels (N, 9) and extents (N, 4) are those of `pack_discs`; columns (W, 2), rows (W / 2, 2): cosines
+    and sines of azimuths and elevations. The nearest range [m] is written into depth (n, W), which holds inf
+    before; then sums (n, W, 5) gets R, G, B [8-bit levels], range [m] and 1 of what is near that range, each
+    times a weight, added.
     """
     width = depth.shape[1]
-    step = 2.0 * math.pi / width
-    px_angle2 = np.float32((MIN_RADIUS_PX * step) ** 2)
+    px_angle2 = np.float32((MIN_RADIUS_PX * 2.0 * math.pi / width) ** 2)
     for n in range(len(surfels)):
         d = surfels[n]
         c = rgbx[n]
         surfel = (d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7], d[8])
-        level = math.hypot(d[0], d[1]) / d[8]
         u = extents[n, 0] - 0.5
         v = extents[n, 1] - 0.5 - first_row
-        angle = extents[n, 2]
-        reach = angle / step
+        half = extents[n, 2]
+        reach = extents[n, 3]
+        left = math.ceil(u - half)
+        right = min(math.floor(u + half), left + width - 1)
         for i in range(max(math.ceil(v - reach), 0), min(math.floor(v + reach) + 1, len(depth))):
             cosine = rows[first_row + i, 0]
             sine = rows[first_row + i, 1]
-            half = half_width((v - i) * step, angle, cosine * level) / step
-            left = math.ceil(u - half)
-            for at in range(left, min(math.floor(u + half), left + width - 1) + 1):
-                j = (at + width) % width
+            for at in range(left, right + 1):
+                j = at + width if at < 0 else at - width if at >= width else at
                 q, t = hit(surfel, cosine * columns[j, 0], cosine * columns[j, 1], sine, px_angle2)
                 if q >= F1:
                     continue
@@ -218,25 +202,17 @@ def visible_indices(points: PackedPoints, center_world: Array) -> Int64s:
 
 def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -> View:
     """Render surfels at a pose, (width / 2, width) pixels; colours in uint8."""
-    p = surfels.points
-    ranges = np.linalg.norm(p.stack() - pose.center_world, axis=1)
-    largest = np.maximum(MAX_RADIUS * np.percentile(surfels.radii, 95.0), FAR_ANGLE * ranges)  # not lone
-    surfels = surfels.take(np.flatnonzero((surfels.radii <= largest) & (ranges > MIN_RANGE)))
-    packed, extents = _in_camera(surfels, pose, width)
+    packed, extents = pack_discs(surfels, pose, width)
     columns, rows = axes_of_pixels(width)
     rgb = np.zeros((width // 2, width, 3), np.uint8)
     depth = np.full((width // 2, width), np.inf, np.float32)
     num_rows = max(1, STRIP // width)
-    reach = extents[:, 2] * width / (2.0 * math.pi)
 
     def run(first: int) -> None:
         part = slice(first, first + num_rows)
-        middles = extents[:, 1]
-        inside = np.flatnonzero((middles + reach >= first) & (middles - reach <= first + num_rows))
-        some, colors, where = packed[inside], surfels.points.rgbx[inside], extents[inside]
         sums = np.zeros((*depth[part].shape, 5), np.float32)
         for drawn in (sums[:0], sums):
-            splat(some, colors, where, columns, rows, first, depth[part], drawn)
+            splat(packed, surfels.points.rgbx, extents, columns, rows, first, depth[part], drawn)
         is_seen = sums[..., 4] > 0.0
         means = sums[..., :4] / np.where(is_seen, sums[..., 4], np.float32(1.0))[..., None]
         rgb[part] = np.rint(means[..., :3])
@@ -246,20 +222,63 @@ def render_surfels(surfels: Surfels, pose: Pose, width: int, workers: Workers) -
     return View(depth, rgb)
 
 
-def _in_camera(surfels: Surfels, pose: Pose, width: int) -> tuple[Array32, Array]:
-    """Return surfels (N, 9) and extents (N, 3) as `splat` reads them."""
+def pack_discs(surfels: Surfels, pose: Pose, width: int) -> tuple[Array32, Array32]:
+    """Return surfels at a pose (N, 9) and their extents (N, 4) as `splat` reads them."""
     p = surfels.points
-    x_cam = (p.stack() - pose.center_world) @ pose.R_cam_from_world.T
-    ranges = np.linalg.norm(x_cam, axis=1)
-    rays = x_cam / ranges[:, None]
-    normals = surfels.normals @ pose.R_cam_from_world.T
-    cosine = np.einsum("ni,ni->n", normals, rays)
-    normals *= np.where(cosine < 0.0, -1.0, 1.0)[:, None]
-    # without a plane the normal is 0, and becomes the ray
-    normals += np.maximum(MIN_COSINE - np.abs(cosine), 0.0)[:, None] / (1.0 - MIN_COSINE) * rays
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    radii = np.clip(surfels.radii, 1e-9, MAX_ANGLE * ranges)
-    along = np.einsum("ni,ni->n", normals, x_cam)
-    packed = np.column_stack([x_cam, normals, along, 1.0 / radii**2, ranges]).astype(np.float32)
-    angles = np.maximum(np.arcsin(radii / ranges), MIN_RADIUS_PX * 2.0 * math.pi / width)
-    return packed, np.column_stack([*compute_pixels(x_cam, width), angles])
+    largest = MAX_RADIUS * float(np.percentile(surfels.radii, 95.0)) if len(p) else 0.0
+    packed = np.empty((len(p), 9), np.float32)
+    extents = np.empty((len(p), 4), np.float32)
+    R, c = pose.R_cam_from_world, pose.center_world
+    place_discs((p.x, p.y, p.z), surfels.normals, surfels.radii, R, c, largest, width, packed, extents)
+    return packed, extents
+
+
+@kernel
+def place_discs(
+    points: Coordinates,
+    normals: Array32,
+    radii: Array32,
+    R_cam_from_world: Array,
+    center_world: Array,
+    largest: float,
+    width: int,
+    surfels: Array32,
+    extents: Array32,
+) -> None:
+    """Write surfels (N, 9) in the camera's frame, and which pixels they can reach (N, 4).
+
+    The nine numbers are centre [m], normal, product of both, 1 / radius^2 and range [m]; the extents are
+    column and row of the centre, and how far the disc reaches across columns and rows [px]. A surfel that is
+    too near, or larger than `largest` [m] and not far off, reaches none.
+    """
+    R = R_cam_from_world
+    step = math.tau / width
+    for n in range(len(radii)):
+        dx = points[0][n] - center_world[0]
+        dy = points[1][n] - center_world[1]
+        dz = points[2][n] - center_world[2]
+        distance = math.sqrt(dx * dx + dy * dy + dz * dz)
+        if distance <= MIN_RANGE or radii[n] > max(largest, FAR_ANGLE * distance):
+            extents[n] = NOWHERE
+            continue
+        nx, ny, nz = normals[n]
+        facing = (nx * dx + ny * dy + nz * dz) / distance
+        sign = -1.0 if facing < 0.0 else 1.0
+        # without a plane the normal is 0, and becomes the ray
+        turn = max(MIN_COSINE - abs(facing), 0.0) / (1.0 - MIN_COSINE) / distance
+        nx, ny, nz = sign * nx + turn * dx, sign * ny + turn * dy, sign * nz + turn * dz
+        length = math.sqrt(nx * nx + ny * ny + nz * nz)
+        disc = surfels[n]
+        for k in range(3):
+            disc[k] = R[k, 0] * dx + R[k, 1] * dy + R[k, 2] * dz
+            disc[3 + k] = (R[k, 0] * nx + R[k, 1] * ny + R[k, 2] * nz) / length
+        radius = min(max(radii[n], 1e-9), MAX_ANGLE * distance)
+        disc[6] = (nx * dx + ny * dy + nz * dz) / length
+        disc[7] = 1.0 / (radius * radius)
+        disc[8] = distance
+        level = math.hypot(disc[0], disc[1])
+        angle = max(math.asin(radius / distance), MIN_RADIUS_PX * step)
+        sine = math.sin(angle) * distance  # over the level part of the range: that of the azimuth, of a cap
+        extents[n, 0], extents[n, 1] = direction_to_pixel(disc[0], disc[1], disc[2], level, width)
+        extents[n, 2] = (math.asin(sine / level) if sine < level else math.pi) / step
+        extents[n, 3] = angle / step
