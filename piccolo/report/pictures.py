@@ -11,6 +11,7 @@ import csv
 import json
 import math
 import re
+import zlib
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Bytes, Int64s, Mask
+from ..arrays import Array, Array32, Bytes, Int64s, Mask
 from ..camera.model import pinhole
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import AMBIGUOUS
@@ -47,9 +48,9 @@ THUMB_QUALITY = 78
 THUMB_SIZE = (256, 160)
 THUMB_FOV_DEG = 100.0
 MASK_WIDTH = 1024  # [px]
-SCAN_WIDTH = 1536  # [px] a voxel of the map is wider than a pixel
-ALTERNATIVE_WIDTH = 1024  # [px]
-REACH_SIZE = (96, 48)  # [px]
+SCAN_WIDTH = 1024  # [px] surfels are hardly finer
+DEPTH_FROM, DEPTH_TO = 0.05, 1e5  # [m]
+DEPTH_STEP = 0.001  # of a range, to the next that the page can tell from it
 LEAST_PROBABILITY = 0.02  # of alternatives from which the scan is drawn
 MAX_ALTERNATIVES = 3
 MAX_WIDTH = 8192  # [px] of a sphere at full size
@@ -98,13 +99,11 @@ def make_pictures(
         view_width = min(full, SCAN_WIDTH) & ~1
         view = scan_view(surfels, poses[0], view_width)
         document["scan"] = _base64(scan_picture(view))
-        # the range (h, w) of a small sphere [0.1 m]; 255 for 25.5 m and more, or nothing scanned
-        tenths = np.minimum(10.0 * view.depth, 255.0).astype(np.uint8)
-        document["reach"] = _base64(cv2.resize(tenths, REACH_SIZE, interpolation=cv2.INTER_AREA).tobytes())
+        document["depth"] = _base64(pack_depth(view.depth))
         mask = occlusion_mask(points, shrink(panorama, MASK_WIDTH), poses[0])
         document["mask"] = _base64(encode_image(mask, ".png"))
         document["alternatives"] = [
-            _base64(scan_picture(scan_view(surfels, pose, ALTERNATIVE_WIDTH))) if is_shown else None
+            _base64(scan_picture(scan_view(surfels, pose, view_width))) if is_shown else None
             for pose, is_shown in zip(poses[1:], _shown(result), strict=True)
         ]
     return make_thumbnail(small, poses[0] if poses else None), json.dumps(document)
@@ -127,6 +126,19 @@ def scan_picture(view: View) -> bytes:
     """JPEG of a view; grey where nothing was scanned."""
     rgb = fill_holes(view.rgb, view.is_seen)
     return encode_image(_grey_where_unscanned(rgb, view.is_seen), ".jpg", QUALITY)
+
+
+def pack_depth(depth: Array32) -> bytes:
+    """Return the ranges (H, W) [m] of a view, inf for nothing scanned, as the page's pictures.ts reads them.
+
+    Codes are 1 + log(range / DEPTH_FROM) / DEPTH_STEP in 16 bits, 0 for nothing; kept are their differences
+    along columns, then rows, even ones for positive, in two planes of bytes (high, low), by zlib.
+    """
+    codes = 1.0 + np.log(np.clip(depth, DEPTH_FROM, DEPTH_TO) / DEPTH_FROM) / DEPTH_STEP
+    whole = np.where(np.isfinite(depth), np.rint(codes), 0.0).astype(np.int32)
+    steps = np.diff(np.diff(whole, axis=0, prepend=0), axis=1, prepend=0)
+    folded = np.where(steps < 0, -2 * steps - 1, 2 * steps).astype(">u2")
+    return zlib.compress(np.moveaxis(folded.view(np.uint8).reshape(*depth.shape, 2), 2, 0).tobytes())
 
 
 def _grey_where_unscanned(rgb: Bytes, is_seen: Mask) -> Bytes:

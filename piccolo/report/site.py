@@ -24,6 +24,7 @@ from ..confidence.covariance import PoseCovariance
 from ..errors import printable
 from ..files.atomic import check_output_folder, write_atomically
 from ..geometry.pose import Pose, heading_pitch_roll_deg
+from ..geometry.pose_gaussian import turn_positions
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
 
@@ -158,12 +159,17 @@ def pose_document(pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
 
 
 def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict[str, Any]:
-    """Describe the pose's uncertainty: its 95 % ellipse on the plan [m], standard deviations, and words."""
-    level = (R_map_from_world @ covariance.matrix[3:, 3:] @ R_map_from_world.T)[:2, :2]
-    variances, axes = np.linalg.eigh(level)
+    """Describe the pose's uncertainty: its 95 % ellipse on the plan [m], standard deviations, and words.
+
+    The covariance itself is that of the turn about the camera's axes [rad] and of the position in the plan's
+    frame [m], the 21 numbers of its rows from the diagonal on.
+    """
+    in_plan = turn_positions(covariance.matrix, R_map_from_world)
+    variances, axes = np.linalg.eigh(in_plan[3:5, 3:5])
     half = np.sqrt(np.maximum(variances, 0.0) * CHI_SQUARE_95)
     return {
         "ellipse": [*_list(half[::-1]), round(math.degrees(math.atan2(axes[1, 1], axes[0, 1])), 2)],
+        "covariance": [float(f"{value:.4g}") for value in in_plan[np.triu_indices(6)]],
         "mm": _list(covariance.std_mm, 2),
         "deg": _list(covariance.std_deg, 4),
         "largest": round(1000.0 * covariance.largest_std, 2),
