@@ -265,7 +265,7 @@ def test_ways_lead_to_neighbours_and_along_a_walk(many, open_page, shoot):
 def test_the_clipboard_gets_what_the_buttons_say(demo, open_page):
     page = open_page(demo[1], permissions=["clipboard-read", "clipboard-write"])
     page.click("#row-0")
-    page.click(".copy >> nth=1")
+    page.click("#facts .copy >> nth=1")
     page.wait_for_selector("text=Copied")
     pose = json.loads(page.evaluate("navigator.clipboard.readText()"))
     result = read_results([demo[0] / "poses.jsonl"])[0]

@@ -3,8 +3,10 @@
 import base64
 import hashlib
 import json
+import math
 import re
 import shutil
+import zlib
 from dataclasses import replace
 
 import cv2
@@ -17,6 +19,7 @@ from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
+from piccolo.report.pictures import pack_depth
 from piccolo.report.site import collect_entries, shorten_names, unique_names
 from research.synthetic.walk_frames import writing_video
 
@@ -60,6 +63,25 @@ def _decoded(text):
     return cv2.imdecode(np.frombuffer(base64.b64decode(text), np.uint8), cv2.IMREAD_COLOR)
 
 
+def _ranges(text):
+    """Ranges (H, W) [m] of a packed depth, 0 for nothing, as the page's pictures.ts reads them."""
+    planes = np.frombuffer(zlib.decompress(base64.b64decode(text)), np.uint8).reshape(2, -1)
+    high, low = planes.astype(np.int64)
+    width = math.isqrt(2 * len(high))
+    folded = (256 * high + low).reshape(width // 2, width)
+    codes = np.where(folded % 2, -(folded + 1) // 2, folded // 2).cumsum(axis=0).cumsum(axis=1)
+    return np.where(codes > 0, 0.05 * np.exp((codes - 1) * 0.001), 0.0)
+
+
+def test_a_packed_depth_keeps_ranges_to_half_a_thousandth():
+    rng = np.random.default_rng(0)
+    depth = np.exp(rng.uniform(math.log(0.05), math.log(1e5), (32, 64))).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = np.inf
+    found = _ranges(base64.b64encode(pack_depth(depth)))
+    assert ((found == 0.0) == np.isinf(depth)).all()
+    np.testing.assert_allclose(found[found > 0.0], depth[found > 0.0], rtol=0.00051)
+
+
 def test_storeys_have_their_names_levels_and_plans_in_metres(made):
     lower, upper = _document(made)["storeys"]
     assert [lower["name"], upper["name"]] == ["Ground floor", "First floor"]
@@ -89,6 +111,9 @@ def test_photos_know_their_storey_height_and_place_on_the_plan(house, made):
         np.testing.assert_allclose(center, world, atol=1e-6)
     spread = _photo(document, "000.jpg")["spread"]
     assert spread["ellipse"] == pytest.approx([0.004895, 0.002448, 0], abs=2e-5)
+    upper = np.zeros((6, 6))
+    upper[np.triu_indices(6)] = spread["covariance"]
+    np.testing.assert_allclose(np.diag(upper), [1e-7, 1e-7, 1e-7, 4e-6, 1e-6, 1e-6])
 
 
 def test_every_status_is_there_with_what_it_has(made):
@@ -115,8 +140,7 @@ def test_sphere_and_scan_show_the_same_in_every_direction(made):
         turned = cv2.GaussianBlur(np.roll(scan, 8, axis=1), (0, 0), 1.5).astype(float).ravel()
         assert np.corrcoef(*blurred)[0, 1] > 0.85
         assert np.corrcoef(blurred[0], turned)[0, 1] < np.corrcoef(*blurred)[0, 1] - 0.1
-        reach = np.frombuffer(base64.b64decode(pictures["reach"]), np.uint8).reshape(48, 96) / 10.0
-        assert 0.5 < np.median(reach) < 4.0  # of a room of 4.5 x 3.5 m
+        assert 0.5 < np.median(_ranges(pictures["depth"])) < 4.0  # of a room of 4.5 x 3.5 m
         mask = cv2.imdecode(np.frombuffer(base64.b64decode(pictures["mask"]), np.uint8), cv2.IMREAD_GRAYSCALE)
         assert (mask == 255).mean() < 0.2
 

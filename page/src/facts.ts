@@ -47,7 +47,7 @@ export class Facts {
     this.box.replaceChildren(
       ...[
         this.heading(photo),
-        photo.error ? h("p", { class: `error ${photo.status}` }, photo.error) : null,
+        photo.error && photo.status !== "unreadable" ? h("p", { class: `error ${photo.status}` }, photo.error) : null, // of such the viewer tells
         photo.status === "localized" ? null : this.remedies(photo),
         pose ? this.place(photo, pose) : null,
         photo.spread && alternative === null ? this.spread(photo) : null,
@@ -135,10 +135,12 @@ export class Facts {
     const away = (pose: Pose) => length(1000 * Math.hypot(...pose.world.map((value, k) => value - photo.pose!.world[k])));
     const rows = photo.alternatives.map((other, index) => row(index, text.alternative(index + 1), other.probability, away(other.pose)));
     const isLikely = (index: number) => (photo.alternatives[index].probability ?? 1) >= 0.01;
+    const isBeaten = photo.alternatives.some((other) => (other.probability ?? 0) > photo.confidence);
     const unlikely = rows.filter((_, index) => !isLikely(index));
     return section(
       text.alternatives,
-      row(null, text.best, photo.confidence, ""),
+      isBeaten ? h("p", { class: "quiet" }, text.chosenHelp) : null,
+      row(null, isBeaten ? text.chosen : text.best, photo.confidence, ""),
       ...rows.filter((_, index) => isLikely(index)),
       unlikely.length ? this.unlikely(unlikely, model.alternative !== null && !isLikely(model.alternative)) : null,
       photo.probabilityNone === null

@@ -242,6 +242,7 @@ function print(): void {
 function onKey(event: KeyboardEvent): void {
   const target = event.target as HTMLElement;
   const isTyping = target.matches("input, select, textarea") || document.querySelector("dialog[open]");
+  if (event.key === "Escape" && model.isMeasuring && !document.querySelector("dialog[open]")) return viewer.toggleMeasuring();
   if (event.key === "Escape" && model.selected !== null && !document.querySelector("dialog[open]")) {
     if (document.body.classList.contains("showing-list") || document.body.classList.contains("showing-facts")) {
       document.body.classList.remove("showing-list", "showing-facts");
@@ -255,6 +256,7 @@ function onKey(event: KeyboardEvent): void {
     PageDown: () => model.step(1),
     PageUp: () => model.step(-1),
     d: () => viewer.toggleDifferences(),
+    m: () => viewer.toggleMeasuring(),
     "/": () => byId("search").focus(),
     "?": () => byId<HTMLDialogElement>("help").showModal(),
   };
@@ -284,7 +286,7 @@ function keepAddress(): void {
   model.on("selected", () => {
     if (!isFollowing) set(true);
   });
-  model.on("view mode alternative", () => {
+  model.on("view mode alternative measure", () => {
     clearTimeout(late);
     late = window.setTimeout(() => set(false), 250);
   });

@@ -1,4 +1,5 @@
 /** What is chosen on the page, and who wants to know of it. */
+import type { Spot } from "./measure";
 import { STATUSES, type Photo, type Report, type Status } from "./types";
 
 export type Mode = "photo" | "blend" | "split" | "scan";
@@ -21,6 +22,9 @@ export class Model {
   mode: Mode = "photo";
   amount = 0.5;
   showsDifferences = false;
+  isMeasuring = false;
+  /** Between which it is measured, none to two, of any photos. */
+  spots: Spot[] = [];
   view: View = { yaw: 0, pitch: 0, fov: FOV };
   search = "";
   statuses = new Set<Status>(STATUSES);
@@ -95,6 +99,7 @@ export class Model {
     const at = this.report.photos.indexOf(photo);
     if (this.photo === photo) this.select(null);
     this.report.photos.splice(at, 1);
+    this.spots = []; // they know their photos by place
     if (this.selected !== null && this.selected > at) this.selected--;
     this.list();
   }

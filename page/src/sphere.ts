@@ -213,6 +213,21 @@ export class Sphere {
     return { x: (width / 2) * (1 - left / depth / tx), y: (height / 2) * (1 - up / depth / ty) };
   }
 
+  /** The direction of the plan's frame, unit, that a place on the canvas [px] shows. */
+  rayAt(x: number, y: number): Vector {
+    const { yaw, pitch } = this.view;
+    const { clientWidth: width, clientHeight: height } = this.canvas;
+    const left = (1 - (2 * x) / width) * this.tangents[0];
+    const up = (1 - (2 * y) / height) * this.tangents[1];
+    const ahead = Math.cos(pitch) - Math.sin(pitch) * up;
+    const ray = [Math.cos(yaw) * ahead - Math.sin(yaw) * left, Math.sin(yaw) * ahead + Math.cos(yaw) * left, Math.sin(pitch) + Math.cos(pitch) * up];
+    return ray.map((value) => value / Math.hypot(...ray)) as Vector;
+  }
+
+  get photoWidth(): number {
+    return this.content?.photo.width ?? 1;
+  }
+
   /** Angle [rad] of a pixel in the middle of the canvas. */
   get pixelAngle(): number {
     return (2 * this.tangents[1]) / Math.max(1, this.canvas.clientHeight);

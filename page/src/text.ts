@@ -3,6 +3,9 @@ import type { Status } from "./types";
 
 const plural = (count: number, one: string, many: string): string => (count === 1 ? one : many);
 
+/** Of a length [m], by its deviation. */
+const digits = (deviation: number | null): number => (deviation !== null && deviation < 0.0995 ? 3 : 2);
+
 export const text = {
   skip: "Skip to the list of photos",
   photos: (count: number) => `${count} ${plural(count, "photo", "photos")}`,
@@ -62,6 +65,17 @@ export const text = {
   split: "Where photo and scan meet",
   differences: "Differences",
   differencesHelp: "Marks what contradicts the scan: things moved, added or taken away since",
+  measure: "Measure",
+  measureHelp: "Distance between two points of the scan (M)",
+  pick: ["Pick a point: click, tap, or press Enter to take the middle.", "Pick the second point, here or in another photo."],
+  notScanned: "Nothing was scanned there. Pick another point.",
+  noDepth: "Here is no depth to measure by: choose the best pose, or another photo.",
+  atEdge: "At an edge: what lies in front and behind are far apart.",
+  unsurePose: "The pose of this photo is not sure, and neither is the distance.",
+  distance: (metres: number, deviation: number | null) =>
+    metres.toFixed(digits(deviation)) + (deviation === null ? " m" : digits(deviation) > 2 ? ` m ± ${(1000 * deviation).toFixed(0)} mm` : ` m ± ${deviation.toFixed(2)} m`),
+  parts: (level: number, upright: number, deviation: number | null) => `, ${level.toFixed(digits(deviation))} m horizontal, ${upright.toFixed(digits(deviation))} m vertical`,
+  copyDistance: "Copy distance",
   noScan: "No pose was found, so there is no view of the scan.",
   noPictures: "The photo's file was not there when this report was made. Its pose and facts are.",
   loading: "Loading the photo",
@@ -88,6 +102,8 @@ export const text = {
   alternative: (index: number) => `Alternative ${index}`,
   unlikely: (count: number) => `${count} more, each below 1 %`,
   best: "Best pose",
+  chosen: "Chosen pose",
+  chosenHelp: "The chosen pose loses least to any other, each pair compared over what both see. Its probability is not the highest: the photo does not tell them apart.",
   none: "None of these",
   warnings: "Notes",
   about: "Photo",
@@ -117,6 +133,7 @@ export const text = {
     ["P, Page Up", "previous photo"],
     ["1 2 3 4", "photo, blend, split, scan"],
     ["D", "mark differences"],
+    ["M", "measure: Enter picks the middle, Esc ends"],
     ["Esc", "back to the plan"],
     ["/", "search"],
   ] as [string, string][],

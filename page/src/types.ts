@@ -27,6 +27,8 @@ export interface Alternative {
 export interface Spread {
   /** Half axes [m] and direction of the larger one, counterclockwise from +x [deg], of 95 %. */
   ellipse: Vector;
+  /** Of the turn about the camera's axes [rad] and the position on the plan [m]: rows from the diagonal on. */
+  covariance: number[];
   mm: Vector;
   deg: Vector;
   largest: number;
@@ -110,8 +112,8 @@ export interface Pictures {
   sphere: string;
   scan?: string;
   mask?: string;
-  /** How far one can see, 96 x 48 bytes of a sphere [0.1 m]. */
-  reach?: string;
+  /** Ranges of the scan, packed. */
+  depth?: string;
   alternatives?: (string | null)[];
 }
 

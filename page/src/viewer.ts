@@ -1,8 +1,10 @@
 /** The photo that is opened: the sphere, what is drawn over it, and the ways to other photos. */
 import { h } from "./dom";
 import { FOV, type Mode, type Model } from "./model";
+import { type Depth, inCamera, samplesAround } from "./measure";
 import { imagesOf } from "./pictures";
 import { labelOf } from "./plan_painter";
+import { Ruler } from "./ruler";
 import { Sphere } from "./sphere";
 import { text } from "./text";
 import type { Photo, Pose, Vector } from "./types";
@@ -11,8 +13,10 @@ const MODES: Mode[] = ["photo", "blend", "split", "scan"];
 const REACH = 9; // m, to photos that one can go to
 const APART = 0.6; // rad, between ways to them
 const MOST_WAYS = 7;
-const REACH_WIDTH = 96; // px of the sphere that tells how far one can see
-const SLACK = 0.4; // m, of that
+const FAR = 25; // m, of what was not scanned
+const SLACK = 0.4; // m
+const HERE = 0.3; // m, to photos of the same place
+const CLICK = 6; // px, of a pointer that does not turn the view
 const FOOT = 1.5; // m, height of a camera where no floor is known
 
 interface Way {
@@ -28,6 +32,9 @@ export class Viewer {
   private ways: Way[] = [];
   private asked = 0;
   private pointers = new Map<number, { x: number; y: number }>();
+  /** Where the pointer went down that has not turned the view. */
+  private click: { x: number; y: number } | null = null;
+  private readonly ruler: Ruler;
   private readonly canvas = h("canvas", { class: "sphere" });
   private readonly waysBox = h("div", { class: "ways" });
   private readonly note = h("p", { class: "viewer-note", role: "status" });
@@ -52,9 +59,11 @@ export class Viewer {
       text.differences,
     );
     const modes = h("div", { class: "segments", role: "group", "aria-label": text.modesLabel }, ...this.modeButtons);
-    this.bar = h("div", { class: "viewer-bar" }, modes, this.slider, this.differences);
     this.look.append(this.canvas);
-    box.append(this.look, this.divider, this.waysBox, this.note, this.bar);
+    box.append(this.look, this.waysBox);
+    this.ruler = new Ruler(model, box);
+    this.bar = h("div", { class: "viewer-bar" }, modes, this.slider, this.differences, this.ruler.button);
+    box.append(this.divider, this.note, h("div", { class: "viewer-foot" }, this.ruler.panel, this.bar));
     this.listen();
     model.on("selected", () => void this.open());
     model.on("alternative", () => void this.open());
@@ -67,8 +76,14 @@ export class Viewer {
     look.addEventListener("pointerdown", (event) => {
       look.setPointerCapture(event.pointerId);
       this.pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      this.click = this.pointers.size === 1 ? { x: event.clientX, y: event.clientY } : null;
     });
     look.addEventListener("pointermove", (event) => this.drag(event));
+    look.addEventListener("pointerup", (event) => {
+      const box = look.getBoundingClientRect();
+      const isPick = this.click && this.model.isMeasuring && event.button === 0;
+      if (isPick) this.ruler.pick(event.clientX - box.left, event.clientY - box.top, event.pointerType === "touch");
+    });
     for (const name of ["pointerup", "pointercancel"] as const) {
       look.addEventListener(name, (event) => this.pointers.delete(event.pointerId));
     }
@@ -95,9 +110,15 @@ export class Viewer {
     new ResizeObserver(() => this.looked()).observe(this.box);
   }
 
+  toggleMeasuring(): void {
+    this.ruler.toggle();
+  }
+
   private drag(event: PointerEvent): void {
     const before = this.pointers.get(event.pointerId);
     if (!before || !this.sphere) return;
+    if (this.click && Math.hypot(event.clientX - this.click.x, event.clientY - this.click.y) < CLICK) return;
+    this.click = null;
     const other = [...this.pointers].find(([id]) => id !== event.pointerId)?.[1];
     const angle = this.sphere.pixelAngle;
     if (other) {
@@ -121,7 +142,11 @@ export class Viewer {
       "-": [0, 0, 1.18],
     };
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (turns[event.key]) this.turn(...turns[event.key]);
+    const { clientWidth, clientHeight } = this.canvas;
+    const [yaw, pitch, zoom] = turns[event.key] ?? [];
+    const part = event.shiftKey ? 0.1 : 1; // finely, to aim
+    if (zoom) this.turn(part * yaw, part * pitch, zoom);
+    else if (event.key === "Enter" && this.model.isMeasuring) this.ruler.pick(clientWidth / 2, clientHeight / 2, false);
     else if (event.key === "0") this.level();
     else return;
     event.preventDefault();
@@ -164,11 +189,12 @@ export class Viewer {
     const { photo } = this.model;
     const asked = ++this.asked;
     this.findWays(null);
+    this.combine();
     if (!photo) return;
     if (!photo.hasPictures) return this.say(photo.error ?? text.noPictures, true);
     if (!this.sphere) {
       try {
-        this.sphere = new Sphere(this.canvas);
+        this.ruler.sphere = this.sphere = new Sphere(this.canvas);
       } catch {
         return this.say(text.noWebGL, true);
       }
@@ -183,7 +209,8 @@ export class Viewer {
       this.looked();
       this.sphere.show({ photo: images.sphere, scan, mask: alternative === null ? images.mask : null, rotation }, true);
       this.say(photo.pose ? "" : text.noScan, false);
-      this.findWays(images.reach);
+      this.findWays(images.depth);
+      this.model.changed("measure");
       this.combine();
       this.box.dataset.shown = String(this.model.selected);
     } catch {
@@ -218,18 +245,19 @@ export class Viewer {
   private looked(): void {
     this.sphere?.look(this.model.view);
     this.placeWays();
+    this.ruler.place();
   }
 
   /** The photos around that one can go to: the nearest in each direction, of those that the scan lets one see. */
-  private findWays(reach: Uint8Array | null): void {
+  private findWays(depth: Depth | null): void {
     const from = this.pose;
     this.waysBox.replaceChildren();
     this.ways = [];
-    if (!from || !reach || this.model.alternative !== null) return;
+    if (!from || !depth || this.model.alternative !== null) return;
     for (const [index, photo, metres] of this.near(from)) {
       const way = this.wayTo(index, photo, metres, from);
-      const isFree = this.ways.every((other) => angleBetween(other.to, way.to) > APART);
-      if (!isFree || !isSeen(reach, from, photo.pose!, metres)) continue;
+      const isFree = metres < HERE || this.ways.every((other) => other.metres < HERE || angleBetween(other.to, way.to) > APART);
+      if (!isFree || !isSeen(depth, this.model.photo!, photo.pose!, metres)) continue;
       this.ways.push(way);
       if (this.ways.length === MOST_WAYS) break;
     }
@@ -240,13 +268,15 @@ export class Viewer {
   private near(from: Pose): [number, Photo, number][] {
     const { report, selected, photo } = this.model;
     const found: [number, Photo, number][] = [];
+    const here: [number, Photo, number][] = [];
     report.photos.forEach((other, index) => {
       const isThere = other.pose && other.status === "localized" && other.storey === photo?.storey;
       if (index === selected || !isThere) return;
       const metres = Math.hypot(...other.pose!.center.map((value, axis) => value - from.center[axis]));
-      if (metres > 0.15 && metres < REACH) found.push([index, other, metres]);
+      if (metres < REACH) (metres < HERE ? here : found).push([index, other, metres]);
     });
-    return found.sort((a, b) => a[2] - b[2]);
+    const next = here.find(([index]) => index > selected!) ?? here[0]; // round, through all of one place
+    return [...(next ? [next] : []), ...found.sort((a, b) => a[2] - b[2])];
   }
 
   private wayTo(index: number, photo: Photo, metres: number, from: Pose): Way {
@@ -278,13 +308,10 @@ export class Viewer {
 }
 
 /** True if no wall is between two cameras, by how far one can see from the first. */
-function isSeen(reach: Uint8Array, from: Pose, other: Pose, metres: number): boolean {
-  const d = other.center.map((value, axis) => value - from.center[axis]);
-  const r = from.rotation;
-  const [x, y, z] = [0, 3, 6].map((row) => r[row] * d[0] + r[row + 1] * d[1] + r[row + 2] * d[2]);
-  const column = Math.floor((0.5 - Math.atan2(y, x) / (2 * Math.PI)) * REACH_WIDTH) % REACH_WIDTH;
-  const row = Math.min(REACH_WIDTH / 2 - 1, Math.floor((0.5 - Math.atan2(z, Math.hypot(x, y)) / Math.PI) * (REACH_WIDTH / 2)));
-  return reach[row * REACH_WIDTH + column] / 10 > metres - SLACK;
+function isSeen(depth: Depth, photo: Photo, other: Pose, metres: number): boolean {
+  const to = other.center.map((value, axis) => value - photo.pose!.center[axis]) as Vector;
+  const ranges = samplesAround(depth, inCamera(photo, to)).map(([, range]) => Math.min(range || FAR, FAR));
+  return ranges.reduce((sum, range) => sum + range, 0) / ranges.length > metres - SLACK;
 }
 
 function angleBetween(a: Vector, b: Vector): number {

@@ -253,6 +253,7 @@ def place_discs(
     """
     R = R_cam_from_world
     step = math.tau / width
+    least = float(MIN_RADIUS_PX) * step
     for n in range(len(radii)):
         dx = points[0][n] - center_world[0]
         dy = points[1][n] - center_world[1]
@@ -277,7 +278,7 @@ def place_discs(
         disc[7] = 1.0 / (radius * radius)
         disc[8] = distance
         level = math.hypot(disc[0], disc[1])
-        angle = max(math.asin(radius / distance), MIN_RADIUS_PX * step)
+        angle = max(math.asin(radius / distance), least)
         sine = math.sin(angle) * distance  # over the level part of the range: that of the azimuth, of a cap
         extents[n, 0], extents[n, 1] = direction_to_pixel(disc[0], disc[1], disc[2], level, width)
         extents[n, 2] = (math.asin(sine / level) if sine < level else math.pi) / step
