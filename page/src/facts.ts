@@ -47,7 +47,7 @@ export class Facts {
     this.box.replaceChildren(
       ...[
         this.heading(photo),
-        photo.error && photo.status !== "unreadable" ? h("p", { class: `error ${photo.status}` }, photo.error) : null, // of such the viewer tells
+        photo.error && this.tells(photo) ? h("p", { class: `error ${photo.status}` }, photo.error) : null,
         photo.status === "localized" ? null : this.remedies(photo),
         pose ? this.place(photo, pose) : null,
         photo.spread && alternative === null ? this.spread(photo) : null,
@@ -58,6 +58,11 @@ export class Facts {
         photo.warnings.length ? section(text.warnings, h("ul", { class: "notes" }, ...photo.warnings.map((w) => h("li", {}, w)))) : null,
       ].filter((part) => part !== null),
     );
+  }
+
+  /** Of an unreadable photo the viewer says why, unless something can be done about it here. */
+  private tells(photo: Photo): boolean {
+    return photo.status !== "unreadable" || this.model.report.service !== undefined;
   }
 
   private heading(photo: Photo): HTMLElement {

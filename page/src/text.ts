@@ -77,6 +77,7 @@ export const text = {
   parts: (level: number, upright: number, deviation: number | null) => `, ${level.toFixed(digits(deviation))} m horizontal, ${upright.toFixed(digits(deviation))} m vertical`,
   copyDistance: "Copy distance",
   noScan: "No pose was found, so there is no view of the scan.",
+  noPicture: "There is no picture of it.",
   noPictures: "The photo's file was not there when this report was made. Its pose and facts are.",
   loading: "Loading the photo",
   failed: "This photo's pictures could not be loaded.",

@@ -191,7 +191,8 @@ export class Viewer {
     this.findWays(null);
     this.combine();
     if (!photo) return;
-    if (!photo.hasPictures) return this.say(photo.error ?? text.noPictures, true);
+    const isTold = photo.status === "unreadable" && this.model.report.service; // by the facts, with a remedy
+    if (!photo.hasPictures) return this.say(isTold ? text.noPicture : (photo.error ?? text.noPictures), true);
     if (!this.sphere) {
       try {
         this.ruler.sphere = this.sphere = new Sphere(this.canvas);
