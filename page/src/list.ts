@@ -74,9 +74,9 @@ export class List {
     const index = this.model.listed[place];
     const photo = this.model.report.photos[index];
     const isSelected = index === this.model.selected;
-    const picture = photo.thumb
-      ? h("img", { src: photo.thumb, alt: "", width: 96, height: 60, decoding: "async" })
-      : h("span", { class: "no-picture", "aria-hidden": "true" }, badge(photo.status));
+    const without = () => h("span", { class: "no-picture", "aria-hidden": "true" }, badge(photo.status));
+    const picture = photo.thumb ? h("img", { src: photo.thumb, alt: "", width: 96, height: 60, decoding: "async" }) : without();
+    picture.addEventListener("error", () => picture.replaceWith(without()));
     const row = h(
       "div",
       {
