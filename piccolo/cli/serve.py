@@ -15,7 +15,7 @@ from ..jobs.memory import GB, memory_taken
 from ..jobs.threads import num_cores
 from ..scan_map.open_map import CachePolicy
 from ..service.desk import Limits, open_desk
-from .command import Arguments, checking_options, command, option
+from .command import Arguments, UsageError, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, add_method_options
 from .settings import localizer_from
 
@@ -32,6 +32,7 @@ address. Photos are not kept without --keep. A scan that is replaced is opened a
 the photos at work finish. Needs the extra serve.
 """
 TOKEN = re.compile(r"[\w-]{8,200}", re.ASCII)
+ANY = ("0.0.0.0", "::")
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MEGABYTE = 1e6
 GRACE_S = 5.0  # [s] for answers to be sent, beyond those of a photo
@@ -72,6 +73,8 @@ def main(arguments: Arguments) -> int:
         localizer = localizer_from(arguments, tuple(arguments.cloud))
     if a.keep and not a.keep.is_dir():
         raise InputError(f"{a.keep}: found no folder, wanted one that exists")
+    if a.quiet and not a.token and a.host not in LOOPBACK:
+        raise UsageError("--quiet: the token would not be printed, wanted --token")
     token = choose_token(a.host, a.token)
     limits = Limits(
         int(a.max_megabytes * MEGABYTE), a.max_megapixels * MEGABYTE, a.max_waiting, a.max_seconds
@@ -84,16 +87,21 @@ def main(arguments: Arguments) -> int:
         desk = partial(open_desk, localizer, a.jobs, limits, a.keep is not None, a.workers())
         service = Service(desk, limits, a.keep)
         a.warn(service.desk.scan_map.warnings)
-        name, port = server.getsockname()[:2]
-        query = f"enter?token={token}" if token else ""
-        a.note(
-            f"open http://{f'[{name}]' if ':' in name else name}:{port}/{query} in a browser; Ctrl-C ends it"
-        )
+        a.note(f"open {page_address(server, token)} in a browser; Ctrl-C ends it")
         own = {"log_level": "warning", "access_log": False, "server_header": False}
         grace = int(limits.seconds + GRACE_S)
         config = uvicorn.Config(make_app(service, token), timeout_graceful_shutdown=grace, **own)
         uvicorn.Server(config).run(sockets=[server])
     return 0
+
+
+def page_address(server: socket.socket, token: str | None) -> str:
+    """Return the page's address, with the token if there is one."""
+    name, port = server.getsockname()[:2]
+    if name in ANY:
+        name = socket.gethostname()
+    host = f"[{name}]" if ":" in name else name
+    return f"http://{host}:{port}/{f'enter?token={token}' if token else ''}"
 
 
 def choose_token(host: str, path: Path | None) -> str | None:
@@ -111,5 +119,5 @@ def listening(host: str, port: int) -> socket.socket:
     try:
         return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
     except (OSError, OverflowError) as error:
-        reason = getattr(error, "strerror", None) or error
+        reason = str(getattr(error, "strerror", None) or error).partition(" (while")[0]
         raise InputError(f"--host {host} --port {port}: cannot be listened at ({reason})") from error
