@@ -105,8 +105,8 @@ class Service:
 
     async def show(self, request: Request) -> Response:
         """Return a photo for the page: a line with its result, then a line with its pictures."""
-        desk = self.desk
         async with self.asking(request) as (task, _):
+            desk = self.desk
             result = await self.answer(desk, task)
         (short,) = site.shorten_names([result.pano])
         shown = site.Entry(result, None, 0.0)
