@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from hashlib import sha256
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from .. import __version__
@@ -22,6 +21,7 @@ from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..confidence.focal_length import Consensus
 from ..confidence.localization import FocalLength
 from ..errors import InputError, is_passing
+from ..files.atomic import temporary_folder
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
@@ -186,12 +186,12 @@ class Task(NamedTuple):
         if self.files is None:
             yield replace(self.photo, picture=folder / self.photo.path)
             return
-        with TemporaryDirectory(prefix="piccolo-") as temporary:
+        with temporary_folder() as temporary:
             for name, content in self.files.items():
-                path = Path(temporary) / name
+                path = temporary / name
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_bytes(content)
-            yield replace(self.photo, picture=Path(temporary) / self.photo.path.name)
+            yield replace(self.photo, picture=temporary / self.photo.path.name)
 
 
 def files_of(pano: Path) -> dict[str, bytes]:
@@ -226,7 +226,7 @@ class Localizer:
     makes_overlays: bool = False
     makes_occlusion_masks: bool = False
     folder: Path = Path()  # which paths are relative to
-    map_name: str | None = None  # of the map's file that a cluster's workers have been sent
+    map_name: str | None = None  # of a map's file: absolute, or as a cluster's workers have been sent it
     sends_photos: bool = False
 
     @property
@@ -284,7 +284,8 @@ class Localizer:
     def open_scan(self, workers: Workers) -> OpenedScan:
         """Read and prepare the scan."""
         if self.map_name:
-            scan_map = load_map(find_sent_file(self.map_name))
+            path = Path(self.map_name)
+            scan_map = load_map(path if path.is_absolute() else find_sent_file(self.map_name))
             return OpenedScan(scan_map, self.name, self.cloud_settings, self.settings, workers, {})
         paths = [self.folder / path for path in self.paths]
         scan = open_files(paths, self.cloud_settings, self.settings, self.cache, workers)

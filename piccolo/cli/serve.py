@@ -1,9 +1,11 @@
 """Serve a scan: a page to drop photos on, which shows where they were taken, and the same for programs."""
 
+import os
 import re
 import secrets
 import socket
 from argparse import ArgumentParser
+from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,7 +15,6 @@ from ..files.atomic import temporary_folder
 from ..files.json_file import read_text
 from ..jobs.memory import GB, memory_taken
 from ..jobs.threads import num_cores
-from ..scan_map.open_map import CachePolicy
 from ..service.desk import Limits, open_desk
 from .command import Arguments, UsageError, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, add_method_options
@@ -32,8 +33,8 @@ address. Photos are not kept without --keep. A scan that is replaced is opened a
 the photos at work finish. Needs the extra serve.
 """
 TOKEN = re.compile(r"[\w-]{8,200}", re.ASCII)
+HERE = "127.0.0.1"
 ANY = ("0.0.0.0", "::")
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 MEGABYTE = 1e6
 GRACE_S = 5.0  # [s] for answers to be sent, beyond those of a photo
 
@@ -45,7 +46,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--cache FOLDER", CACHE_TEXT)
     add_method_options(parser)
     group = parser.add_argument_group("service")
-    option(group, "--host NAME", "address to listen at", default=LOOPBACK[0])
+    option(group, "--host NAME", "address to listen at", default=HERE)
     option(group, "--port N", "port to listen at; 0: any that is free", default=8765)
     text = "file with the token that others must know (default with another --host: a new one, printed)"
     option(group, "--token FILE", text)
@@ -67,7 +68,8 @@ def main(arguments: Arguments) -> int:
     uvicorn = import_optional("tools/serve.py", "uvicorn", "serve")
     for module in ("starlette", "python_multipart"):
         import_optional("tools/serve.py", module, "serve")
-    from ..service.app import Service, make_app  # noqa: PLC0415  # after the extra is known to be there
+    from ..service.app import MAX_WALKS, Service, make_app  # noqa: PLC0415  # the extra is known to be there
+    from ..service.guard import LOOPBACK  # noqa: PLC0415
 
     with checking_options():
         localizer = localizer_from(arguments, tuple(arguments.cloud))
@@ -75,23 +77,23 @@ def main(arguments: Arguments) -> int:
         raise InputError(f"{a.keep}: found no folder, wanted one that exists")
     if a.quiet and not a.token and a.host not in LOOPBACK:
         raise UsageError("--quiet: the token would not be printed, wanted --token")
-    token = choose_token(a.host, a.token)
+    token = None if a.host in LOOPBACK and not a.token else choose_token(a.token)
     limits = Limits(
         int(a.max_megabytes * MEGABYTE), a.max_megapixels * MEGABYTE, a.max_waiting, a.max_seconds
     )
-    memory = a.max_memory and (a.max_memory - memory_taken() / GB) / a.jobs
+    memory = a.max_memory and (a.max_memory - memory_taken() / GB) / (a.jobs + MAX_WALKS)
     localizer = replace(localizer, max_memory=memory)
     with listening(a.host, a.port) as server, temporary_folder() as folder:
-        if not localizer.cache.is_used:  # the processes open what is prepared here
-            localizer = replace(localizer, cache=CachePolicy(folder=folder))
+        os.environ["TMPDIR"] = str(folder)  # of the processes: what a killed one leaves goes at the end
         desk = partial(open_desk, localizer, a.jobs, limits, a.keep is not None, a.workers())
-        service = Service(desk, limits, a.keep)
+        service = Service(desk, limits, a.keep, token)
         a.warn(service.desk.scan_map.warnings)
         a.note(f"open {page_address(server, token)} in a browser; Ctrl-C ends it")
         own = {"log_level": "warning", "access_log": False, "server_header": False}
         grace = int(limits.seconds + GRACE_S)
-        config = uvicorn.Config(make_app(service, token), timeout_graceful_shutdown=grace, **own)
-        uvicorn.Server(config).run(sockets=[server])
+        config = uvicorn.Config(make_app(service), timeout_graceful_shutdown=grace, **own)
+        with closing(service):
+            uvicorn.Server(config).run(sockets=[server])
     return 0
 
 
@@ -104,14 +106,14 @@ def page_address(server: socket.socket, token: str | None) -> str:
     return f"http://{host}:{port}/{f'enter?token={token}' if token else ''}"
 
 
-def choose_token(host: str, path: Path | None) -> str | None:
-    """Return the token in a file; without one a new token, or none where only this machine may ask."""
+def choose_token(path: Path | None) -> str:
+    """Return the token in a file, or a new one."""
     if path:
         token = read_text(path, "wanted a token").strip()
         if not TOKEN.fullmatch(token):
             raise InputError(f"{path}: found no token, wanted 8 to 200 letters, digits, - and _ on one line")
         return token
-    return None if host in LOOPBACK else secrets.token_urlsafe()
+    return secrets.token_urlsafe()
 
 
 def listening(host: str, port: int) -> socket.socket:

@@ -25,6 +25,7 @@ from ..errors import InputError
 from .memory import share_arenas
 
 ATTEMPTS = 2  # to work on an item, or to open
+OPENING = 10.0  # times the seconds of an item may be spent on opening
 IN_FLIGHT = 4  # items a process, so that none waits for a slow one before
 PARENT_LOST = 1  # exit code
 # Not fork: the child would have the threads of this process stand still in the middle of their work.
@@ -43,6 +44,10 @@ Pair = tuple[Any, Callable[[], Any]]
 
 class WorkerLostError(Exception):
     """The processes at work on an item were killed, as often as it was tried; the text says how."""
+
+
+class OpeningError(InputError):
+    """A process could not open what it works with; the text says why."""
 
 
 class TooSlowError(Exception):
@@ -147,11 +152,6 @@ class Processes:
         """Begin with an item as soon as a process is free; its future raises what `Pair` says."""
         return self._threads.submit(self._value_of, item)
 
-    def finish(self) -> None:
-        """Wait until all items that were submitted are done, then close."""
-        self._threads.shutdown()
-        self.close()
-
     def close(self) -> None:
         """Kill the processes, whatever they are doing."""
         with self._starting:
@@ -192,14 +192,20 @@ class Processes:
                 (child,) = pool._processes.values()
                 self._children.append(child)
             try:
-                opened.result()
+                opened.result(self.seconds and OPENING * self.seconds)
             except BrokenProcessPool:
                 end = self._end_of(pool, child)
                 continue
+            except TimeoutError:
+                child.kill()
+                end = self._end_of(pool, child)
+                continue
+            except InputError as error:
+                raise OpeningError(str(error)) from error
             self._own.worker = pool, child
             return pool, child
         advice = "use fewer processes or more memory"
-        raise InputError(f"`jobs`: a process {end} while it opened the scan; {advice}")
+        raise OpeningError(f"`jobs`: a process {end} while it opened the scan; {advice}")
 
     def _end_of(self, pool: ProcessPoolExecutor, child: BaseProcess) -> str:
         """Return how a process ended; raises CancelledError if that was by `close`."""

@@ -7,6 +7,7 @@ import secrets
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import fields, replace
+from functools import partial
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
@@ -17,7 +18,7 @@ from starlette.applications import Starlette
 from starlette.datastructures import UploadFile
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
 
@@ -25,13 +26,13 @@ from .. import __version__
 from ..batch.localizer import Task
 from ..errors import InputError
 from ..files.atomic import write_atomically
-from ..jobs.processes import Processes, TooSlowError, WorkerLostError
+from ..jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
 from ..localization.settings import CoarseToFineSettings
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..walk.frames import Motion
-from .asking import apply_options, check_names, clean_name, make_photo, parse_options
-from .desk import Desk, Drawing, Limits, WalkDesk, look_at
+from .asking import apply_options, checked, clean_name, make_photo, parse_options
+from .desk import Desk, Drawing, Limits, look_at, open_walk
 from .guard import COOKIE, Guard, refuse
 
 LOG = logging.getLogger(__name__)
@@ -47,20 +48,23 @@ TYPES = {".js": "text/javascript", ".css": "text/css"}
 class Service:
     """Answers requests: of one event loop, while the work is done in other processes."""
 
-    def __init__(self, open_desk: Callable[[], Desk], limits: Limits, keep: Path | None) -> None:
+    def __init__(
+        self, open_desk: Callable[[], Desk], limits: Limits, keep: Path | None, token: str | None
+    ) -> None:
         self.open_desk = open_desk
         self.limits = limits
         self.keep = keep
+        self.token = token  # which who asks must know; None lets all of this machine ask
         self.desk = open_desk()
         self.num_waiting = 0
-        self.walks: dict[str, WalkDesk] = {}
+        self.walks: dict[str, tuple[Processes, float]] = {}  # with the time [s] of the last request
         self.reopening: asyncio.Task[None] | None = None
 
     def close(self) -> None:
         """End all processes."""
-        self.desk.processes.close()
-        for walk in self.walks.values():
-            walk.close()
+        self.desk.close()
+        for processes, _ in self.walks.values():
+            processes.close()
 
     async def page(self, request: Request) -> Response:
         """Return the page, or a file of it."""
@@ -79,8 +83,11 @@ class Service:
 
     async def enter(self, request: Request) -> Response:
         """Take the token from the address into a cookie."""
+        token = request.query_params.get("token", "")
+        if self.token is None or not secrets.compare_digest(token.encode(), self.token.encode()):
+            raise HTTPException(401, "found another token, wanted the one that the service printed")
         response = RedirectResponse("/", 303)
-        response.set_cookie(COOKIE, request.query_params.get("token", ""), httponly=True, samesite="lax")
+        response.set_cookie(COOKIE, self.token, httponly=True, samesite="lax")
         return response
 
     async def scan(self, request: Request) -> Response:
@@ -100,14 +107,15 @@ class Service:
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it."""
         async with self.asking(request) as (task, _):
-            result = await self.answer(self.desk, task)
+            with self.desk.in_use() as desk:
+                result = await self.answer(desk, task)
         return Response(result.to_json(), media_type="application/json")
 
     async def show(self, request: Request) -> Response:
         """Return a photo for the page: a line with its result, then a line with its pictures."""
         async with self.asking(request) as (task, _):
-            desk = self.desk
-            result = await self.answer(desk, task)
+            with self.desk.in_use() as desk:
+                result = await self.answer(desk, task)
         (short,) = site.shorten_names([result.pano])
         shown = site.Entry(result, None, 0.0)
         entry = site.document_of_entry(shown, result.pano, secrets.token_hex(16), desk.scan_map)
@@ -115,60 +123,61 @@ class Service:
 
         async def lines() -> AsyncIterator[str]:
             yield f'{{"photo": {about}, "result": {result.to_json()}}}\n'
-            yield f"{await work(desk.processes, Drawing(task, result))}\n"
+            with desk.in_use():
+                try:
+                    yield f"{await work(desk.processes, Drawing(task, result))}\n"
+                except HTTPException as error:
+                    yield f"{json.dumps({'error': error.detail})}\n"
 
         return StreamingResponse(lines(), media_type=LINES)
 
     async def begin_walk(self, request: Request) -> Response:
         """Begin a walk; return its name."""
-        for name in [name for name, walk in self.walks.items() if monotonic() - walk.used_s > IDLE_S]:
-            self.forget(name)
+        options = await read_options(request)
+        given = checked(options.get("motion", {}), {f.name for f in fields(Motion)}, "options.motion")
+        settings = self.settings_of(options)
+        for name, (_, used_s) in list(self.walks.items()):
+            if monotonic() - used_s > IDLE_S:
+                self.walks.pop(name)[0].close()
         if len(self.walks) >= MAX_WALKS:
             raise HTTPException(503, f"found {MAX_WALKS} walks at once, wanted fewer: end one", RETRY)
-        options = parse_options((await request.body()).decode(errors="replace"))
-        given = options.get("motion", {})
-        check_names(given, {f.name for f in fields(Motion)}, "options.motion")
-        localizer = self.desk.localizer
-        localizer = replace(localizer, settings=self.settings_of(options))
+        localizer = replace(self.desk.localizer, settings=settings)
+        opening = partial(open_walk, localizer, Motion(**given), self.limits.max_pixels)
         name = secrets.token_hex(8)
-        self.walks[name] = WalkDesk(localizer, Motion(**given), self.limits.seconds)
+        processes = Processes(opening, 1, localizer.num_threads, self.limits.seconds, attempts=1)
+        self.walks[name] = processes, monotonic()
         return JSONResponse({"walk": name}, 201, {"Location": f"/walks/{name}"})
 
     async def follow(self, request: Request) -> Response:
-        """Return the line of a walk's next frame, by it and the frames before."""
-        name, walk = self.find_walk(request)
-        async with self.asking(request) as (task, time):
-            line = await self.step(name, walk, walk.keep(task, time))
+        """Return the line of a walk's next frame, by it and those before; a walk that is lost is over."""
+        async with self.asking(request) as frame:
+            name, processes = self.find_walk(request)
+            self.walks[name] = processes, monotonic()
+            try:
+                line = await work(processes, frame)
+            except HTTPException as error:
+                if error.status_code == 500:
+                    self.walks.pop(name, None)
+                    processes.close()
+                raise
         return Response(line, media_type="application/json")
 
     async def end_walk(self, request: Request) -> Response:
         """Return the lines of all frames of a walk, by all of them; it is over then."""
-        name, walk = self.find_walk(request)
-        lines = await self.step(name, walk, None)
-        self.forget(name)
+        name, processes = self.find_walk(request)
+        del self.walks[name]
+        try:
+            lines = await work(processes, None)
+        finally:
+            await asyncio.to_thread(processes.close)
         return Response("".join(f"{line}\n" for line in lines), media_type=LINES)
 
-    def find_walk(self, request: Request) -> tuple[str, WalkDesk]:
-        """Return a walk that has begun and is not over, by its name."""
+    def find_walk(self, request: Request) -> tuple[str, Processes]:
+        """Return a walk that has begun and is not over: its name and its process."""
         name = request.path_params["walk"]
         if name not in self.walks:
             raise HTTPException(404, "found no such walk, wanted one that POST /walks began")
-        self.walks[name].used_s = monotonic()
-        return name, self.walks[name]
-
-    async def step(self, name: str, walk: WalkDesk, frame: object) -> Any:
-        """Ask a walk's process; a walk whose process is lost is over."""
-        try:
-            return await work(walk.processes, frame)
-        except HTTPException as error:
-            if error.status_code >= 500:
-                self.forget(name)
-            raise
-
-    def forget(self, name: str) -> None:
-        """End a walk's process, and remove its frames."""
-        if walk := self.walks.pop(name, None):
-            walk.close()
+        return name, self.walks[name][0]
 
     @asynccontextmanager
     async def asking(self, request: Request) -> AsyncIterator[tuple[Task, float | None]]:
@@ -210,7 +219,10 @@ class Service:
         if result.status == UNREADABLE:
             raise HTTPException(422, result.error)
         if self.keep:
-            await asyncio.to_thread(keep_photo, self.keep, task, result)
+            try:
+                await asyncio.to_thread(keep_photo, self.keep, task, result)
+            except OSError as error:
+                LOG.warning("%s: a photo could not be kept: %s", self.keep, error)
         return result
 
     def look_for_another_scan(self) -> None:
@@ -226,24 +238,42 @@ class Service:
             await asyncio.sleep(SETTLED_S)
         try:
             old, self.desk = self.desk, await asyncio.to_thread(self.open_desk)
-            LOG.warning("the scan was replaced: photos are localized in the new one")
+            old.retire()
+            digest = self.desk.scan_map.scan_sha256[:12]
+            LOG.warning("the scan was replaced: photos are localized in the new one, SHA-256 %s...", digest)
         except (InputError, OSError) as error:
-            self.desk = self.desk._replace(files=seen)
+            self.desk.files = seen
             LOG.warning("the scan was replaced by one that can't be opened, the old one stays: %s", error)
-        else:
-            await asyncio.to_thread(old.processes.finish)
         finally:
             self.reopening = None
 
 
 async def work(processes: Processes, item: object) -> Any:
     """Return what a process says of an item; HTTPException for what it refuses, or did not live to say."""
+    future = None
     try:
-        return await asyncio.wrap_future(processes.submit(item))
+        future = processes.submit(item)
+        return await asyncio.wrap_future(future)
+    except OpeningError as error:
+        raise HTTPException(503, f"the scan can't be opened at the moment: {error}", RETRY) from error
     except InputError as error:
         raise HTTPException(422, str(error)) from error
     except (TooSlowError, WorkerLostError) as error:
         raise HTTPException(500, f"the photo was given up: {error}") from error
+    except (RuntimeError, asyncio.CancelledError) as error:
+        if future is not None and not future.cancelled():
+            raise
+        raise HTTPException(503, "this scan, or walk, was closed meanwhile", RETRY) from error
+
+
+async def read_options(request: Request) -> dict[str, Any]:
+    """Return the options that are the body of a request."""
+    text = b""
+    async for part in request.stream():
+        text += part
+        if len(text) > MAX_OPTIONS:
+            raise HTTPException(413, f"found a larger body, wanted options of at most {MAX_OPTIONS} bytes")
+    return parse_options(text.decode(errors="replace"))
 
 
 def keep_photo(folder: Path, task: Task, result: Result) -> None:
@@ -255,8 +285,8 @@ def keep_photo(folder: Path, task: Task, result: Result) -> None:
         file.write(f"{replace(result, pano=str(path)).to_json()}\n")
 
 
-def make_app(service: Service, token: str | None) -> Starlette:
-    """Return the application of a service; with a token, only who knows it may ask."""
+def make_app(service: Service) -> Starlette:
+    """Return the application of a service."""
     routes = [
         Route("/enter", service.enter),
         Route("/scan", service.scan),
@@ -270,23 +300,11 @@ def make_app(service: Service, token: str | None) -> Starlette:
         *(Route(path, service.page) for path in ("/", "/report.js", "/app.js", "/app.css", "/plans/{name}")),
     ]
 
-    @asynccontextmanager
-    async def closing(app: Starlette) -> AsyncIterator[None]:
-        try:
-            yield
-        finally:
-            service.close()
-
-    async def refuse_http(request: Request, error: Exception) -> Response:
-        assert isinstance(error, HTTPException)
-        return refuse(error)
-
-    async def refuse_input(request: Request, error: Exception) -> Response:
-        return refuse(HTTPException(400, str(error)))
+    async def refuse_error(request: Request, error: Exception) -> Response:
+        return refuse(error if isinstance(error, HTTPException) else HTTPException(400, str(error)))
 
     return Starlette(
         routes=routes,
-        middleware=[Middleware(Guard, max_bytes=service.limits.max_bytes, token=token)],
-        exception_handlers={HTTPException: refuse_http, InputError: refuse_input},
-        lifespan=closing,
+        middleware=[Middleware(Guard, max_bytes=service.limits.max_bytes, token=service.token)],
+        exception_handlers=dict.fromkeys((HTTPException, InputError, ClientDisconnect), refuse_error),
     )

@@ -1,8 +1,9 @@
 """A request: a photo by its name and content, and its options as JSON."""
 
 import json
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -17,14 +18,15 @@ PARTS = ("photo", "prior", "gravity", "min_confidence", "time", "motion")  # of 
 # options of a photo that name no file
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}
-MAX_NAME = 80  # letters of a photo's name that are kept
+MAX_NAME = 80  # bytes of a photo's name that are kept
 NO_NAME = re.compile(r"[^\w.() +-]")  # of letters in any language, and numbers
 
 
 def clean_name(name: str) -> str:
     """Return the name of a file that was sent, as one that is no path, no option and not hidden."""
     own = NO_NAME.sub("_", printable(re.split(r"[/\\]", name)[-1])).lstrip(".-")
-    return own[-MAX_NAME:].lstrip(".- ") or "photo"
+    kept = os.fsencode(own)[-MAX_NAME:].decode(errors="ignore")
+    return kept.lstrip(".- ") or "photo"
 
 
 def parse_options(text: str) -> dict[str, Any]:
@@ -33,23 +35,22 @@ def parse_options(text: str) -> dict[str, Any]:
         options = json.loads(text) if text else {}
     except (ValueError, RecursionError) as error:
         raise InputError(f"options: found no JSON ({printable(str(error))})") from error
-    check_names(options, PARTS, "options")
-    return options if isinstance(options, dict) else {}
+    return checked(options, PARTS, "options")
 
 
-def check_names(given: object, known: Any, where: str) -> None:
-    """Refuse what is no JSON object, or has a name that is not known."""
+def checked(given: object, known: Collection[str], where: str) -> dict[str, Any]:
+    """Return a JSON object; InputError for anything else, and for a name that is not known."""
     if not isinstance(given, dict):
         raise InputError(f"{where}: found {type(given).__name__}, wanted a JSON object")
     if unknown := given.keys() - set(known):
         wanted = ", ".join(sorted(known))
         raise InputError(f"{where}: found {printable(min(unknown))[:40]!r}, wanted any of {wanted}")
+    return given
 
 
 def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
     """Return the photo with the options of its part; its calibration is JSON in place of a file."""
-    given = options.get("photo", {})
-    check_names(given, PHOTO, "options.photo")
+    given = checked(options.get("photo", {}), PHOTO, "options.photo")
     try:
         if given.get("camera") is not None:
             given = {**given, "camera": calibration_of(given["camera"], "options.photo.camera")}
@@ -60,8 +61,7 @@ def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
 
 def apply_options(settings: CoarseToFineSettings, options: Mapping[str, Any]) -> CoarseToFineSettings:
     """Return the settings of a photo: those of the service, with the request's own in their place."""
-    given = options.get("prior", {})
-    check_names(given, PRIOR, "options.prior")
+    given = checked(options.get("prior", {}), PRIOR, "options.prior")
     changed = {name: options[name] for name in ("gravity", "min_confidence") if options.get(name) is not None}
     try:
         return replace(settings, prior=replace(settings.prior, **given), **changed)

@@ -1,35 +1,36 @@
 """A scan that is open to questions: what a page shows of it, and the processes that answer.
 
-Photos come as their content and leave nothing behind: a process writes one below a folder of its own for as
-long as it is at work on it.
+Photos come as their content: a process writes one into a temporary folder for as long as it is at work on it.
 """
 
-from collections.abc import Sequence
-from contextlib import ExitStack, suppress
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from time import monotonic
+from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 from ..batch.localizer import Answer, Localizer, Task
 from ..errors import InputError
 from ..files.atomic import temporary_folder
+from ..files.json_file import DAMAGE
 from ..jobs.processes import Function, Processes
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan
 from ..panorama.picture import picture_shape
-from ..photo import Photo
 from ..report import site
 from ..report.build import WIDTH, document_of_scan
 from ..report.pictures import make_pictures
 from ..result import Result
+from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap
 from ..scan_walk import Walk
 from ..views.surfels import MAX_SURFELS, make_surfels
 from ..walk.frames import Motion
 
 PIXELS = 1e6  # in a megapixel
+MAP = "service.piccolo-map"
 
 
 class Limits(NamedTuple):
@@ -48,16 +49,9 @@ class Drawing(NamedTuple):
     result: Result
 
 
-class Frame(NamedTuple):
-    """A frame of a walk."""
-
-    photo: Photo  # at a path that lasts as long as the walk
-    name: str
-    time: float | None
-
-
-class Desk(NamedTuple):
-    """An open scan."""
+@dataclass
+class Desk:
+    """An open scan. Its processes open a map of its own, so the scan's files may be replaced meanwhile."""
 
     localizer: Localizer
     scan_map: ScanMap
@@ -65,6 +59,33 @@ class Desk(NamedTuple):
     plans: dict[str, bytes]  # PNG, by the name that the document has
     processes: Processes  # of `open_answering`
     files: object  # what `look_at` said of the scan's files
+    end: ExitStack  # of the folder of the map
+    num_users: int = 0
+    is_retired: bool = False
+
+    @contextmanager
+    def in_use(self) -> Iterator["Desk"]:
+        """Yield the desk, which stays open within this."""
+        self.num_users += 1
+        try:
+            yield self
+        finally:
+            self.num_users -= 1
+            self._close_if_idle()
+
+    def retire(self) -> None:
+        """Close when nobody uses it any more."""
+        self.is_retired = True
+        self._close_if_idle()
+
+    def close(self) -> None:
+        """Kill the processes and remove the map."""
+        self.processes.close()
+        self.end.close()
+
+    def _close_if_idle(self) -> None:
+        if self.is_retired and not self.num_users:
+            self.close()
 
 
 def open_desk(
@@ -74,22 +95,24 @@ def open_desk(
     files = look_at(localizer.paths)
     opened = localizer.open_scan(workers)
     scan_map, _ = opened.require_default_method("the service", localizer.settings)
-    scan_map.features_now(workers)
-    with temporary_folder() as folder:
-        site.begin_folder(folder)
-        document = document_of_scan(scan_map, localizer.name, folder)
-        drawn = [storey["plan"]["file"] for storey in document["storeys"] if storey["plan"]]
-        plans = {name: (folder / name).read_bytes() for name in drawn}
+    end = ExitStack()
+    folder = end.enter_context(temporary_folder())
+    write_map(scan_map, folder / MAP, workers)
+    localizer = replace(localizer, map_name=str(folder / MAP))
+    site.begin_folder(folder)
+    document = document_of_scan(scan_map, localizer.name, folder)
+    drawn = [storey["plan"]["file"] for storey in document["storeys"] if storey["plan"]]
+    plans = {name: (folder / name).read_bytes() for name in drawn}
     points = scan_map.points
     extent = [[float(axis.min()), float(axis.max())] for axis in (points.x, points.y, points.z)]
     about = {"scanSha256": scan_map.scan_sha256, "scans": list(scan_map.scan_names), "extent": extent}
     terms = {"maxBytes": limits.max_bytes, "keepsPhotos": keeps_photos}
-    service = {"note": "", "photos": [], "service": terms}
+    document |= {**about, "note": "", "photos": [], "service": terms}
     answering = partial(open_answering, localizer, limits.max_pixels)
     processes = Processes(answering, num_jobs, localizer.num_threads, limits.seconds)
     for _ in range(num_jobs):
         processes.submit(None)
-    return Desk(localizer, scan_map, document | about | service, plans, processes, files)
+    return Desk(localizer, scan_map, document, plans, processes, files, end)
 
 
 def look_at(paths: Sequence[Path]) -> list[object]:
@@ -150,38 +173,26 @@ def draw(scan: OpenedScan, surfels: Any, drawing: Drawing) -> str:
     return f'{{"thumb": "{site.data_url(thumbnail, "image/jpeg")}", "pictures": {pictures}}}'
 
 
-def open_walk(localizer: Localizer, motion: Motion) -> Function:
-    """Open what a process follows a walk with: a `Frame` gets its line, None the lines of all frames."""
-    walk = Walk(localizer.open_here(), localizer.settings, motion)
+def open_walk(localizer: Localizer, motion: Motion, max_pixels: float) -> Function:
+    """Open what a process follows a walk with.
 
-    def follow(frame: Frame | None) -> str | list[str]:
+    A frame, a `Task` with its time [s] or None, gets its line; None gets the lines of all frames. The frames
+    are kept as long as the process lives.
+    """
+    walk = Walk(localizer.open_here(), localizer.settings, motion)
+    folder = TemporaryDirectory()
+
+    def follow(frame: tuple[Task, float | None] | None) -> str | list[str]:
         if frame is None:
             return [result.to_json() for result in walk.finish()]
-        return walk.add(frame.photo, frame.time, frame.name).to_json()
+        task, time = frame
+        name = task.photo.name
+        path = Path(folder.name) / f"{len(walk.photos)}{task.photo.path.suffix}"
+        path.write_bytes((task.files or {})[name])
+        check_size(path, name, max_pixels)
+        try:
+            return walk.add(replace(task.photo, picture=path), time, name).to_json()
+        except DAMAGE as error:
+            raise InputError(str(error)) from error
 
     return follow
-
-
-class WalkDesk:
-    """A walk that is followed, frame by frame, in a process of its own."""
-
-    def __init__(self, localizer: Localizer, motion: Motion, seconds: float) -> None:
-        opening = partial(open_walk, localizer, motion)
-        self.processes = Processes(opening, 1, localizer.num_threads, seconds, attempts=1)
-        self._end = ExitStack()
-        self._folder = self._end.enter_context(temporary_folder())
-        self._count = 0
-        self.used_s = monotonic()  # [s] when it was asked last
-
-    def keep(self, task: Task, time: float | None) -> Frame:
-        """Write a frame, which lasts as long as the walk."""
-        self._count += 1
-        name = task.photo.name
-        path = self._folder / f"{self._count}{task.photo.path.suffix}"
-        path.write_bytes((task.files or {})[name])
-        return Frame(replace(task.photo, picture=path), name, time)
-
-    def close(self) -> None:
-        """End the process, and remove the frames."""
-        self.processes.close()
-        self._end.close()

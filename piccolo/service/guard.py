@@ -2,18 +2,18 @@
 
 import asyncio
 import secrets
-from collections.abc import Mapping
-from http.cookies import CookieError, SimpleCookie
+from time import monotonic
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 COOKIE = "piccolo_token"
 OPEN = ("/health", "/enter")  # paths that need no token
-LOCAL = ("127.0.0.1", "localhost", "[::1]", "::1")
+LOOPBACK = ("127.0.0.1", "localhost", "::1")
 READ_S = 60.0  # [s] for a body to arrive
 DROP_S = 10.0  # [s] for what is left of a refused one: a client that still sends would not hear the answer
 SECURITY = {
@@ -33,13 +33,15 @@ class Body:
         self._max_bytes = max_bytes
         self._num_bytes = 0
         self._is_whole = False
+        self._end_s = monotonic() + READ_S
 
     async def receive(self) -> Message:
         """Return the next part; HTTPException for one too many, or too late."""
         try:
-            message = await asyncio.wait_for(self._next(), None if self._is_whole else READ_S)
+            left_s = None if self._is_whole else self._end_s - monotonic()
+            message = await asyncio.wait_for(self._next(), left_s)
         except TimeoutError:
-            raise HTTPException(408, f"found no more of the body for {READ_S:g} s") from None
+            raise HTTPException(408, f"found a part of the body after {READ_S:g} s, wanted all") from None
         if self._num_bytes > self._max_bytes:
             raise too_large(self._max_bytes)
         return message
@@ -91,30 +93,26 @@ class Guard:
     def check(self, scope: Scope, headers: Headers) -> None:
         """Raise HTTPException for a request of a foreign host, a foreign page, or without the token."""
         host = headers.get("host", "")
-        if self.token is None and urlsplit(f"//{host}").hostname not in LOCAL:
-            raise HTTPException(403, f"found the host {host[:80]!r}, wanted localhost")
         origin = headers.get("origin")
-        if origin is not None and urlsplit(origin).netloc != host:
+        try:
+            name = urlsplit(f"//{host}").hostname
+            page = host if origin is None else urlsplit(origin).netloc
+        except ValueError:
+            raise HTTPException(403, "found no name of a host") from None
+        if self.token is None and name not in LOOPBACK:
+            raise HTTPException(403, f"found the host {host[:80]!r}, wanted localhost")
+        if origin is not None and page != host:
             raise HTTPException(403, f"found a page of {origin[:80]!r}, wanted one of this service")
-        if self.token is not None and scope["path"] not in OPEN and not self.knows_token(headers):
+        if self.token is not None and scope["path"] not in OPEN and not self.knows_token(scope, headers):
             raise HTTPException(401, "found no token, or another: open the address that the service printed")
         if int(headers.get("content-length", "0")) > self.max_bytes:
             raise too_large(self.max_bytes)
 
-    def knows_token(self, headers: Headers) -> bool:
+    def knows_token(self, scope: Scope, headers: Headers) -> bool:
         """Return True if the token came as a bearer's, or as the page's cookie."""
         scheme, _, bearer = headers.get("authorization", "").partition(" ")
-        given = bearer if scheme.lower() == "bearer" else read_cookie(headers)
+        given = bearer if scheme.lower() == "bearer" else Request(scope).cookies.get(COOKIE, "")
         return secrets.compare_digest(given.encode(), (self.token or "").encode())
-
-
-def read_cookie(headers: Mapping[str, str]) -> str:
-    """Return the token in the page's cookie; empty without."""
-    try:
-        cookie = SimpleCookie(headers.get("cookie", ""))
-    except CookieError:
-        return ""
-    return cookie[COOKIE].value if COOKIE in cookie else ""
 
 
 def too_large(max_bytes: int) -> HTTPException:
