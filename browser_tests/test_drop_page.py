@@ -40,6 +40,14 @@ LISTEN = """() => {
   };
 }"""
 
+WITHOUT_PICTURES = """() => {
+  const send = window.fetch;
+  window.fetch = async (url, how) => {
+    const [found] = (await (await send(url, how)).text()).split("\\n");
+    return new Response(found + '\\n{"error": "found no memory"}\\n');
+  };
+}"""
+
 
 @pytest.fixture(scope="session")
 def service(tmp_path_factory):
@@ -217,6 +225,46 @@ def test_a_place_is_shown_on_the_plan(visit):
     _choose(page, FLAT / "images" / "bedroom.jpg")
     _wait(page, "localized")
     assert page.evaluate("told") == {"prior": {"near": [x, y, None], "radius": 5}}
+
+
+def test_a_place_is_told_whole_or_given_up(visit):
+    page = visit()
+    page.click(".drop >> text=Options")
+    page.fill("[name=radius]", "3")
+    page.click(".options .main")
+    told = page.locator("[name=y]").evaluate("input => input.validationMessage")
+    assert told.startswith("A place needs both")
+    page.click("text=Show the place on the plan")
+    page.wait_for_selector(".options", state="hidden")
+    page.keyboard.press("Escape")
+    page.wait_for_selector(".options[open]")
+    assert page.locator("body.picking").count() == 0
+    page.fill("[name=radius]", "")
+    page.click(".options .main")
+    page.wait_for_selector(".options", state="hidden")
+
+
+def test_when_the_last_that_waits_is_taken_off_the_list_the_one_before_is_opened(visit):
+    page = visit()
+    busy = {"status": 503, "headers": {"Retry-After": "600"}, "body": '{"error": "found 32 photos"}'}
+    with _answering(page, lambda route: route.fulfill(**busy)):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector("#row-0 >> text=The service is busy")
+    with _answering(page, lambda route: route.abort()):
+        _choose(page, FLAT / "images" / "living_room.jpg")
+        page.wait_for_selector("#row-1 >> text=The connection")
+    page.click("#row-0")
+    page.click("text=Take off the list")
+    page.wait_for_selector("#photo-name >> text=living_room")
+
+
+def test_without_pictures_the_viewer_says_so(visit):
+    page = visit()
+    page.evaluate(WITHOUT_PICTURES)
+    _choose(page, FLAT / "images" / "bedroom.jpg")
+    _wait(page, "localized")
+    page.wait_for_selector("text=pictures could not be loaded")
+    assert page.locator("#row-0 img").get_attribute("src").startswith("blob:")
 
 
 def test_a_full_service_is_asked_again_and_a_lost_one_when_told_to(visit, shoot):

@@ -8,7 +8,7 @@ import { labelOf } from "./plan_painter";
 import { save } from "./table";
 import { text } from "./text";
 import type { Photo } from "./types";
-import { asJson, type Found, NO_PICTURE, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
+import { asJson, type Found, LOST, NO_PICTURE, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
 
 const AT_ONCE = 2;
 const TRIES = 6; // of a photo that a busy service sends away
@@ -110,7 +110,8 @@ export class Drop {
     const most = this.model.report.service!.maxBytes;
     for (const file of files) {
       const { options } = this;
-      const job: Job = { file, options, photo: this.blank(file), state: "queued", tries: 0, stop: new AbortController() };
+      const photo = this.blank(file, isImage(file) ? URL.createObjectURL(file) : null);
+      const job: Job = { file, options, photo, state: "queued", tries: 0, stop: new AbortController() };
       this.jobs.push(job);
       this.model.put(job.photo);
       if (file.size <= most) continue;
@@ -120,7 +121,7 @@ export class Drop {
   }
 
   /** A photo of which nothing is known, under a name that no other has. */
-  private blank(file: File): Photo {
+  private blank(file: File, thumb: string | null): Photo {
     const isTaken = (wanted: string) => this.model.report.photos.some((photo) => photo.name === wanted);
     let { name } = file;
     for (let k = 2; isTaken(name); k++) name = `${file.name} (${k})`;
@@ -128,7 +129,7 @@ export class Drop {
       ...(Object.fromEntries(NONE.map((key) => [key, null])) as unknown as Photo),
       ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, warnings: [], alternatives: [] },
       ...{ name, short: name.replace(ENDING, "$1"), key: `dropped-${this.count++}` },
-      ...{ status: "waiting", error: words.queued, thumb: isImage(file) ? URL.createObjectURL(file) : null },
+      ...{ status: "waiting", error: words.queued, thumb },
     };
   }
 
@@ -152,13 +153,14 @@ export class Drop {
       const found = await send(job.file, options, job.stop.signal);
       if (this.jobs.includes(job)) this.show(job, found);
     } catch (error) {
-      if (this.jobs.includes(job)) this.refuse(job, error as Refusal);
+      if (this.jobs.includes(job)) this.refuse(job, error instanceof Refusal ? error : new Refusal(LOST, String(error)));
     }
     this.next();
   }
 
   private show(job: Job, { photo, result, pictures }: Found): void {
     const own = pictures.then((line) => {
+      URL.revokeObjectURL(job.photo.thumb ?? ""); // which it had until now
       job.photo.thumb = line.thumb;
       this.model.list();
       return line.pictures;
@@ -194,7 +196,11 @@ export class Drop {
     job.state = "done";
     byId("announce").textContent = text.opened(labelOf(job.photo), text.status[job.photo.status]);
     if (!this.last?.result || job.result) this.last = job;
-    if (this.jobs.some(({ state }) => state !== "done")) return;
+    this.openLast();
+  }
+
+  private openLast(): void {
+    if (!this.last || this.jobs.some(({ state }) => state !== "done")) return;
     const { photo } = this.last;
     this.last = null;
     const isFree = this.model.photo === null || this.model.photo === this.opened;
@@ -204,10 +210,12 @@ export class Drop {
   }
 
   private queue(job: Job): void {
+    if (!this.jobs.includes(job)) return; // taken off the list meanwhile
+    delete window.PICCOLO_PHOTOS?.[job.photo.key]; // its text is large
     job.state = "queued";
     job.refusal = undefined;
     job.result = undefined;
-    this.replace(job, { ...this.blank(job.file), name: job.photo.name, short: job.photo.short });
+    this.replace(job, { ...this.blank(job.file, job.photo.thumb), name: job.photo.name, short: job.photo.short });
     this.next();
   }
 
@@ -216,6 +224,9 @@ export class Drop {
     this.jobs = this.jobs.filter((other) => other !== job);
     delete window.PICCOLO_PHOTOS?.[job.photo.key];
     this.model.remove(job.photo);
+    URL.revokeObjectURL(job.photo.thumb ?? "");
+    if (this.last === job) this.last = null;
+    this.openLast();
   }
 
   /** What can be done about a photo: advice if it is not localized, and buttons. */
@@ -259,10 +270,11 @@ function isImage(file: File): boolean {
 }
 
 /** True of a photo twice as wide as high, as spheres are; not of one that the browser can't read. */
-async function isSphere({ options, photo }: Job): Promise<boolean> {
+async function isSphere({ options, file }: Job): Promise<boolean> {
   if (!options.fov && !options.focal) return false; // not worth the reading
   const image = new Image();
-  image.src = photo.thumb ?? "";
+  image.src = URL.createObjectURL(file);
   await image.decode().catch(() => undefined);
+  URL.revokeObjectURL(image.src);
   return image.naturalWidth > 0 && image.naturalWidth === 2 * image.naturalHeight;
 }

@@ -242,6 +242,10 @@ function print(): void {
 function onKey(event: KeyboardEvent): void {
   const target = event.target as HTMLElement;
   const isTyping = target.matches("input, select, textarea") || document.querySelector("dialog[open]");
+  if (event.key === "Escape" && plan.onPick && !document.querySelector("dialog[open]")) {
+    event.preventDefault(); // it would close the dialog that opens
+    return plan.onPick(null);
+  }
   if (event.key === "Escape" && model.isMeasuring && !document.querySelector("dialog[open]")) return viewer.toggleMeasuring();
   if (event.key === "Escape" && model.selected !== null && !document.querySelector("dialog[open]")) {
     if (document.body.classList.contains("showing-list") || document.body.classList.contains("showing-facts")) {

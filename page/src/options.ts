@@ -31,7 +31,7 @@ export class OptionsDialog {
       field("y", null, null),
       field("radius", 0.1, 1e4),
       h("button", { type: "button", class: "copy", onclick: () => this.pick() }, words.pick),
-      h("button", { class: "copy main" }, words.use),
+      h("button", { class: "copy main", onclick: () => this.check() }, words.use),
     );
     const close = iconButton("close", text.close, () => this.box.close());
     this.box.append(h("div", { class: "dialog-head" }, h("h2", {}, words.options), close), form);
@@ -46,17 +46,23 @@ export class OptionsDialog {
     this.box.showModal();
   }
 
-  /** Let a click on the plan fill in the place. */
+  private check(): void {
+    const [, , x, y, radius] = this.inputs;
+    const isTold = x.value || y.value || radius.value;
+    for (const input of [x, y]) input.setCustomValidity(isTold && !input.value ? words.wholePlace : "");
+  }
+
+  /** Let a click on the plan fill in the place; Escape gives that up. */
   private pick(): void {
     const { R, origin } = this.report;
     this.box.close();
     document.body.classList.remove("showing-facts", "showing-list");
     document.body.classList.add("picking");
-    this.plan.onPick = (x, y) => {
+    this.plan.onPick = (place) => {
       this.plan.onPick = null;
       document.body.classList.remove("picking");
-      for (const [axis, name] of ["x", "y"].entries()) {
-        const metres = origin[axis] + R[axis] * x + R[3 + axis] * y;
+      for (const [axis, name] of place ? ["x", "y"].entries() : []) {
+        const metres = origin[axis] + R[axis] * place![0] + R[3 + axis] * place![1];
         this.inputs.find((input) => input.name === name)!.value = metres.toFixed(2);
       }
       this.box.showModal();

@@ -11,7 +11,7 @@ export class Plan extends PlanPainter {
   private moved = 0;
   private fitted = "";
   /** Takes the next click on the plan, a place in its frame [m], instead of opening what is there. */
-  onPick: ((x: number, y: number) => void) | null = null;
+  onPick: ((place: [number, number] | null) => void) | null = null;
 
   constructor(
     model: Model,
@@ -163,7 +163,7 @@ export class Plan extends PlanPainter {
     if (!this.pointers.delete(event.pointerId) || this.pointers.size) return;
     if (!isClick || this.moved > CLICK) return;
     const at = this.at(event);
-    if (this.onPick) return this.onPick((at.x - this.left) / this.scale, (this.top - at.y) / this.scale);
+    if (this.onPick) return this.onPick([(at.x - this.left) / this.scale, (this.top - at.y) / this.scale]);
     const found = this.photoAt(at, event.pointerType === "touch" ? 26 : 14);
     if (found !== null) this.model.select(found);
   }

@@ -15,7 +15,7 @@ export type Options = Record<string, string>;
 export interface Found {
   photo: Photo;
   result: { cloud_sha256: string | null };
-  /** Come a little later. */
+  /** Come a little later, or fail. */
   pictures: Promise<{ pictures: Pictures; thumb: string }>;
 }
 
@@ -48,8 +48,8 @@ export async function send(file: File, options: object, signal: AbortSignal): Pr
     const lines = linesOf(response.body!);
     const next = async () => JSON.parse((await lines.next()).value as string);
     const found = await next();
-    const pictures = next();
-    pictures.then(() => lines.next(), () => undefined); // to its end, or the browser counts it as broken off
+    const pictures = next().then((line) => (line.error ? Promise.reject(new Error(line.error)) : line));
+    pictures.finally(() => lines.next()).catch(() => undefined); // to its end, or the browser counts it as broken off
     return { ...found, pictures };
   } catch (error) {
     throw error instanceof Refusal ? error : new Refusal(LOST, text.drop.lost);
