@@ -31,7 +31,7 @@ from ..localization.settings import CoarseToFineSettings
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..walk.frames import Motion
-from .asking import apply_options, checked, clean_name, make_photo, parse_options
+from .asking import apply_options, check_object, clean_name, make_photo, parse_options
 from .desk import Desk, Drawing, Limits, look_at, open_walk
 from .guard import COOKIE, Guard, refuse
 
@@ -134,7 +134,7 @@ class Service:
     async def begin_walk(self, request: Request) -> Response:
         """Begin a walk; return its name."""
         options = await read_options(request)
-        given = checked(options.get("motion", {}), {f.name for f in fields(Motion)}, "options.motion")
+        given = check_object(options.get("motion", {}), {f.name for f in fields(Motion)}, "options.motion")
         settings = self.settings_of(options)
         for name, (_, used_s) in list(self.walks.items()):
             if monotonic() - used_s > IDLE_S:

@@ -35,10 +35,10 @@ def parse_options(text: str) -> dict[str, Any]:
         options = json.loads(text) if text else {}
     except (ValueError, RecursionError) as error:
         raise InputError(f"options: found no JSON ({printable(str(error))})") from error
-    return checked(options, PARTS, "options")
+    return check_object(options, PARTS, "options")
 
 
-def checked(given: object, known: Collection[str], where: str) -> dict[str, Any]:
+def check_object(given: object, known: Collection[str], where: str) -> dict[str, Any]:
     """Return a JSON object; InputError for anything else, and for a name that is not known."""
     if not isinstance(given, dict):
         raise InputError(f"{where}: found {type(given).__name__}, wanted a JSON object")
@@ -50,7 +50,7 @@ def checked(given: object, known: Collection[str], where: str) -> dict[str, Any]
 
 def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
     """Return the photo with the options of its part; its calibration is JSON in place of a file."""
-    given = checked(options.get("photo", {}), PHOTO, "options.photo")
+    given = check_object(options.get("photo", {}), PHOTO, "options.photo")
     try:
         if given.get("camera") is not None:
             given = {**given, "camera": calibration_of(given["camera"], "options.photo.camera")}
@@ -61,7 +61,7 @@ def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
 
 def apply_options(settings: CoarseToFineSettings, options: Mapping[str, Any]) -> CoarseToFineSettings:
     """Return the settings of a photo: those of the service, with the request's own in their place."""
-    given = checked(options.get("prior", {}), PRIOR, "options.prior")
+    given = check_object(options.get("prior", {}), PRIOR, "options.prior")
     changed = {name: options[name] for name in ("gravity", "min_confidence") if options.get(name) is not None}
     try:
         return replace(settings, prior=replace(settings.prior, **given), **changed)
