@@ -2,6 +2,7 @@
 
 import shutil
 import sys
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from piccolo.result import Source  # noqa: E402
 from research.synthetic import make_room  # noqa: E402
 
 ARTIFACTS = ROOT / "browser_tests" / "screenshots"
+AXE = ROOT / "page" / "node_modules" / "axe-core" / "axe.min.js"
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader"]
 
 
@@ -31,35 +33,61 @@ def browser():
         chromium.close()
 
 
-@pytest.fixture
-def open_page(browser, request):
-    """A function that opens a report; at the end nothing may have gone wrong, or been asked of anywhere."""
-    contexts, wrong = [], []
+@contextmanager
+def opening(browser, own, is_strict=True):
+    """Yield a function that opens an address; at the end nothing may have been asked of any not `own`.
+
+    Strictly, nothing else may have gone wrong either: no request failed, no error in the console.
+    """
+    contexts = []
+    wrong = []
 
     def watch(page):
-        page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("requestfailed", lambda asked: wrong.append(f"failed: {asked.url}"))
         page.on("dialog", lambda dialog: wrong.append(f"dialog: {dialog.message}"))
-        page.on("request", lambda asked: _is_local(asked.url) or wrong.append(f"asked: {asked.url}"))
+        page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(f"asked: {asked.url}"))
+        if is_strict:
+            page.on("console", lambda message: message.type == "error" and wrong.append(message.text))
+            page.on("requestfailed", lambda asked: wrong.append(f"failed: {asked.url}"))
 
-    def open_page(file, hash="", width=1440, height=900, **more):
+    def visit(address, width, height, **more):
         context = browser.new_context(viewport={"width": width, "height": height}, **more)
         contexts.append(context)
         page = context.new_page()
         watch(page)
-        page.goto(file.resolve().as_uri() + hash)
+        page.goto(address)
         page.wait_for_selector("html[data-ready]")
         return page
 
-    yield open_page
+    yield visit
     for context in contexts:
         context.close()
     assert wrong == []
 
 
-def _is_local(url):
-    return url.startswith(("file:", "data:", "blob:"))
+@pytest.fixture
+def open_page(browser):
+    """A function that opens a report from disk."""
+    with opening(browser, ("file:", "data:", "blob:")) as visit:
+
+        def open_page(file, hash="", width=1440, height=900, **more):
+            return visit(file.resolve().as_uri() + hash, width, height, **more)
+
+        yield open_page
+
+
+@pytest.fixture(scope="session")
+def find_barriers():
+    """A function that returns what axe-core finds on a page that keeps somebody from using it."""
+    source = AXE.read_text()
+
+    def find(page):
+        page.evaluate(source)
+        found = page.evaluate("axe.run({ preload: false }).then(result => result.violations)")
+        told = [(v["id"], v["impact"], [node["html"][:150] for node in v["nodes"][:3]]) for v in found]
+        return [v for v in told if v[1] in ("serious", "critical", "moderate")]
+
+    return find
 
 
 @pytest.fixture

@@ -7,13 +7,13 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+from conftest import opening
 from report_scenes import House
 
 from piccolo.result import read_results
 
 ROOT = Path(__file__).resolve().parents[1]
 FLAT = ROOT / "examples" / "flat"
-AXE = ROOT / "page" / "node_modules" / "axe-core" / "axe.min.js"
 SLOW_MS = 120_000  # for a photo, on a machine that does much else
 CHOOSER = "input[type=file][multiple]"
 PHONE = {"width": 360, "height": 740, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
@@ -66,28 +66,15 @@ def service(tmp_path_factory):
 
 @pytest.fixture
 def visit(browser, service):
-    """A function that opens the service's page; at the end nothing may have been asked of anywhere else."""
-    contexts, wrong = [], []
+    """A function that opens the service's page."""
+    with opening(browser, (service, "data:", "blob:"), is_strict=False) as visit:
 
-    def visit(width=1400, height=860, **more):
-        context = browser.new_context(viewport={"width": width, "height": height}, **more)
-        contexts.append(context)
-        page = context.new_page()
-        page.set_default_timeout(SLOW_MS)
-        page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("request", lambda asked: _is_own(asked.url, service) or wrong.append(asked.url))
-        page.goto(service)
-        page.wait_for_selector("html[data-ready]")
-        return page
+        def open_page(width=1400, height=860, **more):
+            page = visit(service, width, height, **more)
+            page.set_default_timeout(SLOW_MS)
+            return page
 
-    yield visit
-    for context in contexts:
-        context.close()
-    assert wrong == []
-
-
-def _is_own(url, service):
-    return url.startswith((service, "data:", "blob:"))
+        yield open_page
 
 
 @pytest.fixture(scope="session")
@@ -295,9 +282,8 @@ def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing(visit, shoot, scheme):
+def test_axe_finds_nothing(visit, shoot, find_barriers, scheme):
     page = visit(color_scheme=scheme)
-    source = AXE.read_text()
     for state in ("empty", "options", "refused"):
         if state == "options":
             page.click(".drop >> text=Options")
@@ -306,10 +292,7 @@ def test_axe_finds_nothing(visit, shoot, scheme):
             page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
             page.wait_for_selector("#facts >> text=What would help")
         page.wait_for_timeout(400)
-        page.evaluate(source)
-        found = page.evaluate("axe.run({ preload: false }).then(result => result.violations)")
-        told = [(v["id"], v["impact"], [node["html"][:150] for node in v["nodes"][:3]]) for v in found]
-        assert [v for v in told if v[1] in ("serious", "critical", "moderate")] == [], state
+        assert find_barriers(page) == [], state
         shoot(page, f"drop-axe-{scheme}-{state}")
 
 

@@ -53,7 +53,8 @@ def _scanned(scan, page, across, down, heading=40, pitch=-20):
     points, center, _ = scan
     box = page.locator(".look").bounding_box()
     tangent = math.tan(math.radians(FIELD / 2))
-    yaw, elevation = math.radians(90.0 - heading), math.radians(pitch)
+    yaw = math.radians(90.0 - heading)
+    elevation = math.radians(pitch)
     right = (2 * across - 1) * tangent * box["width"] / box["height"]
     up = (1 - 2 * down) * tangent
     ahead = math.cos(elevation) - math.sin(elevation) * up

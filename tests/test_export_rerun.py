@@ -63,7 +63,8 @@ def test_dots_of_a_photo_are_where_the_pinhole_that_is_read_back_projects_them(t
     assert export([photo], "rerun", tmp_path / "x.rrd", options) == {}
     found = read(tmp_path / "x.rrd")
     assert found["/scan"]["offset"] == list(ORIGIN)
-    frame, picture = found[r"/photos/a\ b.jpg"], found[r"/photos/a\ b.jpg/image"]
+    frame = found[r"/photos/a\ b.jpg"]
+    picture = found[r"/photos/a\ b.jpg/image"]
     assert (frame["confidence"], frame["status"], frame["timelines"]) == ([0.9], ["localized"], [])
     assert picture["Pinhole:resolution"] == [[width, width * 3 / 4]]
     blob = np.array(picture["EncodedImage:blob"][0], np.uint8)
@@ -74,7 +75,8 @@ def test_dots_of_a_photo_are_where_the_pinhole_that_is_read_back_projects_them(t
     for u, v in pixels:
         if min(u, v, width - u, 0.75 * width - v) < 12:
             continue
-        top, left = int(v) - 6, int(u) - 6
+        top = int(v) - 6
+        left = int(u) - 6
         part = np.maximum(gray[top : top + 13, left : left + 13], 0.0)
         rows, columns = np.indices(part.shape) + 0.5
         middle = np.array([(columns * part).sum(), (rows * part).sum()]) / part.sum() + (left, top)

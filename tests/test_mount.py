@@ -183,7 +183,8 @@ def test_a_mount_on_a_base_with_x_ahead_has_the_axes_of_the_base(tmp_path, capsy
     assert calibrate_mount.main([*words, "--axes", "piccolo", "--out", str(outs[1])]) == 0
     out, err = capsys.readouterr()
     assert err == ""
-    report, other = json.loads(out), json.loads(wrong)
+    report = json.loads(out)
+    other = json.loads(wrong)
     assert report["lever_arm_m"] == pytest.approx([0.1, 0.2, 0.5], abs=1e-5)
     z, x, y = other["std_m"]  # of forward, left, up, as which they were read
     assert report["std_m"] == pytest.approx([x, y, z])

@@ -29,7 +29,8 @@ class Client:
     """Asks a service that runs at a port."""
 
     def __init__(self, port, process):
-        self.port, self.process = port, process
+        self.port = port
+        self.process = process
 
     def ask(self, method, path, body=b"", **headers):
         """Status, headers and body of an answer."""

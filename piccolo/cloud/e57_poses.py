@@ -17,7 +17,8 @@ from ..geometry.pose import OPENGL_FROM_CAM, Pose, quaternion_wxyz, turn_axes
 from .readers.e57 import E57Image, list_images
 from .readers.e57_file import HEADER, NAMESPACE, PAGE_CONTENT, PAGE_SIZE, read_section
 
-ROTATION, TRANSLATION = ("".join(f'<{k} type="Float">%r</{k}>' for k in names) for names in ("wxyz", "xyz"))
+ROTATION = "".join(f'<{k} type="Float">%r</{k}>' for k in "wxyz")
+TRANSLATION = "".join(f'<{k} type="Float">%r</{k}>' for k in "xyz")
 POSE = f"""<pose type="Structure"><rotation type="Structure">{ROTATION}</rotation>
 <translation type="Structure">{TRANSLATION}</translation></pose>"""
 # a sphere's middle is its +x, a pinhole looks along -z (ASTM E2807)

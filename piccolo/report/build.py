@@ -1,7 +1,7 @@
 """A report of results in a scan: facts, plans, and the pictures of each photo, taken up where stopped."""
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import KW_ONLY, dataclass
 from os import PathLike
@@ -148,8 +148,13 @@ def make_task(entry: site.Entry, scan_map: ScanMap, settings: ReportSettings) ->
         digest = ""
     parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
-    found = [result.best_pose, *(a.pose for a in result.alternatives)] if result.best_pose else []
-    return Task(entry, photo, key, [scan_map.from_world(pose) for pose in found if pose])
+    return Task(entry, photo, key, list_poses(result, scan_map.from_world))
+
+
+def list_poses(result: Result, from_world: Callable[[Pose], Pose]) -> list[Pose]:
+    """Return the best pose and the alternatives in the map's frame; none of a photo without a pose."""
+    found = [result.best_pose, *(alternative.pose for alternative in result.alternatives)]
+    return [from_world(pose) for pose in found if pose]
 
 
 def write_pictures(

@@ -32,7 +32,7 @@ from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..walk.frames import Motion
 from .asking import apply_options, check_object, clean_name, make_photo, parse_options
-from .desk import Desk, Drawing, Limits, look_at, open_walk
+from .desk import Desk, Drawing, Limits, content_of, look_at, open_walk
 from .guard import COOKIE, Guard, refuse
 
 LOG = logging.getLogger(__name__)
@@ -156,7 +156,7 @@ class Service:
             try:
                 line = await work(processes, frame)
             except HTTPException as error:
-                if error.status_code == 500:
+                if error.status_code >= 500:
                     self.walks.pop(name, None)
                     processes.close()
                 raise
@@ -237,8 +237,9 @@ class Service:
         while seen != (seen := look_at(paths)):
             await asyncio.sleep(SETTLED_S)
         try:
-            old, self.desk = self.desk, await asyncio.to_thread(self.open_desk)
-            old.retire()
+            desk = await asyncio.to_thread(self.open_desk)
+            self.desk.retire()
+            self.desk = desk
             digest = self.desk.scan_map.scan_sha256[:12]
             LOG.warning("the scan was replaced: photos are localized in the new one, SHA-256 %s...", digest)
         except (InputError, OSError) as error:
@@ -278,7 +279,7 @@ async def read_options(request: Request) -> dict[str, Any]:
 
 def keep_photo(folder: Path, task: Task, result: Result) -> None:
     """Write a photo into a folder, under a name that no other has, and its line after those there."""
-    content = (task.files or {})[task.photo.name]
+    content = content_of(task)
     path = folder / f"{sha256(content).hexdigest()[:12]}-{task.photo.name}"
     write_atomically(path, content)
     with (folder / "results.jsonl").open("a") as file:

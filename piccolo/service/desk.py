@@ -18,9 +18,9 @@ from ..files.json_file import DAMAGE
 from ..jobs.processes import Function, Processes
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan
-from ..panorama.picture import picture_shape
+from ..panorama.picture import open_picture
 from ..report import site
-from ..report.build import WIDTH, document_of_scan
+from ..report.build import WIDTH, document_of_scan, list_poses
 from ..report.pictures import make_pictures
 from ..result import Result
 from ..scan_map.open_map import write_map
@@ -146,28 +146,32 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
         if item is None:
             surfels()
             return None
-        with item.place(Path()) as photo:
-            check_size(photo.path, item.photo.name, max_pixels)
+        check_size(item, max_pixels)
         return answer(item)
 
     return work
 
 
-def check_size(path: Path, name: str, max_pixels: float) -> None:
+def check_size(task: Task, max_pixels: float) -> None:
     """Refuse a picture with more pixels than a service takes, before it is decoded."""
+    name = task.photo.name
     width = height = 0
-    with suppress(InputError):  # no picture: said by what reads it
-        (width, height), _ = picture_shape(path)
+    with suppress(InputError), open_picture(Path(name), content_of(task)) as image:
+        width, height = image.size  # what is no picture is refused by what reads it
     if width * height > max_pixels:
         found = f"found {width} x {height} px"
         raise InputError(f"{name}: {found}, wanted at most {max_pixels / PIXELS:g} megapixels")
 
 
+def content_of(task: Task) -> bytes:
+    """Return the picture that was sent."""
+    return (task.files or {})[task.photo.name]
+
+
 def draw(scan: OpenedScan, surfels: Any, drawing: Drawing) -> str:
     """Return JSON of a photo's thumbnail and pictures."""
     result = drawing.result
-    found = [result.best_pose, *(a.pose for a in result.alternatives)]
-    poses = [scan.prepared.from_world(pose) for pose in found if pose]
+    poses = list_poses(result, scan.prepared.from_world)
     with drawing.task.place(Path()) as photo:
         thumbnail, pictures = make_pictures(photo.path, result, poses, surfels, WIDTH)
     return f'{{"thumb": "{site.data_url(thumbnail, "image/jpeg")}", "pictures": {pictures}}}'
@@ -186,12 +190,11 @@ def open_walk(localizer: Localizer, motion: Motion, max_pixels: float) -> Functi
         if frame is None:
             return [result.to_json() for result in walk.finish()]
         task, time = frame
-        name = task.photo.name
+        check_size(task, max_pixels)
         path = Path(folder.name) / f"{len(walk.photos)}{task.photo.path.suffix}"
-        path.write_bytes((task.files or {})[name])
-        check_size(path, name, max_pixels)
+        path.write_bytes(content_of(task))
         try:
-            return walk.add(replace(task.photo, picture=path), time, name).to_json()
+            return walk.add(replace(task.photo, picture=path), time, task.photo.name).to_json()
         except DAMAGE as error:
             raise InputError(str(error)) from error
 

@@ -228,7 +228,8 @@ def pack_discs(surfels: Surfels, pose: Pose, width: int) -> tuple[Array32, Array
     largest = MAX_RADIUS * float(np.percentile(surfels.radii, 95.0)) if len(p) else 0.0
     packed = np.empty((len(p), 9), np.float32)
     extents = np.empty((len(p), 4), np.float32)
-    R, c = pose.R_cam_from_world, pose.center_world
+    R = pose.R_cam_from_world
+    c = pose.center_world
     place_discs((p.x, p.y, p.z), surfels.normals, surfels.radii, R, c, largest, width, packed, extents)
     return packed, extents
 
@@ -267,7 +268,9 @@ def place_discs(
         sign = -1.0 if facing < 0.0 else 1.0
         # without a plane the normal is 0, and becomes the ray
         turn = max(MIN_COSINE - abs(facing), 0.0) / (1.0 - MIN_COSINE) / distance
-        nx, ny, nz = sign * nx + turn * dx, sign * ny + turn * dy, sign * nz + turn * dz
+        nx = sign * nx + turn * dx
+        ny = sign * ny + turn * dy
+        nz = sign * nz + turn * dz
         length = math.sqrt(nx * nx + ny * ny + nz * nz)
         disc = surfels[n]
         for k in range(3):
