@@ -229,9 +229,9 @@ def block_correlation(first, second, shared, blocks, num_blocks):
 def centered_correlation(features, seen, samples, validity, area, flat, least_seen):
     """Correlations (views, rotations) of channels (n, 3, cells) around their means over shared cells.
 
-    A view's channels are multiplied by the fraction seen (views, cells) already. The photo's means are those
-    over all that it shows. Deviations count as `flat` at least; the correlation is multiplied by the root of
-    the fraction seen of what the photo shows, and is 0 if that is at most `least_seen`.
+    A view's channels are multiplied by the fraction seen (views, cells) already. All sums are weighted by
+    that fraction. Deviations count as `flat` at least; the correlation is multiplied by the root of the
+    fraction seen of what the photo shows, and is 0 if that is at most `least_seen`.
     """
     found = np.zeros((len(features), len(samples)))
     for i, f in enumerate(features.astype(float)):
@@ -242,11 +242,12 @@ def centered_correlation(features, seen, samples, validity, area, flat, least_se
             part = total / shown.sum()
             if part <= least_seen:
                 continue
-            photo_mean = (shown * s).sum(axis=1, keepdims=True) / shown.sum()
-            view_mean = (shown * f).sum(axis=1, keepdims=True) / total
-            product = (shown * f * (s - photo_mean)).sum()
-            of_view = (shown * f * f).sum() - total * (view_mean**2).sum()
-            of_photo = (weight * s * s).sum() - total * (photo_mean**2).sum()
+            view = f / np.maximum(seen[i], 1e-9)
+            view = view - (weight * view).sum(axis=1, keepdims=True) / total
+            photo = s - (weight * s).sum(axis=1, keepdims=True) / total
+            product = (weight * view * photo).sum()
+            of_view = (weight * view * view).sum()
+            of_photo = (weight * photo * photo).sum()
             norm = math.sqrt(max(of_view, flat**2 * total) * max(of_photo, flat**2 * total))
             found[i, r] = product / norm * math.sqrt(part)
     return found

@@ -125,7 +125,7 @@ def search_views(
 ) -> Poses:
     """Search by whole views and refine; True if the result is sure."""
     asked = thin_query(query) if is_brief else query
-    refined = search_and_refine(asked, tilts, FIRST_BEAM if is_brief else query.method.beam, watch)
+    refined = search_and_refine(asked, tilts, FIRST_BEAM if is_brief else query.beam, watch)
     with watch.stage("refine"):
         found = known + add_verified(query, refined)
         return found, is_sure(query, found)

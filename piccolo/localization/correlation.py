@@ -19,6 +19,7 @@ MOST_LEVEL = 127.5  # of a channel
 MOST_ENERGY = 3.0 * MOST_LEVEL**2  # of a cell
 BLOCK = 512  # views a matrix product, at most
 LEAST_SEEN = 0.3  # of what a photo shows, by a view that it is compared with
+ALL_SEEN = np.float32(255.0)  # of a view's cell
 FLAT = 6.0  # [levels] a smaller deviation counts as this
 Samples = Array32
 
@@ -62,6 +63,7 @@ def unpack_views(
     features: Int8s,
     seen: Bytes,
     area: Samples,
+    is_centered: bool,
     values: Samples,
     fractions: Samples,
     energy: Samples,
@@ -70,7 +72,8 @@ def unpack_views(
     """Write views' 8-bit channels (n, 3 * cells) and fractions seen (n, cells) as float32, and energies.
 
     Energies (n, cells) are squared channels times the area (cells,), in whole numbers; `total` (n,) their
-    sums.
+    sums. The channels of a cell are its mean times the fraction seen. For centred correlations the energy is
+    the square of the mean times that fraction.
     """
     num_cells = len(area)
     for i in range(len(features)):
@@ -83,6 +86,8 @@ def unpack_views(
             fractions[i, c] = np.float32(seen[i, c])
             square = v[c] * v[c] + v[num_cells + c] * v[num_cells + c]
             square += v[2 * num_cells + c] * v[2 * num_cells + c]
+            if is_centered and seen[i, c] > 0:
+                square *= ALL_SEEN / fractions[i, c]
             energy[i, c] = np.rint(square * area[c])
             whole_total += energy[i, c]
         total[i] = whole_total
@@ -119,7 +124,7 @@ def masked_correlation(
     def correlate(lo: int) -> None:
         some = features[lo : lo + size]
         values, fractions, energy, total = thread_block(len(some), num_cells)
-        unpack_views(some, seen[lo : lo + size], scaled, values, fractions, energy, total)
+        unpack_views(some, seen[lo : lo + size], scaled, is_centered, values, fractions, energy, total)
         np.matmul(values, weighted.T, out=scores[lo : lo + size])
         norm = fractions @ panorama.energy.T
         if is_centered:
@@ -145,8 +150,8 @@ def center_correlation(
     """Turn sums of products (views, rotations) into correlations with the means subtracted.
 
     `values` and `fractions` are those of `unpack_views`, energies (views, rotations) sums of squares. On a
-    part of the sphere the channels' means are not 0, and any two plain surfaces would correlate. The photo's
-    means are those over all that it shows, a view's over what it shows of that.
+    part of the sphere the channels' means are not 0, and any two plain surfaces would correlate. All sums and
+    means are over the same cells: those that both show.
     """
     num_cells = len(panorama.area)
     num_views = len(values)
@@ -154,22 +159,21 @@ def center_correlation(
     shown = panorama.validity * np.rint(panorama.area * area_scale)
     weight = fractions @ shown.T
     of_view = values.reshape(3 * num_views, num_cells) @ shown.T
-    shown_area = np.maximum(shown.sum(axis=1), F1)
-    means = (panorama.samples.sum(axis=2) * area_scale / shown_area[:, None]).T
+    by_channel = panorama.samples.transpose(1, 0, 2).reshape(-1, num_cells)
+    of_photo = fractions @ by_channel.T
     units = (
         whole_scale(MOST_LEVEL, 127, 3 * num_cells),
         whole_scale(MOST_ENERGY, 1, num_cells),
-        whole_scale(MOST_ENERGY, panorama.most_seen, num_cells) * np.float32(panorama.most_seen),
+        whole_scale(MOST_ENERGY, panorama.most_seen, num_cells) * ALL_SEEN,
         area_scale,
-        np.float32(panorama.most_seen),
     )
     subtract_means(
         of_view.reshape(num_views, 3, -1),
-        np.ascontiguousarray(means),
+        of_photo.reshape(num_views, 3, -1),
         view_energy,
         photo_energy,
         weight,
-        shown_area,
+        np.maximum(shown.sum(axis=1), F1),
         units,
         scores,
     )
@@ -178,39 +182,38 @@ def center_correlation(
 @kernel
 def subtract_means(
     of_view: Samples,
-    means: Samples,
+    of_photo: Samples,
     view_energy: Samples,
     photo_energy: Samples,
     weight: Samples,
     shown_area: Samples,
-    units: tuple[np.float32, np.float32, np.float32, np.float32, np.float32],
+    units: tuple[np.float32, np.float32, np.float32, np.float32],
     scores: Samples,
 ) -> None:
     """Write correlations from sums over the shared cells, see `center_correlation`.
 
-    `of_view` (views, 3, rotations) are sums of the views' channels, `means` (3, rotations) the photo's,
-    `units` the factors that made whole numbers: of samples, view and photo energies, areas and fractions.
-    Deviations below FLAT count as FLAT. The correlation is multiplied by the root of the fraction that a view
-    sees of what the photo shows, and is 0 if that is less than LEAST_SEEN.
+    `of_view` and `of_photo` (views, 3, rotations) are sums of the channels, `units` the factors that made
+    whole numbers: of samples, view and photo energies, and areas. Deviations below FLAT count as FLAT. The
+    correlation is multiplied by the root of the fraction that a view sees of what the photo shows, and is 0
+    if that is less than LEAST_SEEN.
     """
-    per_sample, per_view, per_photo, per_area, most_seen = units
+    per_sample, per_view, per_photo, per_area = units
     least = np.float32(FLAT * FLAT)
     for i in range(len(scores)):
         for r in range(scores.shape[1]):
-            seen = weight[i, r] / (shown_area[r] * most_seen)
-            area = max(weight[i, r] / (per_area * most_seen), np.float32(1e-3))
+            seen = weight[i, r] / (shown_area[r] * ALL_SEEN)
+            area = max(weight[i, r] / (per_area * ALL_SEEN), np.float32(1e-3))
             product = scores[i, r] / per_sample
             of_squares = view_energy[i, r] / per_view
             squares = photo_energy[i, r] / per_photo
             for k in range(3):
                 total = of_view[i, k, r] / per_area
-                mean = means[k, r] / per_sample
-                product -= total * mean
+                total_of_photo = of_photo[i, k, r] / (per_sample * ALL_SEEN)
+                product -= total * total_of_photo / area
                 of_squares -= total * total / area
-                squares -= mean * mean * area
+                squares -= total_of_photo * total_of_photo / area
             norm = math.sqrt(max(of_squares, least * area) * max(squares, least * area))
-            fraction = math.sqrt(min(seen, F1)) if seen > np.float32(LEAST_SEEN) else F0
-            scores[i, r] = product / norm * fraction
+            scores[i, r] = product / norm * math.sqrt(min(seen, F1)) if seen > np.float32(LEAST_SEEN) else F0
 
 
 @kernel

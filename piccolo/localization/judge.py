@@ -317,7 +317,7 @@ def search_mirrored(query: Query, mirrored: Query, pose: Pose) -> list[Hypothesi
     own = brief_query(query.with_rotations(pose.R_cam_from_world @ yaws))
     own_score = score_near(query, pose)
     if score_briefly(own) < FOUND_AGAIN * own_score:
-        return refine_starts(asked, search_poses(asked, "known"), query.method.beam)
+        return refine_starts(asked, search_poses(asked, "known"), query.beam)
     asked = brief_query(asked)
     ends = descend_briefly(asked)
     return refine_starts(asked, ends.poses, FIRST_BEAM) if ends.best_score > own_score else []

@@ -26,7 +26,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.points_around import RecentViews, round_position
 from ..views.view import Cells, normalize_view
 from .photo import ACROSS, Photo, make_photo
-from .settings import METHOD, SHAPE_SCALES, CoarseToFineSettings, MethodConfig, ViewName
+from .settings import Beam, METHOD, SHAPE_SCALES, CoarseToFineSettings, MethodConfig, ViewName
 
 MAX_WIDTH = 4096  # [px] of the photo for the loss: more costs seconds and gains nothing
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
@@ -80,6 +80,11 @@ class Query:
     def is_narrow(self) -> bool:
         """True for a photo of a part of the sphere that is compared with the drawn scan."""
         return self.uses_matches and self.photo.is_partial
+
+    @property
+    def beam(self) -> Beam:
+        """The number of poses that go on to each stage of a search."""
+        return self.method.narrow_beam if self.photo.is_partial else self.method.beam
 
     @property
     def pixel(self) -> float:

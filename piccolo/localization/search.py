@@ -186,10 +186,10 @@ def search_poses(query: Query, tilts: Tilts) -> Starts:
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, task, "set fewer num_yaws or num_rotations")
     samples, validity = turn_panorama(query.photo.images.search(), rotations)
-    num_starts = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
-    num_starts = min(num_starts, settings.max_starts)
-    pool = num_starts * POSES_PER_START
     is_partial = query.photo.is_partial
+    enough = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
+    num_starts = settings.max_starts if is_partial else min(enough, settings.max_starts)
+    pool = num_starts * POSES_PER_START
     sparse, turn, _ = best_poses_wide(m, samples, validity, pool, query.workers, is_partial)
     candidate = m.sparse[sparse]
     R = rotations[turn]
