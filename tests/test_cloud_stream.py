@@ -261,13 +261,13 @@ import resource
 from pathlib import Path
 import numpy as np
 from piccolo.cloud.stream import CloudStream
-from piccolo.cloud.readers.reader import CHUNK, PointSource, RawCloud
+from piccolo.cloud.readers.reader import PointSource, RawCloud
 
 def read_chunks():
     rng = np.random.default_rng(0)
     for _ in range({num_chunks}):
-        points = rng.random((CHUNK // 4, 3)) * [4.0, 4.0, 0.005]
-        yield RawCloud(points, rng.integers(199, 201, (CHUNK // 4, 3), np.uint8))
+        points = rng.random((250_000, 3)) * [4.0, 4.0, 0.005]
+        yield RawCloud(points, rng.integers(199, 201, (250_000, 3), np.uint8))
 
 found = CloudStream([PointSource(Path("a"), read_chunks)]).voxels(np.eye(3))
 assert 40_000 < len(found.nodes) < 41_000, len(found.nodes)

@@ -56,10 +56,10 @@ def test_nearest_lists_and_middles_by_brute_force():
     rng = np.random.default_rng(7)
     descriptors, middles = _descriptors(rng, 90), _descriptors(rng, 30)
     squares = ((descriptors[:, None].astype(int) - middles[None].astype(int)) ** 2).sum(axis=2)
-    probes, nearest = np.empty((90, 6), np.int32), np.empty(90, np.int32)
+    probes = np.empty((90, 6), np.int32)
     nearest_lists(descriptors, middles, probes)
     np.testing.assert_array_equal(probes, np.argsort(squares, axis=1, kind="stable")[:, :6])
-    feature_map.nearest_middle(descriptors, middles, nearest)
+    nearest = feature_map.find_nearest(descriptors, middles)
     np.testing.assert_array_equal(nearest, squares.argmin(axis=1))
 
 
@@ -99,8 +99,7 @@ def test_the_maps_features_lie_on_its_surfaces_and_in_one_list_each():
     assert start[-1] == len(found.points) == len(found.descriptors)
     assert (np.diff(start) >= 0).all()
     assert abs(len(found.middles) * feature_map.LIST_SIZE - len(found.points)) < feature_map.LIST_SIZE
-    nearest = np.empty(len(found.points), np.int32)
-    feature_map.nearest_middle(found.descriptors, found.middles, nearest)
+    nearest = feature_map.find_nearest(found.descriptors, found.middles)
     np.testing.assert_array_equal(nearest, np.repeat(np.arange(len(found.middles)), np.diff(start)))
     for directions in (found.directions, found.tangents):
         np.testing.assert_allclose(np.linalg.norm(directions / 127.0, axis=1), 1.0, atol=0.01)

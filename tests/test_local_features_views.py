@@ -12,7 +12,7 @@ from piccolo.geometry.sphere import compute_indices, make_grid, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.local_features import feature_map
 from piccolo.local_features.feature_map import cell_table, view_positions
-from piccolo.local_features.perspective_view import MULTIPLE, cover_sphere, view_around
+from piccolo.local_features.perspective_view import MULTIPLE, add_margin, cover_sphere, view_around
 from piccolo.local_features.view_image import fill_gaps, render_gray
 from research.synthetic.raycast import cast_rays
 
@@ -41,8 +41,9 @@ def test_a_view_holds_all_that_a_photo_shows(turn):
     rows, columns = view.project(RAYS[is_valid])
     assert 3 < rows.min() < rows.max() < height - 4
     assert 3 < columns.min() < columns.max() < width - 4
-    assert (view.cut_mask(is_valid)[rows, columns] == 255).mean() > 0.97
-    assert not view.cut_mask(is_valid)[[0, 0, -1, -1], [0, -1, 0, -1]].any()
+    mask = view.cut_mask(add_margin(is_valid))
+    assert (mask[rows, columns] == 255).mean() > 0.97
+    assert not mask[[0, 0, -1, -1], [0, -1, 0, -1]].any()
 
 
 def test_a_level_photo_is_not_turned_about_its_axis():
@@ -67,7 +68,7 @@ def test_pixels_of_a_view_show_what_they_are_cut_from():
     ramp = np.abs(np.arange(SPHERE) - SPHERE // 2).astype(np.float32) / (SPHERE // 2) * 255.0
     picture = np.repeat(ramp[None].astype(np.uint8), SPHERE // 2, axis=0)
     for view in (view_around(_shown((0.0, 0.1, 3.0)), FOCAL, SPHERE), cover_sphere(SPHERE)[4]):
-        image = view.cut(picture)
+        image = view.cut(add_margin(picture))
         rows, columns = np.mgrid[5 : image.shape[0] : 20, 5 : image.shape[1] : 20].reshape(2, -1)
         height, width = image.shape
         across = (0.5 * width - 0.5 - columns) / view.focal

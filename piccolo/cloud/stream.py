@@ -17,7 +17,7 @@ from ..errors import InputError
 from ..files.cache import sha256_of_arrays
 from ..geometry.pose import MAX_COORDINATE, rotate_points
 from ..jobs.memory import check_address_space
-from ..jobs.threads import Progress, no_progress
+from ..jobs.threads import Progress, Workers, no_progress
 from .readers import e57, e57_file, las, mesh, mesh_files, npz, pcd, ply, reader, text
 from .settings import IN_METRES, Channel, CloudSettings, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
@@ -31,7 +31,14 @@ MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
 Chunk = tuple[Array, Bytes]  # finite points (N, 3) [m], colours (N, 3)
 MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description; a longer one is ignored
+ALONE = Workers()
 ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
+
+
+def find_box(points: Array) -> Array:
+    """Return the least and the greatest coordinates (2, 3) of points (N, 3); NaN where one is NaN."""
+    columns = points.T  # faster one by one
+    return np.array([[a.min(initial=np.inf) for a in columns], [a.max(initial=-np.inf) for a in columns]])
 
 
 @dataclass
@@ -47,25 +54,30 @@ class PointValidator:
     color: Bytes | None = None  # (3,) of the first point
     is_varied: bool = False  # another point has another colour
     step: float = 0.0  # [m] between numbers at the farthest point that is stored in float32
+    # (2, 3) least and greatest coordinates so far [m]
+    box: Array = field(default_factory=lambda: find_box(np.empty((0, 3))))
 
     def filter(self, raw: reader.RawCloud) -> Chunk:
         """Count the points of a chunk; return the finite ones in metres."""
-        is_finite: Mask = np.all(np.isfinite(raw.points_world), axis=1)
-        num_finite = int(np.count_nonzero(is_finite))
         colors = raw.colors
         with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
             points: Array = raw.points_world.astype(np.float64, copy=False)
-        if num_finite < len(points):
+        box = find_box(points)
+        if not np.isfinite(box).all():
+            is_finite: Mask = np.all(np.isfinite(points), axis=1)
             points = points[is_finite]
             colors = colors[is_finite]
-        self.num_finite += num_finite
-        self.num_dropped += len(is_finite) - num_finite
-        if num_finite:
-            points = points * self.scale
+            box = find_box(points)
+        self.num_finite += len(points)
+        self.num_dropped += len(raw.colors) - len(points)
+        if len(points):
+            points = points if self.scale == 1.0 else points * self.scale
+            box *= self.scale
+            self.box[:] = np.minimum(self.box[0], box[0]), np.maximum(self.box[1], box[1])
             self.brightest = max(self.brightest, int(colors.max()))
             self.color = colors[0] if self.color is None else self.color
             self.is_varied = self.is_varied or bool((colors != self.color).any())
-            farthest = max(-float(points.min()), float(points.max()))
+            farthest = float(np.abs(box).max())
             if farthest > MAX_COORDINATE:
                 found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
                 raise InputError(f"{self.path}: {found}; remove broken points or set `units`")
@@ -134,7 +146,7 @@ class CloudStream:
     show: Progress = no_progress
     sha256: str = ""  # of what is read, if that is known
     # (2, 3) least and greatest of all points read so far [m]
-    box: Array = field(default_factory=lambda: np.repeat([[np.inf], [-np.inf]], 3, axis=1))
+    box: Array = field(default_factory=lambda: find_box(np.empty((0, 3))))
 
     @property
     def label(self) -> str:
@@ -162,16 +174,12 @@ class CloudStream:
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres; append each file's validator once it is read."""
         for source in self.sources:
-            validator = PointValidator(source.path, self.scale, source.channel == "colors")
+            validator = PointValidator(source.path, self.scale, source.channel == "colors", box=self.box)
             total = None if source.num_points is None else math.ceil(source.num_points / reader.CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
                     check_address_space()
-                    points_world, colors = validator.filter(raw)
-                    for k in range(3 if len(points_world) else 0):
-                        column = points_world[:, k]
-                        self.box[:, k] = min(self.box[0, k], column.min()), max(self.box[1, k], column.max())
-                    yield points_world, colors
+                    yield validator.filter(raw)
             except OSError as error:
                 text = f"{source.path}: cannot be read ({error.strerror or error}), wanted a whole file"
                 raise InputError(text) from error
@@ -182,12 +190,22 @@ class CloudStream:
         pairs = zip(self.sources, validators, strict=True)
         return [line for source, validator in pairs for line in (*source.warnings, *validator.warnings())]
 
-    def voxels(self, R_map_from_world: Array) -> Voxels:
-        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3)."""
+    def voxels(self, R_map_from_world: Array, workers: Workers = ALONE) -> Voxels:
+        """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3).
+
+        With several threads the next chunk is read while one is added.
+        """
         validators: list[PointValidator] = []
         table = VoxelTable(self.label)
-        for points_world, colors in self.chunks(validators):
-            table.add(rotate_points(points_world, R_map_from_world), colors)
+
+        def add(chunk: Chunk) -> None:
+            table.add(rotate_points(chunk[0], R_map_from_world), chunk[1])
+
+        chunks = self.chunks(validators)
+        chunk = next(chunks, None)
+        while chunk is not None:
+            tasks: list[Callable[[], Chunk | None]] = [partial(add, chunk), partial(next, chunks, None)]
+            chunk = workers.map(lambda task: task(), tasks, "")[1]
         voxels = table.finish()
         of_all = (*voxels.warnings, *unit_warnings(self.label, voxels.nodes[:, :3]))
         return voxels._replace(warnings=(*self._warnings(validators), *of_all))

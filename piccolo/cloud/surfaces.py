@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int64s, Integers
+from ..arrays import Array, Array32, Int32s, Integers
 from ..geometry.colors import colors_of_edges
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
@@ -27,6 +27,7 @@ CELLS = (3, 4)  # levels above the leaves: cells of 16 cm, or 32 cm where the sc
 MIN_LEAVES = 20
 MIN_CELLS = 200
 MAX_CELLS = 20_000
+SOME_CELLS = 1000  # at a time
 NOISE_SHARE = 0.3  # of the noise's deviation that is left in a pose, from trials with noise of 1 to 5 cm
 ONE_SHEET = 2.5  # kurtosis of noise within a cell, about; of two thin sheets it is 1
 ROUGHNESS = 0.005  # [m] of clean surfaces and the things on them
@@ -136,12 +137,33 @@ def surface_variance(octree: Octree) -> Array:
 
 
 def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
-    """Return normals (C, 3) of the planes through the leaves of cells, and variances (C,) across them [m^2].
+    """Return normals (C, 3) of the planes through the leaves of a level's fuller cells, and variances (C,).
+
+    The variances [m^2] are across the planes.
+    """
+    level = len(octree.level_start) - 2 - levels_up
+    edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
+    for _ in range(levels_up):
+        edges = octree.first_child[edges]
+    full = np.flatnonzero(np.diff(edges) >= MIN_LEAVES)
+    full = full[np.linspace(0, len(full) - 1, min(len(full), MAX_CELLS)).astype(np.int64)]
+    found = [(np.empty((0, 3)), np.empty(0))]
+    for begin in range(0, len(full), SOME_CELLS):
+        some = full[begin : begin + SOME_CELLS]
+        found.append(moments_of_cells(octree.nodes, edges[some], edges[some + 1]))
+    normals, variances = map(np.concatenate, zip(*found, strict=True))
+    return normals, variances
+
+
+def moments_of_cells(nodes: Array32, begins: Int32s, ends: Int32s) -> tuple[Array, Array]:
+    """Return normals (C, 3) and variances (C,) of cells, each with the leaves from its begin to its end.
 
     The residuals of one noisy sheet have a kurtosis of 3, less what the cell cuts off; those of two sheets at
     +-b with noise of variance s^2 have E r^4 = 3 (b^2 + s^2)^2 - 2 b^4. The result is b^2 and a part of s^2.
     """
-    leaves, first, counts = leaves_by_cell(octree, levels_up)
+    counts = (ends - begins).astype(np.int64)
+    first = np.cumsum(counts) - counts
+    leaves = nodes[np.arange(counts.sum()) + np.repeat(begins - first, counts), :3].astype(np.float64)
     cell = np.repeat(np.arange(len(counts)), counts)
     offsets = leaves - (np.add.reduceat(leaves, first) / counts[:, None])[cell]
     products = (offsets[:, :, None] * offsets[:, None, :]).reshape(-1, 9)
@@ -154,22 +176,6 @@ def residual_moments(octree: Octree, levels_up: int) -> tuple[Array, Array]:
     across -= ROUGHNESS**2
     of_sheets = np.sqrt(np.clip((ONE_SHEET - kurtosis) / (ONE_SHEET - 1.0), 0.0, 1.0)) * across
     return normals, of_sheets + NOISE_SHARE**2 * (across - of_sheets)
-
-
-def leaves_by_cell(octree: Octree, levels_up: int) -> tuple[Array, Int64s, Int64s]:
-    """Return the leaves (N, 3) [m] of a level's fuller cells, and each cell's first one and their number."""
-    level = len(octree.level_start) - 2 - levels_up
-    edges = np.arange(octree.level_start[level], octree.level_start[level + 1] + 1)
-    for _ in range(levels_up):
-        edges = octree.first_child[edges]
-    full = np.flatnonzero(np.diff(edges) >= MIN_LEAVES)
-    full = full[np.linspace(0, len(full) - 1, min(len(full), MAX_CELLS)).astype(np.int64)]
-    if len(full) == 0:
-        return np.empty((0, 3)), full, full
-    counts = (edges[full + 1] - edges[full]).astype(np.int64)
-    first = np.cumsum(counts) - counts
-    index = np.arange(counts.sum()) + np.repeat(edges[full] - first, counts)
-    return octree.nodes[index, :3].astype(np.float64), first, counts
 
 
 def fit_tensor(normals: Array, variances: Array) -> Array:

@@ -42,7 +42,8 @@ NUM_COLUMNS = 10
 FIRST_ROWS = 1 << 15
 MORE_ROWS = 8  # an eighth more at a time
 MAX_VOXELS = 80_000_000  # 20,000 m^2 or more
-MAX_LOAD = 0.6  # fraction of the index in use
+MAX_LOAD = 0.4  # fraction of the index in use
+TOGETHER = 256  # points whose rows are looked up together: memory answers many requests at a time
 ROW_BYTES = 4 * NUM_COLUMNS
 SLOT_BYTES = 4
 SORTED_BYTES = 3 * 8 + 6 * 4  # a voxel: codes, order, codes in order, nodes
@@ -127,17 +128,65 @@ def join_voxels(first: Array32, second: Array32, origin: Array) -> Voxels:
 
 
 @inline_kernel
-def find_slot(index: Int32s, rows: Int32s, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
-    """Return the slot that holds a cell's row, or else the free slot where it belongs."""
+def first_slot(index: Int32s, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
+    """Return the slot where the search for a cell begins."""
     # Teschner et al., VMV 2003. Products of less than 63 bits: none overflows, with or without Numba.
     mixed = (x * 73856093) ^ (y * 19349663) ^ (z * 83492791)
-    slot = (mixed ^ (mixed >> 17)) & (len(index) - 1)
+    return (mixed ^ (mixed >> 17)) & (len(index) - 1)
+
+
+@inline_kernel
+def find_slot(index: Int32s, rows: Int32s, slot: np.int64, x: np.int64, y: np.int64, z: np.int64) -> np.int64:
+    """Return the slot that holds a cell's row, or else the free slot where it belongs."""
     while index[slot] != 0:
         row = rows[index[slot] - 1]
         if row[CELL] == x and row[CELL + 1] == y and row[CELL + 2] == z:
             break
         slot = (slot + 1) & (len(index) - 1)
     return slot
+
+
+@inline_kernel
+def look_up(
+    points: Array, base: Int64s, index: Int32s, rows: Int32s, quanta: Int64s, slots: Int64s, found: Int32s
+) -> None:
+    """Write the quanta (3, n) from the base of points (n, 3), and the first slot (n,) of each point's cell.
+
+    What these slots name is read, so that it is in the processor's cache; `found` (n,) takes it.
+    """
+    for k in range(3):
+        for i in range(len(points)):
+            quantum = np.int64(np.floor(points[i, k] * QUANTA_PER_METRE)) + PHASE
+            quanta[k, i] = quantum - (base[k] << QUANTUM_BITS)
+    for i in range(len(points)):
+        x, y, z = quanta[0, i] >> QUANTUM_BITS, quanta[1, i] >> QUANTUM_BITS, quanta[2, i] >> QUANTUM_BITS
+        slots[i] = first_slot(index, x, y, z)
+    for i in range(len(points)):
+        found[i] = index[slots[i]]
+    for i in range(len(points)):
+        found[i] = rows[max(found[i], 1) - 1, COUNT]
+
+
+@inline_kernel
+def enter_cells(
+    quanta: Int64s, slots: Int64s, index: Int32s, rows: Int32s, num_voxels: int, found: Int32s
+) -> tuple[int, int]:
+    """Write the row (n,) of each point's cell, made if it is missing; return the counts of `add_points`."""
+    for i in range(len(found)):
+        x, y, z = quanta[0, i] >> QUANTUM_BITS, quanta[1, i] >> QUANTUM_BITS, quanta[2, i] >> QUANTUM_BITS
+        if num_voxels == len(rows) or max(abs(x), abs(y), abs(z)) >= MAX_CELL:
+            return i, num_voxels
+        slot = find_slot(index, rows, slots[i], x, y, z)
+        if index[slot] == 0:
+            row = rows[num_voxels]
+            row[:] = 0
+            row[CELL] = x
+            row[CELL + 1] = y
+            row[CELL + 2] = z
+            num_voxels += 1
+            index[slot] = num_voxels
+        found[i] = index[slot] - 1
+    return len(found), num_voxels
 
 
 @kernel
@@ -150,35 +199,22 @@ def add_points(
     at a point farther away than the cells reach, or when no row is left. Return the numbers of points added
     and of voxels.
     """
-    for i in range(len(points)):
-        if num_voxels == len(rows):
-            return i, num_voxels
-        qx = np.int64(np.floor(points[i, 0] * QUANTA_PER_METRE)) + PHASE
-        qy = np.int64(np.floor(points[i, 1] * QUANTA_PER_METRE)) + PHASE
-        qz = np.int64(np.floor(points[i, 2] * QUANTA_PER_METRE)) + PHASE
-        x = (qx >> QUANTUM_BITS) - base[0]
-        y = (qy >> QUANTUM_BITS) - base[1]
-        z = (qz >> QUANTUM_BITS) - base[2]
-        if max(abs(x), abs(y), abs(z)) >= MAX_CELL:
-            return i, num_voxels
-        slot = find_slot(index, rows, x, y, z)
-        if index[slot] == 0:
-            row = rows[num_voxels]
-            row[:] = 0
-            row[CELL] = x
-            row[CELL + 1] = y
-            row[CELL + 2] = z
-            num_voxels += 1
-            index[slot] = num_voxels
-        row = rows[index[slot] - 1]
-        if row[COUNT] < MAX_COUNT:
-            row[COUNT] += 1
-            row[POSITION] += qx & QUANTUM_MASK
-            row[POSITION + 1] += qy & QUANTUM_MASK
-            row[POSITION + 2] += qz & QUANTUM_MASK
-            row[COLOR] += colors[i, 0]
-            row[COLOR + 1] += colors[i, 1]
-            row[COLOR + 2] += colors[i, 2]
+    quanta = np.empty((3, TOGETHER), np.int64)
+    slots = np.empty(TOGETHER, np.int64)
+    found = np.empty(TOGETHER, np.int32)
+    for begin in range(0, len(points), TOGETHER):
+        num = min(TOGETHER, len(points) - begin)
+        look_up(points[begin : begin + num], base, index, rows, quanta, slots, found)
+        count, num_voxels = enter_cells(quanta, slots, index, rows, num_voxels, found[:num])
+        for i in range(count):
+            row = rows[found[i]]
+            if row[COUNT] < MAX_COUNT:
+                row[COUNT] += 1
+                for k in range(3):
+                    row[POSITION + k] += quanta[k, i] & QUANTUM_MASK
+                    row[COLOR + k] += colors[begin + i, k]
+        if count < num:
+            return begin + count, num_voxels
     return len(points), num_voxels
 
 
@@ -187,7 +223,7 @@ def fill_index(rows: Int32s, num_voxels: int, index: Int32s) -> None:
     """Enter the rows (n, 10) of `num_voxels` voxels in an index (2^k,) of zeros."""
     for k in range(num_voxels):
         x, y, z = np.int64(rows[k, CELL]), np.int64(rows[k, CELL + 1]), np.int64(rows[k, CELL + 2])
-        index[find_slot(index, rows, x, y, z)] = k + 1
+        index[find_slot(index, rows, first_slot(index, x, y, z), x, y, z)] = k + 1
 
 
 class VoxelTable:
@@ -198,7 +234,7 @@ class VoxelTable:
         self.num_voxels = 0
         self.base = np.zeros(3, np.int64)  # cell of the first point
         self.rows = np.empty((FIRST_ROWS, NUM_COLUMNS), np.int32)
-        self.index = np.zeros(2 * FIRST_ROWS, np.int32)
+        self.index = np.zeros(4 * FIRST_ROWS, np.int32)
 
     def add(self, points: Array, colors: Bytes) -> None:
         """Add finite points (N, 3) [m], in the map's axes, with colours (N, 3)."""

@@ -12,7 +12,7 @@ from ..cloud.octree import Octree
 from ..geometry.pose import Pose
 from ..geometry.sphere import compute_indices, direction_to_pixel, find_cell, pixel_rays
 from ..geometry.vectors import minus, row
-from ..jobs.threads import Workers
+from ..jobs.threads import Workers, one_blas_thread
 from ..kernels.jit import inline_kernel, kernel, whole
 from .keypoints import DESCRIPTOR_SIZE, find_keypoints
 from .perspective_view import cover_sphere
@@ -28,6 +28,7 @@ MOST_VIEWS = 1 << 16
 GROWTH = 2  # of the number of lists for all features: from this factor on new lists are made
 KMEANS_ROUNDS = 5
 BLOCK = 4096  # descriptors that are projected, or that a thread sorts into lists, at a time
+AT_ONCE = 256  # of these, whose distances from all lists' middles take 4 MB
 # From where features are taken: few positions that see all that a camera can see
 SPACING = 2.5  # [m] across: a nearer place that is seen from a position needs none
 LAYER = 2.4  # [m] in height
@@ -131,16 +132,20 @@ def square_gap(first: Int8s, second: Int8s) -> np.int32:
     return total
 
 
-@kernel
-def nearest_middle(descriptors: Int8s, middles: Int8s, nearest: Int32s) -> None:
-    """Write the index of the nearest middle (L, D) of each descriptor (N, D)."""
-    for i in range(len(descriptors)):
-        best = np.int32(2147483647)
-        for k in range(len(middles)):
-            total = square_gap(descriptors[i], middles[k])
-            if total < best:
-                best = total
-                nearest[i] = k
+def find_nearest(descriptors: Int8s, middles: Int8s) -> Int32s:
+    """Return the index (N,) of the nearest middle (L, D) of each descriptor (N, D), the first of equal ones.
+
+    Exact as in `project`: a squared distance less that of the descriptor from zero is below 2^24.
+    """
+    nearest = np.empty(len(descriptors), np.int32)
+    values = middles.astype(np.float32)
+    squares = np.sum(values * values, axis=1)
+    values *= np.float32(-2.0)
+    for lo in range(0, len(descriptors), AT_ONCE):
+        gaps = descriptors[lo : lo + AT_ONCE].astype(np.float32) @ values.T
+        gaps += squares
+        nearest[lo : lo + AT_ONCE] = gaps.argmin(axis=1)
+    return nearest
 
 
 def list_middles(descriptors: Int8s, num_lists: int) -> Int8s:
@@ -149,9 +154,8 @@ def list_middles(descriptors: Int8s, num_lists: int) -> Int8s:
     if len(sample) == 0:
         return np.zeros((num_lists, NUM_COMPONENTS), np.int8)
     middles = sample[np.linspace(0, len(sample) - 1, num_lists).astype(int)].copy()
-    nearest = np.empty(len(sample), np.int32)
     for _ in range(KMEANS_ROUNDS):
-        nearest_middle(sample, middles, nearest)
+        nearest = find_nearest(sample, middles)
         order = np.argsort(nearest, kind="stable")
         lists, first, counts = np.unique(nearest[order], return_index=True, return_counts=True)
         sums = np.add.reduceat(sample[order].astype(np.int64), first, axis=0)
@@ -185,12 +189,10 @@ def put_in_lists(
     `of_points` are the first six arrays of FeatureMap, in any order of the features, `of_all` its next three.
     """
     descriptors = of_points[4]
-    nearest = np.empty(len(descriptors), np.int32)
-
-    def assign(lo: int) -> None:
-        nearest_middle(descriptors[lo : lo + BLOCK], middles, nearest[lo : lo + BLOCK])
-
-    list(workers.map(assign, range(0, len(descriptors), BLOCK), "sort features"))
+    parts = [descriptors[lo : lo + BLOCK] for lo in range(0, len(descriptors), BLOCK)]
+    with one_blas_thread():
+        found = workers.map(lambda part: find_nearest(part, middles), parts, "sort features")
+    nearest = np.concatenate([np.empty(0, np.int32), *found])
     order = np.argsort(nearest, kind="stable")
     start = np.searchsorted(nearest[order], np.arange(len(middles) + 1)).astype(np.int32)
     arrays: list[Any] = [*(values[order] for values in of_points), *of_all, middles, start]

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Array32, Bytes, Int64s, Mask
 from ..jobs.threads import Workers
-from .perspective_view import PerspectiveView
+from .perspective_view import PerspectiveView, add_margin
 
 CONTRAST = 0.006  # least of a keypoint, as OpenCV counts it: plain walls have faint ones, and they hold
 DESCRIPTOR_SIZE = 128
@@ -40,10 +40,12 @@ def find_keypoints(
     gray: Bytes, is_valid: Mask, views: Sequence[PerspectiveView], workers: Workers = ALONE
 ) -> Keypoints:
     """Find the keypoints of the valid part of an equirectangular picture (H, W), W = 2 H, in some views."""
+    picture = add_margin(gray)
+    mask = add_margin(is_valid)
 
     def find(view: PerspectiveView) -> Keypoints:
-        shown = view.cut_mask(is_valid)
-        return find_in_view(view.cut(gray), shown, view) if shown.any() else _nothing()
+        shown = view.cut_mask(mask)
+        return find_in_view(view.cut(picture), shown, view) if shown.any() else _nothing()
 
     return join_keypoints(list(workers.map(find, views, "find keypoints")))
 

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +17,7 @@ MARGIN = 8  # [px] of the sphere's picture around it, so that views may cross th
 VIEWS_DEG = [(45.0 * k, 0.0) for k in range(8)]
 VIEWS_DEG += [(60.0 * k + 30.0, elevation) for elevation in (45.0, -45.0) for k in range(6)]
 NUM_SIDES = 4
+Image = TypeVar("Image", Bytes, Mask)
 # of the faces of a cube; nothing is seen in those at the poles, which bound the sides
 FACES_DEG = [*((90.0 * k, 0.0) for k in range(NUM_SIDES)), (0.0, 90.0), (0.0, -90.0)]
 HALVES = (0, 2, 4, 6, 8, 10, 12, 15, 17, 19), (1, 3, 5, 7, 9, 11, 13, 14, 16, 18)  # every other view
@@ -42,12 +43,12 @@ class PerspectiveView(NamedTuple):
         return 1.0 / self.pixel
 
     def cut(self, picture: Bytes) -> Bytes:
-        """Cut the view (h, w) out of a sphere's picture (H, W)."""
-        return np.asarray(cv2.remap(add_margin(picture), self.columns, self.rows, cv2.INTER_LINEAR), np.uint8)
+        """Cut the view (h, w) out of a sphere's picture with its margin."""
+        return np.asarray(cv2.remap(picture, self.columns, self.rows, cv2.INTER_LINEAR), np.uint8)
 
     def cut_mask(self, is_valid: Mask) -> Bytes:
-        """Cut the view (h, w) out of a sphere's mask (H, W): 255 where it is valid."""
-        mask = add_margin(is_valid.view(np.uint8) * np.uint8(255))
+        """Cut the view (h, w) out of a sphere's mask with its margin: 255 where it is valid."""
+        mask = is_valid.view(np.uint8) * np.uint8(255)
         return np.asarray(cv2.remap(mask, self.columns, self.rows, cv2.INTER_NEAREST), np.uint8)
 
     def find_own(self, rays: Floats) -> Int64s:
@@ -131,6 +132,6 @@ def centers_of_pixels(count: int, pixel: float) -> Array:
     return np.asarray(0.5 * pixel * count * (1.0 - (2.0 * np.arange(count) + 1.0) / count))
 
 
-def add_margin(image: Bytes) -> Bytes:
-    """Pad a picture by MARGIN: columns wrap at the seam, the first and the last row are repeated."""
+def add_margin(image: Image) -> Image:
+    """Pad a picture or mask by MARGIN: columns wrap at the seam, the first and the last row are repeated."""
     return np.pad(np.pad(image, ((0, 0), (MARGIN, MARGIN)), mode="wrap"), ((MARGIN, MARGIN), (0, 0)), "edge")

@@ -111,8 +111,6 @@ def draw_voxels(
             r = scratch.directions[2, k]
             reach = scratch.ranges[k]
             across = scratch.turns[k]
-            node = tree.nodes[scratch.nodes[k]]
-            gray = np.float32(0.299) * node[3] + np.float32(0.587) * node[4] + np.float32(0.114) * node[5]
             top: Any = max(np.int32(math.ceil(v - reach - HALF)), 0)
             bottom: Any = min(np.int32(math.floor(v + reach - HALF)), height - 1)
             left: Any = np.int32(math.ceil(u - across - HALF))
@@ -131,6 +129,12 @@ def draw_voxels(
                         du = (np.float32(at) + HALF - u) / across
                         weight = max(F1 - HALF * (du * du + dv * dv), np.float32(0.02))
                         weight = weight * weight * weight
+                        node = tree.nodes[scratch.nodes[k]]  # here, as most voxels are hidden
+                        gray = (
+                            np.float32(0.299) * node[3]
+                            + np.float32(0.587) * node[4]
+                            + np.float32(0.114) * node[5]
+                        )
                         sums[i, j, 0] += weight * gray
                         sums[i, j, 1] += weight
 

@@ -12,7 +12,13 @@ from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
 from ..local_features.keypoints import Keypoints, find_keypoints
-from ..local_features.perspective_view import PerspectiveView, cover_sphere, list_sides, view_around
+from ..local_features.perspective_view import (
+    PerspectiveView,
+    add_margin,
+    cover_sphere,
+    list_sides,
+    view_around,
+)
 from ..panorama import Panorama
 from ..panorama.edges import soften
 from ..panorama.local_normalization import normalize_panorama
@@ -134,6 +140,7 @@ def find_seen(panorama: Panorama, small: Texels, workers: Workers) -> Seen:
     around = view_around(find_valid(small), width / math.tau, width)
     several = list_sides(width) if small.valid_share >= WHOLE else cover_sphere(width)
     views = [around] if around else several
-    views = [view for view in views if view.cut_mask(panorama.is_valid).any()]
+    mask = add_margin(panorama.is_valid)
+    views = [view for view in views if view.cut_mask(mask).any()]
     gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
     return Seen(views, find_keypoints(gray, panorama.is_valid, views, workers))

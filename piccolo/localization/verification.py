@@ -24,7 +24,7 @@ from ..kernels.jit import kernel
 from ..local_features.hypotheses import LEAST_MATCHES, count_matches, exact_pose
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, merge_matches
-from ..local_features.perspective_view import PerspectiveView
+from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
 from .query import Query
 
@@ -194,7 +194,8 @@ def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArr
 
 def draw(query: Query, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
     """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
-    shown = cv2.dilate(view.cut_mask(query.photo.panorama.is_valid), np.ones((2 * AROUND + 1,) * 2, np.uint8))
+    mask = view.cut_mask(add_margin(query.photo.panorama.is_valid))
+    shown = cv2.dilate(mask, np.ones((2 * AROUND + 1,) * 2, np.uint8))
     turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
     return render_gray(query.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
 

@@ -158,7 +158,7 @@ def prepare_map(
     watch = watch or Stopwatch()
     R_map_from_world = R_z_from_axis(up, cloud.up) if isinstance(up, str) else up
     with watch.stage("read"):
-        voxels = cloud.voxels(R_map_from_world)
+        voxels = cloud.voxels(R_map_from_world, Workers(workers.num_threads))  # the reading is shown
         octree = build_octree(voxels)
         origin_world = R_map_from_world.T @ voxels.origin
         warnings = voxels.warnings

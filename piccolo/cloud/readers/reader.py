@@ -23,7 +23,7 @@ from ...geometry.colors import Labels, label_colors
 from ..settings import IN_METRES, RANGES, Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
-CHUNK = 1 << 20  # points of a chunk, at most
+CHUNK = 1 << 17  # points of a chunk, at most: they stay in the processor's cache
 MAX_BLOCK_SIZE = 1 << 28  # [byte] read at once, in which CHUNK records of 256 bytes have room
 CUT = "the file was cut while it was read, wanted a whole file"
 
