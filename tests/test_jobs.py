@@ -31,7 +31,7 @@ def _words(scene, pano, *more):
 
 
 def test_several_processes_write_the_same_files(scene, tmp_path, capsys):
-    bad = tmp_path / "bad.jpg"
+    bad = tmp_path / os.fsdecode(b"bad\n\xe9.jpg")
     bad.write_bytes(b"\xff\xd8\xff nothing more")
     table = tmp_path / "priors.csv"
     table.write_text("name,height\nclean_1.jpg,1.5\nclean_9.jpg,1\n")
