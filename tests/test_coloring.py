@@ -340,7 +340,7 @@ def test_the_commands_colour_a_scan(files, whole, tmp_path, capsys):
 def test_a_colouring_that_is_stopped_twice_goes_on_with_the_same_bits(
     files, whole, tmp_path, monkeypatch, capsys
 ):
-    """Two photos are localized by shape, then twice by colours; it is killed after the first and fifth step."""
+    """Two photos are localized by shape, then twice by colours; it is killed after steps one and five."""
     out = tmp_path / "stopped"
     steps = []
     append = Journal.append

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import cv2
 import numba
@@ -57,7 +58,7 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     monkeypatch.setattr(page, "DAMAGED_SCANS", {"scan thinned to 5%": confidence.thin_points})
     monkeypatch.setattr(speed, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
     out = tmp_path / "page.md"
-    sizes = ["--damaged", "1", "--photos", "1", "--points", "20000", "--rooms"]
+    sizes = ["--damaged", "1", "--photos", "0", "--points", "20000", "--rooms"]
     assert benchmark.main(["all", "--scenes", str(scene), *sizes, "--quiet", "--out", str(out)]) == 0
     text = out.read_text()
     assert len(text.splitlines()) <= 200
@@ -74,15 +75,13 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert [damaged[name]["right"] for name in ("as taken", DAMAGE[0])] == 2 * ["1"]
     assert [damaged["another place"][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
     assert set(damaged) == {"as taken", *DAMAGE, "another place", "scan thinned to 5%"}
-    photos = table_of(text, TITLES["photos"])
-    assert [row["queries"] for row in photos.values()] == ["1", "1"]
     paper = table_of(text, TITLES["paper"])
     ratio = float(paper["preset paper"]["s"]) / float(paper["default method"]["s"])
     stated = float(re.search(r"The preset takes (\d+\.\d) times as long", text)[1])
     assert stated == pytest.approx(ratio, abs=0.1)
     confidences = table_of(text, "Confidences")
-    assert sum(int(row["answers"]) for row in confidences.values()) == 1 + len(damaged) + 2
-    assert f"0 of {1 + len(damaged) + 2} were localized and are not right." in text
+    assert sum(int(row["answers"]) for row in confidences.values()) == 1 + len(damaged)
+    assert f"0 of {1 + len(damaged)} were localized and are not right." in text
     sizes = table_of(text, TITLES["size"])
     assert [row["points"] for row in sizes.values()] == ["20,000"]
     assert re.fullmatch("[01]/1", sizes[f"{scene.name}, resampled"]["right"])
@@ -111,6 +110,20 @@ def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
     assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 3
     assert "found no queries, wanted pictures with true poses" in capsys.readouterr().err
     assert benchmark.main(["all", "--scenes", str(scene), "--photos", "-1"]) == 2
+
+
+def test_photos_are_cut_with_their_focal_length_as_it_is_and_in_exif(scene, monkeypatch, capsys):
+    given = []
+
+    def localize(photo):
+        given.append(read_panorama(photo).focal_prior.source)
+        return Result("not_localized", 0.0, "a.ply", "a.jpg")
+
+    monkeypatch.setattr(page.piccolo, "open_scan", lambda *_, **__: SimpleNamespace(localize=localize))
+    assert benchmark.main(["all", "--scenes", str(scene), "--only", "photos", "--photos", "1"]) == 0
+    assert given == ["`focal_px`", "EXIF"]
+    rows = table_of(capsys.readouterr().out, TITLES["photos"])
+    assert [row["queries"] for row in rows.values()] == ["1", "1"]
 
 
 def test_photos_of_a_scene_come_with_their_calibrations(tmp_path, capsys):
