@@ -185,12 +185,11 @@ def _lying(turn):
     return stream(RawCloud(points, cloud.colors), chunk=9999), pose
 
 
-@pytest.mark.parametrize("up", ["y", "-x"])
-def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
-    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+def test_up_axis_is_believed_and_poses_stay_in_the_files_frame():
+    axis = np.array([-1.0, 0.0, 0.0])
     yaw = exp_so3(np.array([0.0, 0.0, 0.4]))
     cloud, truth = _lying(rotation_to_z(axis).T @ yaw)
-    scan_map = prepare_map(cloud, Workers(2), up)
+    scan_map = prepare_map(cloud, Workers(2), "-x")
     np.testing.assert_array_equal(scan_map.R_map_from_world @ axis, [0.0, 0.0, 1.0])
     np.testing.assert_array_equal(np.abs(scan_map.R_map_from_world).sum(axis=0), 1.0)
     assert np.linalg.det(scan_map.R_map_from_world) == 1.0
