@@ -7,6 +7,7 @@ import json
 import math
 import re
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from types import SimpleNamespace
 
 import cv2
@@ -16,6 +17,7 @@ import pytest
 from batches import ROOT, command_of, run
 from rooms import write_room
 
+from piccolo.confidence.covariance import PoseCovariance
 from piccolo.geometry.pose import Pose
 from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
@@ -152,6 +154,9 @@ def test_wrong_answers_are_listed():
     result = Result("localized", 0.95, "a.ply", "a.jpg", found, None, None, (), None, {"search": 1.0}, {})
     rows = [QueryResult("", "a.jpg", "night", None, pose, result)] * 25
     assert page.row_cells(rows) == ("25", "0", "25", "25", "0", "-", "-", "1.00")
+    for std, is_outside in ((0.1, True), (0.25, False)):  # [m]
+        known = replace(result, covariance=PoseCovariance(std**2 * np.eye(6), ""))
+        assert page.is_outside(QueryResult("", "", "", None, pose, known)) == is_outside
     first, second, *_, last = page.wrong_lines(rows).splitlines()
     assert first == "25 of 25 were localized and are not right."
     assert second == "- night, a.jpg: 0.50 m off; confidence 0.950"
