@@ -183,7 +183,6 @@ FISHEYE = Camera("OPENCV_FISHEYE", 400, 400, (118.0, 119.0, 201.0, 199.0, 0.01, 
 LENSES = {
     "pinhole": (Mount(pinhole(480, 360, 300.0)),),
     "wide": (Mount(Camera("OPENCV", 500, 400, (150.0, 152.0, 255.0, 190.0, -0.02, 0.001, 1e-3, -1e-3))),),
-    "fisheye": (Mount(FISHEYE),),
     "dual fisheye": (Mount(FISHEYE, TILT), Mount(FISHEYE, BACK, offset=(400, 0))),
 }
 

@@ -11,7 +11,7 @@ import pytest
 import rooms
 from plyfile import PlyData, PlyElement
 from refusals import assert_input_error
-from rooms import as_panorama, query, room
+from rooms import room
 from test_cloud_morton import seeded_cloud
 
 from piccolo.cloud.readers.reader import PointSource, RawCloud
@@ -19,7 +19,7 @@ from piccolo.cloud.settings import METRES, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import CloudStream, open_cloud, stream_of_arrays
 from piccolo.cloud.voxels import Voxels
 from piccolo.errors import InputError
-from piccolo.geometry.pose import Pose, exp_so3, rotation_to_z
+from piccolo.geometry.pose import exp_so3, rotation_to_z
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.opening import open_files
 from piccolo.paper.localize import PaperSettings
@@ -177,32 +177,26 @@ def test_a_broken_disk_is_one_line():
 
 
 def _lying(turn):
-    """The cloud of room 1, turned, as a file, and the true pose in it of a panorama."""
-    cloud, taken = room(1)[1], query(1)
+    """The cloud of room 1, turned, as a file."""
+    cloud = room(1)[1]
     points = (cloud.points @ turn.T).astype(np.float64) + cloud.origin_world
-    center = turn @ (taken.pose.center_world - cloud.origin_world) + cloud.origin_world
-    pose = Pose(taken.pose.R_cam_from_world @ turn.T, center)
-    return stream(RawCloud(points, cloud.colors), chunk=9999), pose
+    return stream(RawCloud(points, cloud.colors), chunk=9999)
 
 
-@pytest.mark.parametrize("up", ["y", "-x"])
-def test_up_axis_is_believed_and_poses_stay_in_the_files_frame(up):
-    axis = np.eye(3)["xyz".index(up[-1])] * (-1 if up[0] == "-" else 1)
+def test_up_axis_is_believed():
+    axis = np.array([-1.0, 0.0, 0.0])
     yaw = exp_so3(np.array([0.0, 0.0, 0.4]))
-    cloud, truth = _lying(rotation_to_z(axis).T @ yaw)
-    scan_map = prepare_map(cloud, Workers(2), up)
+    cloud = _lying(rotation_to_z(axis).T @ yaw)
+    scan_map = prepare_map(cloud, Workers(2), "-x")
     np.testing.assert_array_equal(scan_map.R_map_from_world @ axis, [0.0, 0.0, 1.0])
     np.testing.assert_array_equal(np.abs(scan_map.R_map_from_world).sum(axis=0), 1.0)
     assert np.linalg.det(scan_map.R_map_from_world) == 1.0
     assert scan_map.warnings == ()
-    panorama = as_panorama(query(1).rgb)
-    found = rooms.locate(panorama, scan_map, rooms.KNOWN)
-    rooms.assert_near(found.pose, truth, 0.01, 0.2)
 
 
 @pytest.mark.parametrize("up", ["auto", "z", "-y"])
 def test_floors_on_edge_are_told_and_nothing_is_turned_but_by_word(up):
-    lying, _ = _lying(exp_so3(np.array([0.5 * np.pi, 0.0, 0.0])))
+    lying = _lying(exp_so3(np.array([0.5 * np.pi, 0.0, 0.0])))
     scan_map = prepare_map(lying, Workers(2), up)
     assert np.array_equal(scan_map.R_map_from_world, LEVEL) == (up != "-y")
     if up == "auto":
@@ -214,7 +208,7 @@ def test_floors_on_edge_are_told_and_nothing_is_turned_but_by_word(up):
 
 
 def test_the_files_own_axis_is_up_unless_they_disagree():
-    lying, _ = _lying(rotation_to_z(np.array([0.0, 1.0, 0.0])).T)
+    lying = _lying(rotation_to_z(np.array([0.0, 1.0, 0.0])).T)
     (source,) = lying.sources
     y_up = dataclasses.replace(lying, sources=[source._replace(up="y")])
     scan_map = prepare_map(y_up, Workers(2))

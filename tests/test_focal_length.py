@@ -14,7 +14,7 @@ from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
-from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import bundle, focal_length as focal, localize as module
@@ -28,8 +28,9 @@ from research.synthetic.world import render_picture
 TRUE = 160.0  # [px] of the photos here, 320 x 240
 
 
-def _photo(camera):
+def _photo(camera, yaw=0.0):
     this, pose = place(1)
+    pose = Pose(yaw_rotation(yaw) @ pose.R_cam_from_world, pose.center_world)
     return render_picture(Mount(camera), this, pose, Workers(2)), pose
 
 
@@ -129,7 +130,7 @@ def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found
 
 def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose(monkeypatch):
     """Nor does a bundle of one photo, which keeps what that rules out; the photo is searched for once."""
-    rgb, pose = _photo(pinhole(320, 240, TRUE))
+    rgb, pose = _photo(pinhole(320, 240, TRUE), 1.0)
     photo = Photo(rgb, focal_px=145.0)
     find = module.find
     found = []

@@ -1,6 +1,7 @@
 """The structure of the packages, read from their sources."""
 
 import ast
+import functools
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -59,6 +60,12 @@ def _module(path):
 MODULES = {_module(path): path for name in PACKAGES for path in sorted((ROOT / name).rglob("*.py"))}
 
 
+@functools.cache
+def _nodes(path):
+    """All nodes of a source's syntax."""
+    return list(ast.walk(ast.parse(path.read_text())))
+
+
 def _folder(module):
     """The longest entry of LAYERS that a module belongs to."""
     name = module.removeprefix("piccolo.")
@@ -70,7 +77,7 @@ def _imported(module):
     """The modules that one imports, of these packages and others."""
     path = MODULES[module]
     base = module.split(".") if path.name == "__init__.py" else module.split(".")[:-1]
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in _nodes(path):
         if isinstance(node, ast.ImportFrom):
             above = base[: len(base) - node.level + 1] if node.level else []
             parent = ".".join([*above, *filter(None, [node.module])])
@@ -111,7 +118,7 @@ def test_no_modules_import_each_other():
 
 def test_only_commands_know_argparse():
     for module, path in MODULES.items():
-        imports = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Import)]
+        imports = [n for n in _nodes(path) if isinstance(n, ast.Import)]
         imports = {a.name for n in imports for a in n.names}
         assert "argparse" not in imports or _folder(module) == "cli" or module.startswith("research."), module
 
@@ -121,7 +128,7 @@ def test_one_module_makes_statuses():
     callers = {
         str(path.relative_to(ROOT / "piccolo"))
         for path in (ROOT / "piccolo").rglob("*.py")
-        for node in ast.walk(ast.parse(path.read_text()))
+        for node in _nodes(path)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "classify"
     }
     assert callers == {"localization/judge.py"}

@@ -35,8 +35,8 @@ def scan():
 
 
 @functools.lru_cache
-def place(index=0):
-    """The room as a query finds it, and the query's pose in the world."""
+def place(index=2):
+    """The room as a query finds it, and the query's pose in the world; some cost the search much time."""
     world = rooms.room(SEED)[0]
     this, _, _ = pose_of_query(world, index, "clean")
     return this, make_query(world, index, "clean", 128, Workers(2)).pose
@@ -55,10 +55,10 @@ def cut(full, mount):
 
 def test_a_rig_of_four_photos_equals_the_sphere_that_they_were_cut_from(tmp_path):
     this, pose = place()
-    full = photograph(this, pose, 2048, Workers(2))
+    full = photograph(this, pose, 1024, Workers(2))
     folder = tmp_path / "instant"
     folder.mkdir()
-    camera = pinhole(640, 640, 320.0)
+    camera = pinhole(320, 320, 160.0)
     mounts = tuple(m.with_camera(camera) for m in four_sides())
     for mount in mounts:
         write(folder / mount.image, encoded(cut(full, mount), ".png"))
@@ -129,16 +129,17 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
         instant.mkdir(parents=True)
         for mount in mounts:
             write(instant / mount.image, encoded(render_picture(mount, this, pose, Workers(2)), ".png"))
+    (instant / mount.image).write_bytes(b"no picture")
     main([*cloud, "--pano", str(tmp_path / "walk"), "--rig", str(rig), "--out", str(tmp_path / "out.jsonl")])
     results = read_results([tmp_path / "out.jsonl"])
     assert [Path(result.pano).name for result in results] == ["1", "2"]
-    assert all(result.cameras == mounts for result in results)
-    assert all(pose_errors(result.best_pose, pose)[0] < 0.02 for result in results)
-    assert results[0].source.pano_sha256 == results[1].source.pano_sha256
+    assert [result.status for result in results] == ["localized", "unreadable"]
+    assert results[0].cameras == mounts
+    assert pose_errors(results[0].pose, pose)[0] < 0.02
     capsys.readouterr()
-    wide = render_picture(Mount(pinhole(480, 360, 150.0)), this, pose, Workers(2))
+    wide = render_picture(Mount(pinhole(320, 240, 100.0)), this, pose, Workers(2))
     exif = Image.Exif()
-    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 600 px diagonal: 152.5 px
+    exif.get_ifd(IFD.Exif)[Base.FocalLengthIn35mmFilm] = 11  # 400 px diagonal: 101.7 px
     Image.fromarray(wide).save(tmp_path / "phone.jpg", exif=exif, quality=95)
     main([*cloud, "--pano", str(tmp_path / "phone.jpg")])
     out, err = capsys.readouterr()
@@ -147,7 +148,7 @@ def test_rigs_and_phone_photos_on_the_command_line(tmp_path, capsys):
     first, *_, last = lines  # a warning stands below the line of its photo
     assert first.startswith(f"{tmp_path / 'phone.jpg'}: localized at")
     assert last.startswith(
-        "  warning: read as a pinhole photo 115.1 deg wide, focal length 153 px from EXIF's 35 mm"
+        "  warning: read as a pinhole photo 115.1 deg wide, focal length 102 px from EXIF's 35 mm"
     )
     assert main([*cloud, "--pano", str(tmp_path / "phone.jpg"), "--camera", str(rig)]) == 2
     assert "give it as --rig" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """Plain words and one statement a line, counted in the sources and documents."""
 
 import ast
+import functools
 import re
 from pathlib import Path
 
@@ -9,7 +10,6 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("piccolo", "research", "tools", "examples")
 SOURCES = [ROOT / "localize.py", *(path for name in FOLDERS for path in sorted((ROOT / name).rglob("*.py")))]
-TREES = {str(path.relative_to(ROOT)): ast.parse(path.read_text()) for path in SOURCES}
 BLOCKS = (ast.Module, ast.ClassDef, ast.FunctionDef)
 
 VAGUE = re.compile(r"(The same|What|How|Where)\b")  # such a first line needs the code around it
@@ -26,6 +26,12 @@ FLAG = re.compile(r"(?<![\w-])--[a-z{]")
 DOCUMENTS = ("README.md", "BENCHMARK.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/*.md", "docs/recipes/*.md")
 MAX_WORDS = 20_000
 MAX_PARALLEL = 4.99  # assignments a, b = x, y in 1,000 lines
+
+
+@functools.cache
+def _trees():
+    """The syntax of each source, by its name."""
+    return {str(path.relative_to(ROOT)): ast.parse(path.read_text()) for path in SOURCES}
 
 
 def _blocks(tree):
@@ -88,7 +94,7 @@ def _report(what, count, most, places=()):
 def test_docstrings_can_be_understood_alone():
     found = [
         f"{name}: {text.splitlines()[0]}"
-        for name, tree in TREES.items()
+        for name, tree in _trees().items()
         for block in _blocks(tree)
         if VAGUE.match(text := ast.get_docstring(block) or "")
     ]
@@ -98,7 +104,7 @@ def test_docstrings_can_be_understood_alone():
 def test_functions_are_verbs():
     found = [
         f"{name}:{function.lineno} {function.name}"
-        for name, tree in TREES.items()
+        for name, tree in _trees().items()
         for block in _blocks(tree)
         if not isinstance(block, ast.FunctionDef)
         for function in block.body
@@ -108,7 +114,7 @@ def test_functions_are_verbs():
 
 
 def test_messages_of_the_package_name_parameters_not_flags():
-    trees = {n: t for n, t in TREES.items() if n.startswith("piccolo/") and "/cli/" not in n}
+    trees = {n: t for n, t in _trees().items() if n.startswith("piccolo/") and "/cli/" not in n}
     found = [f"{n}:{line} {text}" for n, t in trees.items() for line, text in _texts(t) if FLAG.search(text)]
     _report("flags in messages", len(found), 0, found)
 
@@ -125,7 +131,7 @@ def test_page_fits_a_few_screens(name, most):
 
 def test_one_statement_a_line():
     packages = ("piccolo/", "research/", "tools/")
-    trees = {name: tree for name, tree in TREES.items() if name.startswith(packages)}
+    trees = {name: tree for name, tree in _trees().items() if name.startswith(packages)}
     num_lines = sum(len((ROOT / name).read_text().splitlines()) for name in trees)
     found = [
         f"{n}:{node.lineno}" for n, tree in trees.items() for node in ast.walk(tree) if _is_parallel(node)
@@ -136,7 +142,7 @@ def test_one_statement_a_line():
 def test_no_tuple_hides_arguments():
     found = {
         f"{name}:{line}"
-        for name, tree in TREES.items()
+        for name, tree in _trees().items()
         for function in _blocks(tree)
         if isinstance(function, ast.FunctionDef)
         for line in _packed(function)

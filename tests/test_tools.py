@@ -6,6 +6,9 @@ import importlib
 import json
 import math
 import re
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numba
@@ -14,6 +17,7 @@ import pytest
 from batches import ROOT, command_of, run
 from rooms import write_room
 
+from piccolo.confidence.covariance import PoseCovariance
 from piccolo.geometry.pose import Pose
 from piccolo.localization import attempts
 from piccolo.panorama import read_panorama
@@ -24,7 +28,7 @@ from research.measuring import benchmark, confidence, page, sensitivity, speed
 from research.scene import Query, read_scene, write_queries
 from research.synthetic.world import cut_photo, write_photo
 
-DAMAGE = "20% hidden by objects", "night", "half of the sphere masked"
+DAMAGE = "20% hidden by objects", "half of the sphere masked"
 TITLES = {name: text.splitlines()[0].removeprefix("## ") for name, text in page.PARTS.items()}
 
 
@@ -53,8 +57,10 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
         return [trial for trial in made if trial.case in DAMAGE]
 
     monkeypatch.setattr(page, "damage_trial", make_all)
+    monkeypatch.setattr(page, "DAMAGED_SCANS", {"scan thinned to 5%": confidence.thin_points})
+    monkeypatch.setattr(speed, "ProcessPoolExecutor", lambda *_, **__: ThreadPoolExecutor(1))
     out = tmp_path / "page.md"
-    sizes = ["--damaged", "1", "--photos", "1", "--points", "20000", "--rooms"]
+    sizes = ["--damaged", "1", "--photos", "0", "--points", "20000", "--rooms"]
     assert benchmark.main(["all", "--scenes", str(scene), *sizes, "--quiet", "--out", str(out)]) == 0
     text = out.read_text()
     assert len(text.splitlines()) <= 200
@@ -68,18 +74,16 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert 0.0 < float(row["deg"]) < 0.5
     damaged = table_of(text, TITLES["damage"])
     assert {row["queries"] for row in damaged.values()} == {"1"}
-    assert [damaged[name]["right"] for name in ("as taken", "20% hidden by objects", "night")] == 3 * ["1"]
+    assert [damaged[name]["right"] for name in ("as taken", DAMAGE[0])] == 2 * ["1"]
     assert [damaged["another place"][column] for column in ("right", "localized", "mm")] == ["0", "0", "-"]
-    assert set(damaged) == {"as taken", *DAMAGE, "another place", *confidence.DAMAGED_SCANS}
-    photos = table_of(text, TITLES["photos"])
-    assert [row["queries"] for row in photos.values()] == ["1", "1"]
+    assert set(damaged) == {"as taken", *DAMAGE, "another place", "scan thinned to 5%"}
     paper = table_of(text, TITLES["paper"])
     ratio = float(paper["preset paper"]["s"]) / float(paper["default method"]["s"])
     stated = float(re.search(r"The preset takes (\d+\.\d) times as long", text)[1])
     assert stated == pytest.approx(ratio, abs=0.1)
     confidences = table_of(text, "Confidences")
-    assert sum(int(row["answers"]) for row in confidences.values()) == 1 + len(damaged) + 2
-    assert f"0 of {1 + len(damaged) + 2} were localized and are not right." in text
+    assert sum(int(row["answers"]) for row in confidences.values()) == 1 + len(damaged)
+    assert f"0 of {1 + len(damaged)} were localized and are not right." in text
     sizes = table_of(text, TITLES["size"])
     assert [row["points"] for row in sizes.values()] == ["20,000"]
     assert re.fullmatch("[01]/1", sizes[f"{scene.name}, resampled"]["right"])
@@ -88,11 +92,12 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert float(speeds["loss"]["of cv2.remap"]) > 0.0
 
 
-def test_sizes_are_those_asked_for(scene):
+def test_sizes_are_those_asked_for(scene, monkeypatch):
+    monkeypatch.setattr(speed, "NUM_QUERIES", 1)
     points, _, queries = speed.scene_case(read_scene(scene), 50_000)  # more than it has
     assert (len(points), len(queries)) == (50_000, 1)
     points, _, queries = speed.rooms_case(1)
-    assert (len(points), len(queries)) == (50_000, speed.NUM_QUERIES)
+    assert (len(points), len(queries)) == (50_000, 1)
 
 
 def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
@@ -107,6 +112,20 @@ def test_parts_of_the_page_and_its_refusals(scene, tmp_path, capsys):
     assert benchmark.main(["all", "--scenes", str(tmp_path)]) == 3
     assert "found no queries, wanted pictures with true poses" in capsys.readouterr().err
     assert benchmark.main(["all", "--scenes", str(scene), "--photos", "-1"]) == 2
+
+
+def test_photos_are_cut_with_their_focal_length_as_it_is_and_in_exif(scene, monkeypatch, capsys):
+    given = []
+
+    def localize(photo):
+        given.append(read_panorama(photo).focal_prior.source)
+        return Result("not_localized", 0.0, "a.ply", "a.jpg")
+
+    monkeypatch.setattr(page.piccolo, "open_scan", lambda *_, **__: SimpleNamespace(localize=localize))
+    assert benchmark.main(["all", "--scenes", str(scene), "--only", "photos", "--photos", "1"]) == 0
+    assert given == ["`focal_px`", "EXIF"]
+    rows = table_of(capsys.readouterr().out, TITLES["photos"])
+    assert [row["queries"] for row in rows.values()] == ["1", "1"]
 
 
 def test_photos_of_a_scene_come_with_their_calibrations(tmp_path, capsys):
@@ -135,6 +154,9 @@ def test_wrong_answers_are_listed():
     result = Result("localized", 0.95, "a.ply", "a.jpg", found, None, None, (), None, {"search": 1.0}, {})
     rows = [QueryResult("", "a.jpg", "night", None, pose, result)] * 25
     assert page.row_cells(rows) == ("25", "0", "25", "25", "0", "-", "-", "1.00")
+    for std, is_outside in ((0.1, True), (0.25, False)):  # [m]
+        known = replace(result, covariance=PoseCovariance(std**2 * np.eye(6), ""))
+        assert page.is_outside(QueryResult("", "", "", None, pose, known)) == is_outside
     first, second, *_, last = page.wrong_lines(rows).splitlines()
     assert first == "25 of 25 were localized and are not right."
     assert second == "- night, a.jpg: 0.50 m off; confidence 0.950"

@@ -80,11 +80,13 @@ def _assert_right(results, queries):
     assert np.degrees(max(angle for _, angle in errors)) < 0.5
 
 
-def test_a_walk_with_bad_frames_between(scan, queries):
+def test_a_walk_with_bad_frames_between_keeps_within_a_prior(scan, queries):
     frames = [cv2.imread(str(q.image))[..., ::-1].copy() for q in queries]
     noise = np.random.default_rng(0).integers(0, 255, frames[0].shape, dtype=np.uint8)
     frames[3], frames[4] = np.ascontiguousarray(frames[3][:, ::-1]), noise
-    results = scan.localize_walk(frames, times=[q.time for q in queries], gravity="known")
+    x, y, z = np.mean([q.pose.center_world for q in queries], axis=0)
+    prior = piccolo.Prior(near=(x, y, z), radius=2.0)
+    results = scan.localize_walk(frames, times=[q.time for q in queries], gravity="known", prior=prior)
     bad = {3, 4}
     assert all(results[k].status != "localized" for k in bad)
     good = [k for k in range(len(queries)) if k not in bad]
@@ -97,16 +99,6 @@ def test_a_walk_with_bad_frames_between(scan, queries):
     assert all(result.walk.gap is None for result in results)
     assert all(results[k].covariance is not None for k in good)
     assert piccolo.Result.from_json(results[0].to_json()).to_json() == results[0].to_json()
-
-
-def test_a_walk_keeps_within_a_prior(scan, queries):
-    x, y, z = np.mean([q.pose.center_world for q in queries], axis=0)
-    frames = [q.image for q in queries]
-    frames[3] = np.zeros((rooms.WIDTH // 2, rooms.WIDTH, 3), np.uint8) + 99  # lost: looked for near and far
-    results = scan.localize_walk(frames, gravity="known", prior=piccolo.Prior(near=(x, y, z), radius=2.0))
-    good = [k for k in range(len(queries)) if k != 3]
-    _assert_right([results[k] for k in good], [queries[k] for k in good])
-    assert results[3].status != "localized"
 
 
 def test_a_walk_is_done_again_from_a_frame_that_was_missing_or_failed(queries, tmp_path, monkeypatch, capsys):
@@ -335,7 +327,7 @@ def test_a_walk_goes_on_with_the_same_bits(queries, tmp_path, shown):
     ends, lines = [], []
     for num_threads, num_kept in ((2, 0), (1, 2)):
         walk = rooms.scan(3, num_threads).track(gravity="known")
-        for k, query in enumerate(queries[:5]):
+        for k, query in enumerate(queries[:4]):
             photo = Photo(query.image, mask=tmp_path / "mask.png")
             if k < num_kept:
                 walk.restore(lines[k], photo)

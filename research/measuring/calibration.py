@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from piccolo.arguments import MIN_CONFIDENCE
 from piccolo.arrays import Array
@@ -137,7 +137,7 @@ def print_coverage(title: str, outcomes: Sequence[Outcome]) -> None:
     for part, own in parts.items():
         e = errors[:, own, None]
         squares = np.sum(e * np.linalg.solve(matrices[:, own, own], e), axis=(1, 2))
-        fractions = [f"{np.mean(squares < chi2.ppf(p, e.shape[1])):.3f}" for p in (0.95, 0.5)]
+        fractions = [f"{np.mean(squares < chdtri(e.shape[1], 1.0 - p)):.3f}" for p in (0.95, 0.5)]
         rows.append((part, str(len(known)), *fractions))
     columns = (title, "right poses", "in the 95 % region", "in the 50 % region")
     print(Table("", columns, tuple(rows)).markdown())

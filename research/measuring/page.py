@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numba
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 import piccolo
 from piccolo import InputError, PaperSettings, Pose, Result
@@ -94,7 +94,7 @@ def is_outside(row: QueryResult) -> bool:
     if covariance is None or pose is None or row.true_pose is None:
         return False
     error = subtract(row.true_pose, pose)
-    return bool(error @ np.linalg.solve(covariance.matrix, error) > chi2.ppf(0.95, 6))
+    return bool(error @ np.linalg.solve(covariance.matrix, error) > chdtri(6, 0.05))
 
 
 def row_cells(rows: Sequence[QueryResult]) -> tuple[str, ...]:
