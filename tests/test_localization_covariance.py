@@ -88,6 +88,16 @@ def test_sandwich_of_independent_blocks_is_the_textbook_covariance():
     np.testing.assert_allclose(found, np.linalg.inv(hessian), atol=0.05)
 
 
+def test_errors_weighed_by_a_covariance_of_few_blocks_are_right_in_the_mean():
+    rng = np.random.default_rng(0)
+    squares = []
+    for _ in range(4000):
+        known = covariance.sandwich_covariance(np.eye(6), rng.normal(size=(20, 6)))
+        error = np.sqrt(20.0) * rng.normal(size=6)
+        squares.append(error @ np.linalg.solve(covariance.few_blocks_factor(20) * known, error))
+    assert np.mean(squares) == pytest.approx(6.0, rel=0.05)
+
+
 def test_no_covariance_without_a_minimum_or_with_few_blocks():
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     assert covariance.sandwich_covariance(np.diag([1.0, 1, 1, 1, 1, -0.1]), gradients) is None
@@ -110,7 +120,7 @@ def test_in_a_place_ten_times_as_large_a_position_is_known_a_tenth_as_well(found
     prepared, pose, _ = found
     points = _points(prepared, pose)
     places = [points._replace(offsets=points.offsets * np.float32(size)) for size in (4.0, 40.0)]
-    small, large = (covariance.compute_covariance(prepared, place, pose) for place in places)
+    small, large = (covariance.compute_covariance(prepared, place, pose, False) for place in places)
     per_metre = np.repeat([1.0, 0.1], 3)
     np.testing.assert_allclose(large * np.outer(per_metre, per_metre), small, rtol=0.02, atol=1e-9)
 
@@ -130,7 +140,7 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "compute_hessian", hessian)
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose)
+    matrix = covariance.compute_covariance(prepared, _points(prepared, pose), pose, False)
     assert (
         sorted(asked, key=lambda each: ("full", "fine", "middle").index(each[1].image))
         == ways[: 2 if num_rough == 1 else 3]
@@ -141,14 +151,16 @@ def test_where_the_finest_images_have_no_minimum_the_next_one_tells(found, monke
         np.testing.assert_allclose(matrix, ways[num_rough][1].inflation * gradients.T @ gradients)
 
 
-def test_two_images_count_alike(found, monkeypatch):
+@pytest.mark.parametrize("is_partial", [False, True])
+def test_two_images_count_alike(found, monkeypatch, is_partial):
     prepared, pose, _ = found
     points = _points(prepared, pose)
     gradients = np.random.default_rng(0).normal(size=(100, 6))
     monkeypatch.setattr(covariance, "compute_hessian", lambda *_: np.eye(6))
     monkeypatch.setattr(covariance, "block_gradients", lambda *_: gradients)
-    matrix = covariance.compute_covariance(prepared, points, pose)
-    np.testing.assert_allclose(matrix, 2.0 / (1.0 / 1.1 + 1.0 / 0.36) * gradients.T @ gradients)
+    matrix = covariance.compute_covariance(prepared, points, pose, is_partial)
+    expected = 2.0 / (1.0 / 1.1 + 1.0 / 0.36) * gradients.T @ gradients
+    np.testing.assert_allclose(matrix, 100.0 / 93.0 * expected if is_partial else expected)
 
 
 def test_a_direction_that_one_image_does_not_tell_is_told_by_the_other():

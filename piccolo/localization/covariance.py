@@ -188,6 +188,14 @@ def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:
     return np.asarray(inverse @ (gradients.T @ gradients) @ inverse)
 
 
+def few_blocks_factor(num_blocks: int) -> float:
+    """Return the factor by which a covariance that is estimated from few blocks is too small in the mean.
+
+    It is that of the mean of the inverse of a Wishart matrix in six dimensions.
+    """
+    return num_blocks / (num_blocks - 7.0)
+
+
 def merge_covariances(found: Sequence[Array]) -> Array:
     """Return the covariance (6, 6) that has the mean information of some.
 
@@ -265,11 +273,13 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps))
 
 
-def compute_covariance(shown: Query, points: Cells, pose: Pose) -> Array | None:
+def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used; else both count alike. The points are around the pose.
+    rough, a third is used; else both count alike. `is_partial` says that the photo shows a part of the
+    sphere, even without occluders: then the covariance is larger, as few blocks tell it
+    (`few_blocks_factor`). The points are around the pose.
     """
     if points.offsets.shape[1] == 0:
         return None
@@ -283,7 +293,8 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose) -> Array | None:
         covariance = sandwich_covariance(hessian, gradients)
         if covariance is None:
             return None
-        return steps.inflation * covariance
+        factor = few_blocks_factor(len(gradients)) if is_partial else 1.0
+        return steps.inflation * factor * covariance
 
     has_shape = shown.scan_map.has_shape
     steps = SHAPE_STEPS if has_shape else STEPS
@@ -338,7 +349,7 @@ def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: P
     if leaves_out and seen.contradicts.any():
         points = remove_hidden(points, masked.photo.panorama.is_valid, pose)
     shown = query if leaves_out else masked
-    covariance = compute_covariance(shown, points, pose)
+    covariance = compute_covariance(shown, points, pose, is_partial)
     if covariance is None:
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
