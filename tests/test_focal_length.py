@@ -45,7 +45,7 @@ def _fit(rgb, pose, **options):
 
 
 @pytest.mark.parametrize("num", [1, 2])
-def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num):
+def test_the_minimum_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num):
     true, curvature = np.array([0.01, -0.02])[:num], np.array([[4.0, 1.0], [1.0, 3.0]])[:num, :num]
     changes = focal.make_design(num, 0.04)
     pulls = np.tile([[0.3, -0.3], [-0.3, 0.3], [0.1, 0.2], [-0.1, -0.2]], (2, 1))[:, :num]
@@ -54,21 +54,21 @@ def test_the_crest_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num
     losses = whole[:, None] / 8.0 + off @ pulls.T
     turn = np.array([0.0, 0.0, 0.5])
     poses = [Pose(exp_so3(turn * c[0]), np.array([3.0 * c[0], 0.0, 0.0])) for c in changes]
-    crest = focal.fit_crest(changes, losses, poses, Pose(np.eye(3), np.zeros(3)))
-    np.testing.assert_allclose(crest.change, true, atol=1e-9)
-    np.testing.assert_allclose(crest.motion[:, 0], [0.0, 0.0, 0.5, 3.0, 0.0, 0.0], atol=1e-9)
+    minimum = focal.fit_minimum(changes, losses, poses, Pose(np.eye(3), np.zeros(3)))
+    np.testing.assert_allclose(minimum.change, true, atol=1e-9)
+    np.testing.assert_allclose(minimum.motion[:, 0], [0.0, 0.0, 0.5, 3.0, 0.0, 0.0], atol=1e-9)
     inverse = np.linalg.inv(curvature)
-    slopes = pulls / (1.0 - 1.0 / 8.0)  # each block has an eighth of what fixes the crest
+    slopes = pulls / (1.0 - 1.0 / 8.0)  # each block has an eighth of what fixes the minimum
     expected = focal.INFLATION * inverse @ slopes.T @ slopes @ inverse
-    np.testing.assert_allclose(np.linalg.inv(crest.information), expected, rtol=1e-6)
+    np.testing.assert_allclose(np.linalg.inv(minimum.information), expected, rtol=1e-6)
 
 
-def test_a_loss_of_few_blocks_or_without_a_crest_tells_nothing():
+def test_a_loss_of_few_blocks_or_without_a_minimum_tells_nothing():
     changes = focal.make_design(1, 0.04)
     poses = [Pose(np.eye(3), np.zeros(3))] * len(changes)
-    crest = focal.fit_crest(changes, -np.repeat(changes**2, 9, axis=1), poses, poses[0])
-    assert not crest.information.any()
-    few = focal.fit_crest(changes, np.repeat(changes**2, 3, axis=1), poses, poses[0])
+    minimum = focal.fit_minimum(changes, -np.repeat(changes**2, 9, axis=1), poses, poses[0])
+    assert not minimum.information.any()
+    few = focal.fit_minimum(changes, np.repeat(changes**2, 3, axis=1), poses, poses[0])
     assert not few.information.any()
 
 
@@ -168,44 +168,44 @@ def _fake_profile(true, noise=0.0):
 @pytest.mark.parametrize("true", [0.0, 0.23, -0.31])
 def test_a_profile_without_a_minimum_is_followed_downhill(monkeypatch, true):
     monkeypatch.setattr(focal, "take_profile", _fake_profile(true))
-    crest = focal.find_crest(None, Pose(np.eye(3), np.zeros(3)), 1, focal.NEXT_REACH)
-    assert crest.change[0] == pytest.approx(true, abs=0.01)
-    assert crest.variance < 0.01
+    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.NEXT_REACH)
+    assert minimum.change[0] == pytest.approx(true, abs=0.01)
+    assert minimum.variance < 0.01
 
 
 def test_a_loss_that_falls_beyond_the_range_contradicts_and_one_that_does_not_fall_tells_nothing(monkeypatch):
     monkeypatch.setattr(focal, "take_profile", _fake_profile(0.8))
-    crest = focal.find_crest(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
-    assert crest.change[0] > focal.LIMIT
-    assert crest.variance == pytest.approx(focal.END_DEVIATION**2)
+    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
+    assert minimum.change[0] > focal.LIMIT
+    assert minimum.variance == pytest.approx(focal.END_DEVIATION**2)
     changes = focal.make_design(1, 0.1)
     assert not focal.fit_end(changes, changes * np.tile([1.0, -0.9], 8) + 1.0).any()
 
 
-def test_a_crest_is_that_of_the_design_that_tells_most(monkeypatch):
+def test_a_minimum_is_that_of_the_design_that_tells_most(monkeypatch):
     """Among neighbouring focal lengths noise may hide it."""
     monkeypatch.setattr(focal, "take_profile", _fake_profile(0.03, noise=5e-4))
-    crest = focal.find_crest(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
-    assert crest.change[0] == pytest.approx(0.03, abs=0.02)
-    assert crest.information.any()
+    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
+    assert minimum.change[0] == pytest.approx(0.03, abs=0.02)
+    assert minimum.information.any()
 
 
 @pytest.mark.parametrize(
-    ("crest", "share", "std"), [(0.01, 0.48, 0.0072), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)]
+    ("minimum", "share", "std"), [(0.01, 0.48, 0.0072), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)]
 )
-def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, crest, share, std):
+def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, minimum, share, std):
     """Beyond two deviations the picture says where to look next."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
-    found = focal.Crest(np.array([crest]), np.array([[0.01**-2]]), np.ones((6, 1)))
-    monkeypatch.setattr(focal, "find_crest", lambda *args: found)
+    found = focal.Minimum(np.array([minimum]), np.array([[0.01**-2]]), np.ones((6, 1)))
+    monkeypatch.setattr(focal, "find_minimum", lambda *args: found)
     monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
     fit = focal.fit_focal(query, scan().from_world(pose))
-    assert fit.conflict == pytest.approx(crest / 0.01 / math.sqrt(2.0), rel=0.02)
-    assert fit.change[0] / crest == pytest.approx(share, abs=0.02)
+    assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
+    assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
     nothing = found._replace(information=np.zeros((1, 1)))
-    monkeypatch.setattr(focal, "find_crest", lambda *args: nothing)
+    monkeypatch.setattr(focal, "find_minimum", lambda *args: nothing)
     open_fit = focal.fit_focal(query, scan().from_world(pose))
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
 

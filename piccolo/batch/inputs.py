@@ -48,8 +48,8 @@ def list_panoramas(
 ) -> Iterator[Path]:
     """Yield the panoramas that words name, in order: pictures, folders, `@list.txt`, `-` for stdin.
 
-    A folder is one panorama if it holds the six faces of a cube, or what else `is_panorama` tells, else all
-    pictures in it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.
+    A folder is one panorama if `is_panorama` says so (by default of a cube's six faces), else all pictures in
+    it and in its folders, sorted by path; its other files are counted in `left_out` by suffix.
     Raises InputError if a list can't be read, or a folder holds no picture.
     """
     for word in words:
@@ -90,7 +90,7 @@ def _at(path: Path, left_out: Counter[str], is_panorama: Callable[[Path], bool])
 
 
 def _folders(top: Path, is_panorama: Callable[[Path], bool]) -> Iterator[tuple[Path, bool]]:
-    """Yield a folder and those in it, by a link only what has no other name; and if each is one panorama."""
+    """Yield a folder and those in it, each once, links last; and whether each is one panorama."""
     waiting = deque([top])
     seen = set[tuple[int, int]]()
     while waiting:

@@ -1,6 +1,6 @@
 """Answers to the photos of a batch, in this process or where else the scan is opened.
 
-A photo that is not sure gets a second look, with what the others say of their camera, or beside sure ones.
+Photos that are unsure, or off in focal length, get a second look with that of others, or beside sure ones.
 """
 
 import json
@@ -60,7 +60,7 @@ class Look(NamedTuple):
 
 
 def is_doubtful(result: Result) -> bool:
-    """Return True for a photo of a camera that is not localized, or was not before others were beside it."""
+    """Return True for a photo with `cameras` that is not localized, or was not without others beside it."""
     was_doubtful = result.beside is not None or result.status in (AMBIGUOUS, NOT_LOCALIZED)
     return bool(result.cameras) and was_doubtful
 
@@ -253,7 +253,7 @@ class Localizer:
     def expect(
         self, cloud_sha256: str, more: Mapping[str, Any] | None = None
     ) -> Callable[[Path], Mapping[str, Any]]:
-        """Return the fields of a photo's line that say how it was made, with `more` settings."""
+        """Return a function of a photo's path: the fields that say how its line was made, with `more`."""
 
         @lru_cache
         def make_fields(settings: Settings, gravity_vector: Vector | None) -> Mapping[str, Any]:

@@ -104,7 +104,7 @@ def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit
 
 
 def _repeat(own: Sequence[Array], steps: Array, errors: RelativeErrors, is_odd: Sequence[bool]) -> float:
-    """Return how many photos in order say what one says, by how alike the errors of two neighbours are.
+    """Return how many successive photos tell as much as one, by how alike the errors of two neighbours are.
 
     Given poses drift: those of neighbouring photos are off in the same way, which is not averaged away.
     """

@@ -103,8 +103,8 @@ def read_odometry(
     """Return each frame's pose in the frame of an odometry; None of a frame without one.
 
     A transforms.json names its frames. A trajectory has a pose of each frame in order, or, of TUM, poses by
-    time [s]: each frame takes the nearest, within half of the time to the next frame. If `times` are by a
-    clock, it is tried as the trajectory's first. Else both begin at 0.
+    time [s]: each frame takes the nearest, within half of the frames' median step. Times by a clock are
+    tried first; if none fits, rows are taken in order, if as many as frames, else by time since the first.
     Raises InputError if the file is no odometry, or of other frames.
     """
     if path.suffix == ".json":

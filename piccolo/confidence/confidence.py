@@ -40,7 +40,7 @@ LEAST_SCORE = 0.02
 LEAST_RATIO = 0.1
 MOST_RATIO = 1.2
 CONTRADICTED = 0.01  # odds that what the user says is wrong
-NOISE_MATCHES = 8  # local features that agree with a wrong pose by chance, at most
+NOISE_MATCHES = 8  # added to the number that agree, as so many may by chance
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
 FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")

@@ -10,5 +10,5 @@ A photo's way from its file to a result:
 6. `focal_length.calibrate` fits the focal length of a photo of one camera;
 7. `judge.judge` measures the best pose, its covariance (`covariance`) and its probability, and decides;
 8. `result.with_localization` makes the result in the world, which a command writes.
-Photos that help each other begin with the same steps: see `judge`.
+`judge` tells how photos help each other, and what each way hands over.
 """

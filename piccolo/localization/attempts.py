@@ -1,7 +1,7 @@
 """The searches that are tried for a photo, in order, each with its refinement.
 
-A first look by whole views finds most upright photos of the whole sphere, without local features. These would
-show that a photo is mirrored, so the first look briefly searches its mirror image too.
+A first look by whole views finds most upright photos of the whole sphere, without local features. Only
+features show that a photo is mirrored, so the first look briefly searches its mirror image too.
 """
 
 from collections.abc import Callable
@@ -31,8 +31,8 @@ FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
 NUM_VERIFIED = 7  # alternatives of the best pose that are verified
-ENOUGH_MATCHES = 40  # of a part of the features: the others are not asked
-CHANCE_MATCHES = 6  # agree with a wrong pose, at most; mostly none do
+ENOUGH_MATCHES = 40  # of a part of the features: if the pose is sure, the others are not asked
+CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do: with more, the pose fitted to them is added
 NUM_MATCHED = 6  # poses from matches that are refined
 
 Poses = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
@@ -43,12 +43,12 @@ Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Poses]
 def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
     """Return the searches for a photo in order, each with the query of the evidence that it uses.
 
-    A first look by whole views may settle a whole upright sphere, or the scan drawn at the poses that it
-    found. Then come searches by whole views: with gravity `auto` as known, then as unknown (briefly, for a
-    whole sphere). Poses from matches with features of the map, first of a part of the photo's views, then of
-    all, come last: those of the map may have to be made. Narrow photos and those of any tilt ask them first.
-    Photos of a part of the sphere are mostly taken about level: with a tilt that is not known exactly,
-    "known" searches about level.
+    A first look by whole views, or the scan drawn at its poses, may settle a whole upright sphere, and a look
+    along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
+    unknown (briefly, for a whole sphere). Poses from matches with features of the map, first of a part of the
+    photo's views, then of all, come last: those of the map may have to be made. Partial photos, and those of
+    any tilt, ask them first. Partial photos are mostly taken about level: with a tilt that is not known
+    exactly, "known" searches about level.
     """
     method = query.method
     looks_first = method.uses_features and method.uses_search and is_whole(query)

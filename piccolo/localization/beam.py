@@ -46,7 +46,7 @@ class Ends(NamedTuple):
 
 
 def refine_starts(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
-    """Refine the starts by successive halving to a few distinct poses on fine cells, best first."""
+    """Refine the starts by successive halving to a few distinct poses, best first."""
     workers = query.workers
     coarse = keep_ends(descend_prepared(query, starts, first_stage(query)), beam.num_coarse)
     coarse = keep_ends(descend_prepared(query, coarse, SECOND), beam.num_middle)
@@ -73,7 +73,7 @@ def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
 
 
 def first_stage(query: Query) -> Stage:
-    """Return the stage of the first descents; a narrow photo needs more iterations."""
+    """Return the stage of the first descents; a partial photo needs more iterations."""
     return SECOND if query.photo.is_partial else FIRST
 
 

@@ -51,7 +51,7 @@ class Neighbor(NamedTuple):
     name: str
     picture: SurePhoto
     matches: Matches
-    pose: Pose  # of the other, by the matches
+    pose: Pose  # of the query, by the matches
 
 
 @one_blas_thread()

@@ -3,7 +3,7 @@
 Each photo is searched by itself. Its poses vote for poses of the bundle, and the best few of these are tested
 in every photo. Then the bundle, its scale and the errors of the relative poses are adjusted to the poses of
 single photos, and each photo's pose is what it and the others say together. A photo that contradicts the
-others is judged by itself, and so are all if the relative poses contradict the photos that are sure.
+others keeps its own result; if the relative poses contradict photos that are sure, only these keep theirs.
 """
 
 import math
@@ -52,11 +52,11 @@ from .settings import CoarseToFineSettings
 
 EVEN = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
-NUM_NEIGHBORS = 8  # chosen: photos with one of which another may have been exchanged
+NUM_NEIGHBORS = 8  # chosen: photos whose relative pose another may have by mistake
 MOST_GAIN = 3.0  # [log] by being where it was to be expected
 TOLD = 2.0  # deviations of the scale, and ratio of other errors to those expected, that are reported
 NOT_FOUND = "`relative_poses`: no pose of all photos together was found"
-DOUBTED = "`relative_poses`: they contradict the photos that are sure; each photo is judged by itself"
+DOUBTED = "`relative_poses`: they contradict the photos that are sure; only these keep their poses"
 UNSEEN = "`relative_poses`: this photo does not show the place where the others put it"
 CONTRADICTS = "`relative_poses`: this photo contradicts the others; it is judged by itself"
 
@@ -192,7 +192,7 @@ def agree(
     errors = estimate_errors(bundle, estimates, free)._replace(log_scale=errors.log_scale)
     log_scale, std = find_scale(bundle, estimates, errors)
     if abs(log_scale) > MOST_CONFLICT * math.hypot(std, errors.log_scale):
-        return f"`relative_poses`: positions are {describe_scale(log_scale)}; each photo is judged by itself"
+        return f"`relative_poses`: positions are {describe_scale(log_scale)}; only sure photos keep poses"
     excess = max(log_scale**2 - std**2 - errors.log_scale**2, 0.0)
     errors = errors._replace(log_scale=math.hypot(errors.log_scale, math.sqrt(excess)))
     blurred = blur_local(bundle, own, {k: supports[k].local_share for k in own}, errors)
@@ -212,7 +212,7 @@ def blur_local(
 ) -> dict[int, Estimate]:
     """Add the errors of local optima to the photos' own poses, times the probability that each is one.
 
-    That is the photo's own, and less if the pose is near the one that the others expect. Poses and
+    It begins as `local_shares`, and is less if the pose is near the one that the others expect. Poses and
     probabilities are found in turn (expectation maximization).
     """
     shares = local_shares
@@ -230,13 +230,13 @@ def blur_local(
 
 
 def describe_scale(log_scale: float) -> str:
-    """Return by how much positions are too long or too short that are to be multiplied by a scale."""
+    """Say how far positions are too long or too short, by the log of the scale that corrects them."""
     percent = 100.0 * abs(math.expm1(-log_scale))
     return f"{percent:.0f} % too {'short' if log_scale > 0.0 else 'long'}"
 
 
 def judge_apart(member: Member, reason: str) -> Localization:
-    """Return the result of a photo by itself, with the reason; no pose if that is not sure."""
+    """Return a photo's own result, with the reason; if it is not sure, a pose only for CONTRADICTS."""
     alone = member.alone
     if alone.status != LOCALIZED and reason is not CONTRADICTS:
         return Localization(warnings=(*alone.warnings, reason))

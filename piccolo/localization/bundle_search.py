@@ -26,7 +26,7 @@ from .query import Query
 from .selection import Selection, assess_poses
 from .verification import verify
 
-MISSED = 0.25  # chosen: of photos, those whose right pose is not found (BENCHMARK.md, phone photos: a sixth)
+MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
 SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
 CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
@@ -49,7 +49,7 @@ class Member:
 
     @property
     def is_misplaced(self) -> bool:
-        """True if it is ruled out for another focal length than other photos tell: so its place is wrong."""
+        """True if its focal length contradicts that of the other photos, as at a wrong place."""
         prior = self.query.given.focal_prior
         has_conflict = self.fit is not None and self.fit.conflict > MOST_CONFLICT
         return has_conflict and prior is not None and prior.is_measured

@@ -64,7 +64,7 @@ class DifferenceSteps(NamedTuple):
     """Image and step with which the loss is differentiated for a covariance."""
 
     image: ImageName  # of the photo
-    turn: float  # step of the differences [rad]; a move is as long as turns it seen from the median range
+    turn: float  # [rad] step of the differences; a move is this times the median range
     inflation: float  # so that 95 % of true poses lie in the 95 % region (tools/benchmark.py calibration)
 
 
@@ -253,7 +253,7 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     """Return what halves that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
-    both. The sum is the mean square of the steps from the pose to theirs, with errors of the same covariance.
+    both. Added are the covariance and the mean square of the steps to theirs, less for scores near chance.
     """
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
@@ -276,8 +276,8 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
-    Noise and stitching roughen the loss in the finest image; the next one is smoother. If both are too
-    rough, a third is used; else both count alike. `is_partial` says that the photo shows a part of the
+    Noise and stitching roughen the loss in the finest image; the next one is smoother. Those that are not too
+    rough count alike; if both are, a third is used. `is_partial` says that the photo shows a part of the
     sphere, even without occluders: then the covariance is larger, as few blocks tell it
     (`few_blocks_factor`). The points are around the pose.
     """
@@ -314,7 +314,7 @@ def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
     These are correlated over many blocks: its noise and doubled surfaces (`surface_variance`); of shape alone
-    those of its edges.
+    its edges too.
     """
     surface = scan_map.surface_variance
     covariance = np.zeros((6, 6))

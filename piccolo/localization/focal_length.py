@@ -1,9 +1,9 @@
 """The focal length of a photo, fitted with its pose to the scan and to prior knowledge.
 
 The photo is projected again with each of several focal lengths (and k1, if a guessed camera has it), and the
-pose refined with each. The losses at the ends are the profile of the loss. Its crest is the focal length on
-which photo and scan agree; the slopes of the blocks' losses at the crest give its covariance. The covariance
-of the pose is marginal: it includes the error of the focal length.
+pose refined with each. The losses at the ends are the profile of the loss. Its minimum is the focal length on
+which photo and scan agree; the slopes of the blocks' losses there give its covariance. The covariance of the
+pose is marginal: it includes the error of the focal length.
 """
 
 import itertools
@@ -46,10 +46,10 @@ NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
 FIRST_REACH = 0.1  # of a design to either side, at first
 NEXT_REACH = 0.04
 LAST_REACH = 0.02
-NARROWER = 0.4  # times the reach, where a design has a crest
+NARROWER = 0.4  # times the reach, where a design has a minimum
 WIDER = 2.0  # and where it has none
 LIMIT = 0.4  # of the change that is searched
-END_DEVIATION = 0.05  # of a crest that lies there or beyond
+END_DEVIATION = 0.05  # of a minimum that lies there or beyond
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 STEP = 1e-4  # [rad, m] with which that is differentiated
 AGREES = 0.25  # least weight of a match that agrees
@@ -116,16 +116,16 @@ class FocalFit(NamedTuple):
         return replace(found, doubt=self.doubt, picture_px=px, picture_std_px=std)
 
 
-class Crest(NamedTuple):
+class Minimum(NamedTuple):
     """The calibration at which the loss of a profile is least."""
 
     change: Array  # (p,)
-    information: Array  # (p, p) inverse of its covariance; 0 where the profile has no crest
+    information: Array  # (p, p) inverse of its covariance; 0 where the profile has no minimum
     motion: Array  # (6, p) as of FocalFit
 
     @property
     def variance(self) -> float:
-        """Variance of the logarithm of the focal length; infinite where there is no crest."""
+        """Variance of the logarithm of the focal length; infinite where there is no minimum."""
         return float(np.linalg.pinv(self.information)[0, 0]) if self.information.any() else math.inf
 
 
@@ -144,65 +144,65 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         k1 = names.index(RADIAL)
         expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
     precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
-    crest = find_crest(query, pose, num, FIRST_REACH if is_first else NEXT_REACH)
-    if crest.information.any():
+    minimum = find_minimum(query, pose, num, FIRST_REACH if is_first else NEXT_REACH)
+    if minimum.information.any():
         per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
-        covariance = np.linalg.pinv(crest.information)
+        covariance = np.linalg.pinv(minimum.information)
         covariance[0, 0] += (EDGE_ERROR * per_px) ** 2
-        crest = crest._replace(information=np.linalg.pinv(covariance))
+        minimum = minimum._replace(information=np.linalg.pinv(covariance))
     change, information, _ = fit_matches(query, pose)
     of_matches = np.diag([information, 0.0][:num])
-    both = crest.information + of_matches
-    middle = np.linalg.pinv(both) @ (crest.information @ crest.change + of_matches[0] * change)
-    crest = crest._replace(change=middle, information=both)
+    both = minimum.information + of_matches
+    middle = np.linalg.pinv(both) @ (minimum.information @ minimum.change + of_matches[0] * change)
+    minimum = minimum._replace(change=middle, information=both)
     conflict = 0.0
     doubt = WRONG_SHARE if prior.deviation <= WIDE else 0.0
     opinion = None
     wide = precision.copy()
-    if crest.information.any():
-        opinion = Opinion(float(crest.change[0] - expected[0]), crest.variance)
+    if minimum.information.any():
+        opinion = Opinion(float(minimum.change[0] - expected[0]), minimum.variance)
         conflict = opinion.conflict(prior.deviation)
         if doubt:
             doubt = opinion.doubt(prior.deviation) * opinion.share_of_given(prior.deviation)
-        spread = crest.variance + prior.deviation**2
+        spread = minimum.variance + prior.deviation**2
         # of the prior's variance, as by DerSimonian and Laird (1986)
         excess = 0.0 if prior.is_measured else max(opinion.off**2 - spread, 0.0)
         wide[0, 0] = 1.0 / (prior.deviation**2 + excess)
     if conflict > DISAGREE:
         precision = wide  # the picture says where to look next
-    goal = crest.information @ crest.change + precision @ expected
-    change = np.linalg.inv(crest.information + precision) @ goal
-    total = np.linalg.inv(crest.information + wide)
-    return FocalFit(change, np.asarray(total), crest.motion, opinion, conflict, doubt)
+    goal = minimum.information @ minimum.change + precision @ expected
+    change = np.linalg.inv(minimum.information + precision) @ goal
+    total = np.linalg.inv(minimum.information + wide)
+    return FocalFit(change, np.asarray(total), minimum.motion, opinion, conflict, doubt)
 
 
-def find_crest(query: Query, pose: Pose, num: int, reach: float) -> Crest:
-    """Search the crest of the profile about a pose in ever narrower designs, moved downhill if they miss it.
+def find_minimum(query: Query, pose: Pose, num: int, reach: float) -> Minimum:
+    """Find the minimum of the profile about a pose in ever narrower designs, moved downhill if they miss it.
 
-    Of the designs that have a crest, the one with the least variance counts. If none has, the picture does
-    not determine the calibration: the information is 0. If the loss still falls at the end of the range, the
-    end is the crest: that contradicts what was given.
+    Of the designs that have a minimum, the one with the least variance counts. If none has, the picture does
+    not determine the calibration: the information is 0. If the loss clearly falls to the end of the range,
+    that is the minimum: it contradicts what was given.
     """
     middle = np.zeros(num)
-    found: Crest | None = None
+    found: Minimum | None = None
     for _ in range(MOST_DESIGNS):
         changes = middle + make_design(num, reach)
         losses, ends = take_profile(query, pose, changes)
-        crest = fit_crest(changes, losses, ends, pose)
-        has_crest = bool(crest.information.any())
-        is_inside = has_crest and bool(np.all(np.abs(crest.change - middle) <= reach))
+        minimum = fit_minimum(changes, losses, ends, pose)
+        has_minimum = bool(minimum.information.any())
+        is_inside = has_minimum and bool(np.all(np.abs(minimum.change - middle) <= reach))
         lowest = changes[int(losses.sum(axis=1).argmin())]
         if is_inside:
-            found = min(crest, found or crest, key=lambda one: one.variance)
-        is_lost = not has_crest and bool(np.all(np.abs(lowest - middle) < 0.99 * reach))
+            found = min(minimum, found or minimum, key=lambda one: one.variance)
+        is_lost = not has_minimum and bool(np.all(np.abs(lowest - middle) < 0.99 * reach))
         if reach <= LAST_REACH if is_inside else found or is_lost:
             break
         if abs(lowest[0]) > LIMIT:
-            return crest._replace(change=lowest, information=fit_end(changes, losses))
-        middle = np.clip(crest.change if has_crest else lowest, middle - reach, middle + reach)
+            return minimum._replace(change=lowest, information=fit_end(changes, losses))
+        middle = np.clip(minimum.change if has_minimum else lowest, middle - reach, middle + reach)
         pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
         reach = max(NARROWER * reach, LAST_REACH) if is_inside else min(WIDER * reach, FIRST_REACH)
-    return found or Crest(np.zeros(num), np.zeros((num, num)), crest.motion)
+    return found or Minimum(np.zeros(num), np.zeros((num, num)), minimum.motion)
 
 
 def fit_end(changes: Array, losses: Array) -> Array:
@@ -268,11 +268,11 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Crest:
-    """Find the crest of a profile by a quadratic function (least squares), and how poses follow the camera.
+def fit_minimum(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Minimum:
+    """Find the minimum of a profile by a quadratic function (least squares), and how poses follow the camera.
 
     The changes (K, p) of the camera have losses (K, B) by block, and poses; `pose` is that without a change.
-    The covariance of the crest is H^-1 (sum g g^T) H^-1, with the slope g of each block's loss there.
+    The covariance of the minimum is H^-1 (sum g g^T) H^-1, with the slope g of each block's loss there.
     """
     middle = changes.mean(axis=0)
     num = changes.shape[1]
@@ -288,13 +288,13 @@ def fit_crest(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) 
     motion = np.linalg.lstsq(terms[:, : 1 + num], moved, rcond=None)[0][1:].T
     num_blocks = int(losses.any(axis=0).sum())
     if num_blocks < LEAST_BLOCKS * num or not np.linalg.eigvalsh(H)[0] > 0.0:
-        return Crest(middle, np.zeros((num, num)), motion)
+        return Minimum(middle, np.zeros((num, num)), motion)
     offset = -np.linalg.solve(H, fitted[1 : 1 + num].sum(axis=1))
     slopes = fitted[1 : 1 + num].T + hessians @ offset
     shares = np.trace(hessians @ np.linalg.inv(H), axis1=1, axis2=2) / num
     slopes /= (1.0 - np.clip(shares, 0.0, MOST_OF_BLOCK))[:, None]  # as if each had been left out, as in CR3
     information = H @ np.linalg.pinv(INFLATION * slopes.T @ slopes) @ H
-    return Crest(middle + offset, information, motion)
+    return Minimum(middle + offset, information, motion)
 
 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:

@@ -1,12 +1,18 @@
-"""The judge: of the default method the only maker of a status, of confidences and of what is ruled out.
+"""The judge: the default method's only maker of confidences, and of the statuses localized and ambiguous.
 
-Every status is made in `decide`, by `classify`. A photo alone comes here with its evidence (`judge`). Photos
-that help each other make no status; each way hands over probabilities, or a pose with errors:
-- `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`; a new way does this;
+All are made in `decide`. A photo alone comes here with its evidence (`judge`). Photos that help each other
+decide nothing; each way hands over probabilities, or a pose with errors:
+- `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`;
 - `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
 - `batch.localizer`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
 - `walk.results`: the probabilities of a frame's places along the path, to `decide`, its pose to `take_pose`;
 - `coloring`: nothing; each photo is localized as one alone, in colours of the others.
+
+A new way hands over as `bundle` or `beside` do. It is wired in by a method of `opened_scan.OpenedScan`, and
+- of photos that are given together: by a method of `Scan`; in `cli` by an option, a `make_..._job` and
+  NOT_WITH of `together`, and JOINT and `run_jointly` of `photo_run`;
+- as a second look at photos of a batch: by a function in LISTINGS of `batch.localizer`, fields of its `Look`,
+  a branch in `look_again`, and by `may_change` and, in `batch.results_file`, `Finished.is_second`.
 """
 
 import math
@@ -152,7 +158,7 @@ def conclude(
 def decide(found: Localization, probabilities: Array, min_confidence: float) -> Localization:
     """Return a result with the probabilities (K + 1,) of its pose, its alternatives and none, and its status.
 
-    What is ruled out stays so, whatever the probabilities are. Every status is made here.
+    What is ruled out stays so, whatever the probabilities are.
     """
     p = np.append(np.zeros(len(probabilities) - 1), 1.0) if found.is_ruled_out else probabilities
     others = tuple(replace(a, probability=float(q)) for a, q in zip(found.alternatives, p[1:-1], strict=True))
@@ -290,8 +296,8 @@ def collect_evidence(
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
     """Return True if the mirrored photo has a pose that explains more, and with which more features agree.
 
-    In a symmetric scene both are about equal. A pose that explains nearly all of the photo is not tested, nor
-    one by whole views alone: the first look has compared the mirrored photo itself.
+    In a symmetric scene both are about equal. Not tested are scores of ENOUGH_EXPLAINED, scans without
+    colours, and poses by whole views alone: the first look has compared these with the mirrored photo.
     """
     if best.score >= ENOUGH_EXPLAINED or not query.uses_matches:
         return False

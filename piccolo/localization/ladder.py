@@ -1,4 +1,4 @@
-"""The ladder of stages on which a pose is refined: from wide images and coarse views to single points."""
+"""The ladder of stages on which a pose is refined: from coarse images and views to single points."""
 
 import math
 from typing import NamedTuple
@@ -38,7 +38,7 @@ class Limits(NamedTuple):
 
 
 class Around(NamedTuple):
-    """Poses around the one that is given: each descends on a wider image first, and the best end counts."""
+    """Poses around the one that is given: each descends on a coarser image first, and the best end counts."""
 
     image: ImageName
     num_iterations: int  # on that
@@ -173,7 +173,7 @@ def settle(query: Query, found: Hypothesis, seen: Comparison | None = None) -> H
 def converge(query: Query, shown: Query, found: Hypothesis, stage: Stage) -> Hypothesis:
     """Descend on the points visible from the pose, in the rounds of a stage.
 
-    The descent uses the masked query `shown`; the result is discarded if the whole photo's score falls.
+    It descends on the masked query `shown`; an end below MIN_SCORE_LEFT of the photo's score is discarded.
     """
     pose = found.pose
     for k in range(stage.rounds.most):
@@ -192,8 +192,8 @@ def descend_perturbed(
     levels: Array32,
     weights: Array32,
     blocks: Int32s,
-    wide: Texels,
-    narrow: Texels,
+    coarse: Texels,
+    fine: Texels,
     scale: float,
     tolerance: float,
     num_iterations: tuple[int, int],
@@ -202,9 +202,9 @@ def descend_perturbed(
     center: Array,
     scores: Array,
 ) -> None:
-    """Perturb poses (n, 3, 3), (n, 3) by steps (n, 6) and descend in place, on the wide then narrow image.
+    """Perturb poses (n, 3, 3), (n, 3) by steps (n, 6) and descend in place, on the coarse then fine image.
 
-    `num_iterations` are those on each image. A pose with the zero step skips the wide one.
+    `num_iterations` are those on each image. A pose with the zero step skips the coarse one.
     """
     R = R_cam_from_map
     t = center
@@ -214,11 +214,11 @@ def descend_perturbed(
         for i in range(6):
             first = 0 if steps[k, i] != 0.0 else first
         for image in range(first, 2):
-            texels = wide.rgbx if image == 0 else narrow.rgbx
-            width = wide.width if image == 0 else narrow.width
+            texels = coarse.rgbx if image == 0 else fine.rgbx
+            width = coarse.width if image == 0 else fine.width
             problem = ChannelProblem(points, levels, weights, texels, width, scale)
             descend_channels(problem, num_iterations[image], tolerance, R[k], t[k])
-        scores[k] = score(points, levels, weights, blocks, narrow.rgbx, narrow.width, R[k], t[k])
+        scores[k] = score(points, levels, weights, blocks, fine.rgbx, fine.width, R[k], t[k])
 
 
 def to_levels(channels: Array32) -> Array32:
@@ -254,11 +254,11 @@ def score_on_cells(cells: Cells, blocks: Int32s, image: Texels, pose: Pose) -> H
 
 
 def descend_around(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
-    """Return the best end of descents from a pose and around it, on the wide image first."""
+    """Return the best end of descents from a pose and around it, on the coarse image first."""
     assert stage.around is not None
     blocks = query.method.view(stage.view).arrays.blocks
-    wide = query.photo.image(stage.around.image)
-    narrow = query.photo.image(stage.image)
+    coarse = query.photo.image(stage.around.image)
+    fine = query.photo.image(stage.image)
     limits = stage.limits
     steps = perturbations(stage.around.size)
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
@@ -275,8 +275,8 @@ def descend_around(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypo
             levels,
             cells.weights,
             blocks,
-            wide,
-            narrow,
+            coarse,
+            fine,
             scale,
             limits.tolerance,
             num_iterations,

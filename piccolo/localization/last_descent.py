@@ -11,7 +11,7 @@ from .selection import Selection, rank, select
 from .verification import SURE_MATCHES, count_each
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
-FAINT_SCORE = 0.1  # a pose with less, and fewer matches than the next line, is never localized
+FAINT_SCORE = 0.1  # if all poses have less, and fewer matches than below, refinement soon ends
 FAINT_MATCHES = 6
 NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best
 NEAR_MATCHES = 0.5  # and so is one with this fraction of its matches

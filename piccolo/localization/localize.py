@@ -29,9 +29,7 @@ GUESSES = (
     -0.15,
     0.15,
 )  # added to the log of the focal length: one comes near enough to any that is 20 % off
-MOST_RANGE = (
-    10.0  # [m] distance of what a photo shows: with the log of the focal length a pose moves as many times
-)
+MOST_RANGE = 10.0  # [m] of what is seen: a pose moves by this times the change of the focal length's log
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
 
 
@@ -40,7 +38,7 @@ class Found(NamedTuple):
 
     query: Query
     selection: Selection
-    fit: FocalFit | None  # of the photo of one camera, unless the poses are hopeless
+    fit: FocalFit | None  # of the photo of one camera, unless the poses are faint
 
 
 @one_blas_thread()
@@ -117,7 +115,7 @@ def find_by_edges(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:
 
 
 def fit_camera(query: Query, found: Selection) -> Found:
-    """Refine the poses of a photo of one camera with its focal length, unless they are hopeless."""
+    """Refine the poses of a photo of one camera with its focal length, unless they are faint."""
     if query.given.focal_prior is None or is_faint(query, found):
         return Found(query, found, None)
     return Found(*calibrate(query, found))
@@ -144,7 +142,7 @@ def localize_guessed(
 
 
 def is_same_place(one: Localization, pose: Pose, focal: FocalLength | None) -> bool:
-    """Return True if a pose is a result's but for what their focal lengths move along the view."""
+    """Return True if a pose is a result's up to a move along the view that their focal lengths explain."""
     if one.pose is None:
         return False
     change = math.log(focal.px / one.focal_length.px) if focal and one.focal_length else 0.0

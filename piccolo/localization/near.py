@@ -18,7 +18,7 @@ from .verification import verify
 
 
 class Near(NamedTuple):
-    """A pose near one that was given, judged by the photo alone."""
+    """A pose near one that was given, and how likely it is."""
 
     pose: Pose  # in the map
     seen: Comparison  # of the photo with the scan there
@@ -27,9 +27,9 @@ class Near(NamedTuple):
 
 
 def refine_near(query: Query, start: Pose) -> Near:
-    """Descend from a pose and from poses around it, then on the points, and judge the end by whole views.
+    """Descend from a pose and from poses around it, then on the points, and judge the end (`assess_end`).
 
-    A narrow photo converges slowly: its descent goes on.
+    A partial photo converges slowly: its descent goes on.
     """
     middle, seen_from = climb_from_afar(query, start)
     pose = refine(query, middle, FULL).pose

@@ -26,7 +26,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.points_around import RecentViews, round_position
 from ..views.view import Cells, normalize_view
 from .photo import ACROSS, Photo, make_photo
-from .settings import Beam, METHOD, SHAPE_SCALES, CoarseToFineSettings, MethodConfig, ViewName
+from .settings import METHOD, SHAPE_SCALES, Beam, CoarseToFineSettings, MethodConfig, ViewName
 
 MAX_WIDTH = 4096  # [px] of the photo for the loss: more costs seconds and gains nothing
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
@@ -112,11 +112,11 @@ class Query:
         return replace(self.without_features(), evidence="views" if self.uses_matches else self.evidence)
 
     def with_rotations(self, rotations: Array | None) -> "Query":
-        """Return the query that searches only rotations (N, 3, 3), camera from map, with nothing kept."""
+        """Return the query that searches only rotations (N, 3, 3), camera from map, with only views kept."""
         return replace(self, rotations=rotations, cache=Cache(self.cache.views))
 
     def forget(self) -> "Query":
-        """Return the query without what was computed for it but its features: that takes 100 MB."""
+        """Return the query without what was computed for it, but with its features: 100 MB less."""
         colors = Once(make_texels, self.given)
         return replace(self, photo=self.photo.forget(), colors=colors, cache=Cache(make_views(self.scan_map)))
 

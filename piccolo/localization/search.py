@@ -173,10 +173,10 @@ def best_poses(scores: Samples, pool: int, least: np.float32 = LOWEST) -> tuple[
 
 
 def search_poses(query: Query, tilts: Tilts) -> Starts:
-    """Search all candidates with all rotations in two stages; return the distinct best.
+    """Search the sparse candidates with all rotations in two stages; return the distinct best.
 
-    The first scores wide cells of the sparse candidates, by matrix products, the second scores fine cells of
-    the best poses. A photo of a part of the sphere has only the first, with the means subtracted.
+    The first scores wide cells of all, by matrix products, the second the search grid's cells of the best
+    poses. A photo of a part of the sphere has only the first, with the means subtracted.
     """
     m = query.scan_map
     settings = query.settings

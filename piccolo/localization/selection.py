@@ -69,9 +69,9 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     for h, wrong, count in zip(hypotheses, is_wrong, counts, strict=True):
         num_matches = count if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
-        is_narrow = query.evidence == "shape" and query.photo.is_partial
-        # with fewer blocks, chance explains more of them
-        score = h.score * math.sqrt(query.photo.small.valid_share) if is_narrow else h.score
+        has_few_blocks = query.evidence == "shape" and query.photo.is_partial
+        # and chance explains more of them
+        score = h.score * math.sqrt(query.photo.small.valid_share) if has_few_blocks else h.score
         standings.append(Standing(1.0, score, num_matches, query.evidence, of_prior))
     return standings
 

@@ -86,7 +86,7 @@ class MethodConfig(NamedTuple):
     beam: Beam = Beam(400, 48, 8, 2)
     narrow_beam: Beam = Beam(1600, 192, 8, 2)  # of a photo of a part of the sphere: many places look like it
     uses_features: bool = True
-    uses_search: bool = True  # where features alone are not sure
+    uses_search: bool = True  # by whole views
     min_starts: int = 1000
 
     def view(self, name: ViewName) -> ViewConfig:
