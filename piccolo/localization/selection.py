@@ -9,7 +9,7 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
-from .comparison import compare
+from .comparison import compare, score_drawn
 from .prior import contradictions
 from .query import Query
 from .verification import SURE_MATCHES, count_each
@@ -71,8 +71,10 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
         of_prior = log_prior if wrong else 0.0
         is_narrow = query.evidence == "shape" and query.photo.is_partial
         # with fewer blocks, chance explains more of them
-        score = h.score * math.sqrt(query.photo.small.valid_share) if is_narrow else h.score
-        standings.append(Standing(1.0, score, num_matches, query.evidence, of_prior))
+        part = math.sqrt(query.photo.small.valid_share) if is_narrow else 1.0
+        drawn = score_drawn(query, h.pose)
+        drawn = None if drawn is None else part * drawn
+        standings.append(Standing(1.0, part * h.score, num_matches, query.evidence, of_prior, drawn))
     return standings
 
 
