@@ -74,7 +74,7 @@ STEPS = (
 )
 # of dark, noisy photos; they are too few to calibrate
 ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
-# of edges, whose poses have larger errors; squared errors of right poses are then 0.8 of what they claim
+# of edges, whose poses have larger errors; squared errors are half of what they claim
 SHAPE_STEPS = (
     DifferenceSteps("full", math.radians(0.5), 0.5),
     DifferenceSteps("fine", math.radians(0.5), 0.5),
