@@ -46,13 +46,15 @@ def test_right_and_wrong_evidence():
 
 
 def test_each_kind_of_evidence_has_a_model_of_its_own():
-    """Shape and whole views alone have two features; local features count once asked, even if none agrees."""
+    """Whole views alone have two features; local features count once asked, even if none agrees."""
     views = Standing(0.5, 0.2, None, "views")
     np.testing.assert_array_equal(rule.pose_features(views), np.log([0.5, 0.2]))
     asked = views._replace(num_matches=0, evidence="drawn scan")
-    standings = [views._replace(evidence="shape"), views, asked]
+    drawn = views._replace(drawn_score=0.05, evidence="shape")
+    np.testing.assert_array_equal(rule.pose_features(drawn), np.log([0.5, 0.2, 0.05]))
+    standings = [drawn, views, asked]
     assert [standing.evidence for standing in standings] == list(rule.MODELS)
-    assert [len(model.weights) for model in rule.MODELS.values()] == [2, 2, 3]
+    assert [len(model.weights) for model in rule.MODELS.values()] == [3, 2, 3]
     for standing in standings:
         model = rule.MODELS[standing.evidence]
         expected = rule.pose_features(standing) @ np.array(model.weights) - 2.0

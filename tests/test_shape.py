@@ -24,6 +24,7 @@ from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud
 from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.confidence.confidence import log_odds
 from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
@@ -246,6 +247,16 @@ def test_a_photo_of_another_room_is_not_localized():
     photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
     found = rooms.locate(photo, _shape_map())
     assert found.status == "not_localized"
+
+
+def test_edges_drawn_at_the_true_pose_agree_better_than_elsewhere():
+    taken = rooms.query(SEED, width=WIDTH)
+    true_pose = _shape_map().from_world(taken.pose)
+    beside = replace(true_pose, center_world=true_pose.center_world + np.array([0.3, 0.0, 0.0]))
+    query = rooms.ask(rooms.as_panorama(taken.rgb), _shape_map())
+    standings = assess_alone(query, [Hypothesis(pose, 0.2) for pose in (true_pose, beside)])
+    assert standings[0].drawn_score > 1.5 * standings[1].drawn_score
+    assert log_odds(standings[0]) > log_odds(standings[1])
 
 
 def test_a_part_of_the_sphere_counts_less():

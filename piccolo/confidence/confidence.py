@@ -25,6 +25,7 @@ class Standing(NamedTuple):
     num_matches: int | None  # local features that agree with it; None of whole views alone
     evidence: EvidenceKind
     log_prior: float = 0.0  # log odds by what is known beforehand: lower where the pose contradicts it
+    drawn_score: float | None = None  # as the score, of edges drawn at the pose, in a scan without colours
 
 
 class ChoiceModel(NamedTuple):
@@ -37,24 +38,27 @@ class ChoiceModel(NamedTuple):
 LEAST_STD = 0.003  # [m] deviations below this are taken for it
 MOST_STD = 0.3  # [m] and those above this
 LEAST_SCORE = 0.02
+LEAST_DRAWN = 0.01
 LEAST_RATIO = 0.1
 MOST_RATIO = 1.2
 CONTRADICTED = 0.01  # odds that what the user says is wrong
 NOISE_MATCHES = 8  # added to the number that agree, as so many may by chance
 # By tools/benchmark.py calibration. Each feature counts in one direction only.
-FEATURES = ("log of the ratio", "log of the score", "log of the matches")  # the last if features were asked
+FEATURES = ("log of the ratio", "log of the score", "log of the matches, or of the drawn score")
 NONE_FEATURES = ("constant", "log10 of the largest deviation [m]")
 MODELS: dict[EvidenceKind, ChoiceModel] = {
-    "shape": ChoiceModel((7.82, 6.89), (-10.78, 2.92)),
+    "shape": ChoiceModel((11.0, 1.8, 1.7), (-5.6, 3.3)),
     "views": ChoiceModel((5.75, 0.43), (4.04, 3.82)),
     "drawn scan": ChoiceModel((5.38, 1.27, 2.91), (10.61, 3.96)),
 }
 
 
 def pose_features(standing: Standing) -> Array:
-    """Return the features of a pose's odds, as FEATURES names them; without matches the first two."""
+    """Return the features of a pose's odds, as FEATURES names them; by coloured views alone the first two."""
     ratio = min(max(standing.ratio, LEAST_RATIO), MOST_RATIO)
     of_views = [ratio, max(standing.score, LEAST_SCORE)]
+    if standing.drawn_score is not None:
+        return np.log([*of_views, max(standing.drawn_score, LEAST_DRAWN)])
     if standing.num_matches is None:
         return np.log(of_views)
     return np.log([*of_views, standing.num_matches + NOISE_MATCHES])

@@ -172,12 +172,16 @@ def make_neighbors(num_rings: int, sigma_deg: float) -> Neighbors:
 
 @lru_cache(maxsize=8)
 def interpolation(num_rings: int, coarse_rings: int) -> tuple[Int32s, Array32]:
-    """Return the cells (cells, 4) of a coarser grid around each cell's centre, and their bilinear weights.
+    """Return the `cells_around` (cells, 4) of a coarser grid around each cell's centre, and their weights."""
+    return cells_around(make_grid(num_rings).directions.astype(np.float64), coarse_rings)
+
+
+def cells_around(fine: Array, coarse_rings: int) -> tuple[Int32s, Array32]:
+    """Return the cells (N, 4) of a grid around each unit direction (N, 3), and their bilinear weights.
 
     The four are two cells in each of two rings; beyond the last ring that ring is used again, on the other
     side of the pole.
     """
-    fine = make_grid(num_rings).directions.astype(np.float64)
     coarse = make_grid(coarse_rings)
     place = (0.5 - np.arcsin(np.clip(fine[:, 2], -1.0, 1.0)) / np.pi) * coarse_rings - 0.5
     turn = np.arctan2(fine[:, 1], fine[:, 0]) / (2.0 * np.pi) + 0.5

@@ -19,10 +19,13 @@ from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import CHUNK, Texels, make_chunk, project, sample
 from ..views.points_around import round_position
-from ..views.view import ViewArrays, average_colors, cell_statistics, empty_cells, locate
+from ..views.view import ViewArrays, ViewConfig, average_colors, cell_statistics, empty_cells, locate
 from .query import Query
+from .settings import DRAWN_VIEW
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
+DRAWN = b"drawn"
+DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
 LEAST_SHARED = 0.3  # fraction of what the poorer view shows
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
@@ -39,7 +42,11 @@ class Comparison(NamedTuple):
     @property
     def score(self) -> float:
         """Area explained beyond chance, divided by the area that the photo shows, in [0, 1]."""
-        beyond = np.maximum(self.correlation - CHANCE, 0.0) / (1.0 - CHANCE)
+        return self.score_beyond(CHANCE)
+
+    def score_beyond(self, chance: float) -> float:
+        """Return the score where chance explains as much of a block as `chance`."""
+        beyond = np.maximum(self.correlation - chance, 0.0) / (1.0 - chance)
         return float(beyond @ self.area) / max(self.valid_area, 1e-9)
 
     @property
@@ -187,12 +194,23 @@ def compare(query: Query, pose: Pose) -> Comparison:
     return kept[pose.key]
 
 
-def compare_from(query: Query, pose: Pose, seen_from: Pose) -> Comparison:
-    """Compare the scan at a pose with the photo, by blocks.
+def score_drawn(query: Query, pose: Pose) -> float | None:
+    """Score a pose by the edges drawn there, in a scan without colours; kept with the query. Else None."""
+    if query.evidence != "shape":
+        return None
+    key = pose.key + DRAWN
+    if key not in query.cache.comparisons:
+        query.cache.comparisons[key] = compare_from(query, pose, pose, DRAWN_VIEW)
+    drawn: Comparison = query.cache.comparisons[key]
+    return drawn.score_beyond(DRAWN_CHANCE)
+
+
+def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig | None = None) -> Comparison:
+    """Compare the scan at a pose with the photo, by blocks, by default on fine cells.
 
     `seen_from` is a pose so near that it sees the same, whose view may be known.
     """
-    config = query.method.fine_view
+    config = config or query.method.fine_view
     view = config.arrays
     place = round_position(seen_from)
     sums = query.cache.views.averages(place, config)

@@ -9,7 +9,7 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
-from .comparison import compare
+from .comparison import compare, score_drawn
 from .prior import contradictions
 from .query import Query
 from .verification import SURE_MATCHES, count_each
@@ -70,9 +70,10 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
         num_matches = count if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
         has_few_blocks = query.evidence == "shape" and query.photo.is_partial
-        # and chance explains more of them
-        score = h.score * math.sqrt(query.photo.small.valid_share) if has_few_blocks else h.score
-        standings.append(Standing(1.0, score, num_matches, query.evidence, of_prior))
+        part = math.sqrt(query.photo.small.valid_share) if has_few_blocks else 1.0  # chance explains more of few
+        drawn = score_drawn(query, h.pose)
+        drawn = None if drawn is None else part * drawn
+        standings.append(Standing(1.0, part * h.score, num_matches, query.evidence, of_prior, drawn))
     return standings
 
 

@@ -72,6 +72,10 @@ class ImageScales(NamedTuple):
     search: ImageScale = ImageScale(128, 7.5, SEARCH_VIEW.sigma_deg)
 
 
+# edges drawn at a pose, as wide as those of the photo's fine image
+DRAWN_VIEW = ViewConfig(
+    num_rings=160, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150, draws_edges=True
+)
 # narrow edges are for the last descent: all others need them as wide as those of coarse voxels
 SHAPE_SCALES = ImageScales(fine=ImageScales().fine._replace(blur_px=1.7))
 

@@ -14,6 +14,7 @@ from ..cloud.octree import MAX_NODES, Octree, collect
 from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
 from ..kernels.jit import F0, F1, HALF, kernel, whole
 from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscore
+from .edges import draw_edges
 from .zbuffer import VISIBLE_FACTOR
 
 BLOCK = 64  # views that a thread makes at a time
@@ -74,6 +75,7 @@ class ViewConfig:
     voxel_per_range: float  # largest voxel size by its distance
     front: float = 1.15  # a cell's colour is the mean of points up to this times its nearest range
     visible: float = float(VISIBLE_FACTOR)  # a point is seen up to this times it and VISIBLE_OFFSET
+    draws_edges: bool = False  # in place of colours, by the ranges of the view
 
     @cached_property
     def arrays(self) -> ViewArrays:
@@ -302,6 +304,8 @@ def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Arra
     sums = np.empty((len(make_grid(config.num_rings)), 8), np.float32)
     center = np.asarray(center_map, np.float64)
     average_nodes(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), sums)
+    if config.draws_edges:
+        draw_edges(sums, config.num_rings)
     return sums
 
 
