@@ -70,7 +70,8 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
         num_matches = count if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
         has_few_blocks = query.evidence == "shape" and query.photo.is_partial
-        part = math.sqrt(query.photo.small.valid_share) if has_few_blocks else 1.0  # chance explains more of few
+        # and chance explains more of them
+        part = math.sqrt(query.photo.small.valid_share) if has_few_blocks else 1.0
         drawn = score_drawn(query, h.pose)
         drawn = None if drawn is None else part * drawn
         standings.append(Standing(1.0, part * h.score, num_matches, query.evidence, of_prior, drawn))
