@@ -74,10 +74,10 @@ STEPS = (
 )
 # of dark, noisy photos; they are too few to calibrate
 ROUGH_STEPS = DifferenceSteps("middle", math.radians(0.3), 1.0)
-# of edges, whose poses have larger errors; squared errors are half of what they claim
+# of edges, whose poses have larger errors
 SHAPE_STEPS = (
-    DifferenceSteps("full", math.radians(0.5), 0.5),
-    DifferenceSteps("fine", math.radians(0.5), 0.5),
+    DifferenceSteps("full", math.radians(0.5), 1.0),
+    DifferenceSteps("fine", math.radians(0.5), 1.0),
 )
 ROUGH_SHAPE_STEPS = DifferenceSteps("fine", math.radians(0.8), 1.0)
 
