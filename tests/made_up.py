@@ -64,5 +64,5 @@ def compared(monkeypatch, explains, counts):
 
     for module in (selection, last_descent):
         monkeypatch.setattr(module, "count_each", count_each)
-    known = {at(x, 0.0).pose.key: seen(part) for x, part in explains.items()}
+    known = {(at(x, 0.0).pose.key, None): seen(part) for x, part in explains.items()}
     return replace(QUERY, cache=Cache(VIEWS, known))

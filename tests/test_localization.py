@@ -56,9 +56,11 @@ def test_same_bits_for_any_number_of_threads():
     assert (one.loss, one.evidence, one.confidence) == (two.loss, two.evidence, two.confidence)
 
 
-def test_panorama_from_elsewhere_is_not_localized():
-    for rgb in (query(1).rgb, np.zeros((256, 512, 3), np.uint8)):
-        assert _localize(2, rgb, rooms.AUTO).status == "not_localized"
+@pytest.mark.parametrize("name", ["elsewhere", "black", "noise"])
+def test_panorama_from_elsewhere_is_not_localized(name):
+    noise = np.random.default_rng(0).integers(0, 256, (256, 512, 3), dtype=np.uint8)
+    rgb = {"elsewhere": query(1).rgb, "black": np.zeros_like(noise), "noise": noise}[name]
+    assert _localize(2, rgb, rooms.AUTO).status == "not_localized"
 
 
 def test_nothing_that_counts_or_no_place_for_a_camera_is_no_error():

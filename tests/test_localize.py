@@ -1,17 +1,20 @@
 """The command line, in processes of its own where signals and streams matter."""
 
+import contextlib
 import json
 import os
+import pty
 import re
 import signal
 import subprocess
+import termios
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import rooms
-from batches import start_localize
+from batches import command_of, start_localize
 from rooms import errors, query
 from test_result import RESULT
 
@@ -174,6 +177,24 @@ def test_usage_and_version(capsys):
         assert stop.value.code == code
     text = capsys.readouterr().out
     assert len(re.findall("^  -", text, flags=re.MULTILINE)) <= 47
+
+
+def test_a_signal_leaves_nothing_half_written(scene, tmp_path):
+    arguments = _arguments(scene, "--out", str(tmp_path / "pose.json"), *PAPER, "num_translations=5000")
+    terminal, stderr = pty.openpty()
+    termios.tcsetwinsize(terminal, (24, 80))
+    with subprocess.Popen(command_of("localize.py", *arguments), stderr=stderr, cwd=tmp_path) as process:
+        os.close(stderr)
+        err = os.read(terminal, 1)  # the bar of the search, which a terminal gets: imports are over
+        process.send_signal(signal.SIGTERM)
+        with contextlib.suppress(OSError):  # the end
+            while part := os.read(terminal, 4096):
+                err += part
+    os.close(terminal)
+    assert process.returncode == 143
+    assert b"Traceback" not in err
+    assert b"localize.py: ended by SIGTERM after 0 results" in err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_closed_pipe_is_no_error_message(scene):

@@ -35,11 +35,11 @@ def done(monkeypatch):
 
     def full(query, pose):
         made.append(("full", place(pose)))
-        return at(place(pose), query.cache.comparisons[pose.key].score)
+        return at(place(pose), query.cache.comparisons[pose.key, None].score)
 
     def unoccluded(query, pose):
         made.append(("unoccluded", place(pose)))
-        return query, at(place(pose), query.cache.comparisons[pose.key].score)
+        return query, at(place(pose), query.cache.comparisons[pose.key, None].score)
 
     monkeypatch.setattr(last_descent, "climb_to_full", full)
     monkeypatch.setattr(last_descent, "climb_unoccluded", unoccluded)

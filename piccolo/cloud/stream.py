@@ -4,6 +4,7 @@ A file's format follows from its first bytes, or else from its name.
 """
 
 import math
+import operator
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -73,7 +74,8 @@ class PointValidator:
         if len(points):
             points = points if self.scale == 1.0 else points * self.scale
             box *= self.scale
-            self.box[:] = np.minimum(self.box[0], box[0]), np.maximum(self.box[1], box[1])
+            self.box[0] = np.minimum(self.box[0], box[0])
+            self.box[1] = np.maximum(self.box[1], box[1])
             self.brightest = max(self.brightest, int(colors.max()))
             self.color = colors[0] if self.color is None else self.color
             self.is_varied = self.is_varied or bool((colors != self.color).any())
@@ -205,7 +207,7 @@ class CloudStream:
         chunk = next(chunks, None)
         while chunk is not None:
             tasks: list[Callable[[], Chunk | None]] = [partial(add, chunk), partial(next, chunks, None)]
-            chunk = workers.map(lambda task: task(), tasks, "")[1]
+            chunk = workers.map(operator.call, tasks, "")[1]
         voxels = table.finish()
         of_all = (*voxels.warnings, *unit_warnings(self.label, voxels.nodes[:, :3]))
         return voxels._replace(warnings=(*self._warnings(validators), *of_all))

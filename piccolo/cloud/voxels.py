@@ -147,6 +147,12 @@ def find_slot(index: Int32s, rows: Int32s, slot: np.int64, x: np.int64, y: np.in
 
 
 @inline_kernel
+def locate_cell(quanta: Int64s) -> tuple[np.int64, np.int64, np.int64]:
+    """Return the cell of a point by its quanta (3,) from the base."""
+    return quanta[0] >> QUANTUM_BITS, quanta[1] >> QUANTUM_BITS, quanta[2] >> QUANTUM_BITS
+
+
+@inline_kernel
 def look_up(
     points: Array, base: Int64s, index: Int32s, rows: Int32s, quanta: Int64s, slots: Int64s, found: Int32s
 ) -> None:
@@ -159,7 +165,7 @@ def look_up(
             quantum = np.int64(np.floor(points[i, k] * QUANTA_PER_METRE)) + PHASE
             quanta[k, i] = quantum - (base[k] << QUANTUM_BITS)
     for i in range(len(points)):
-        x, y, z = quanta[0, i] >> QUANTUM_BITS, quanta[1, i] >> QUANTUM_BITS, quanta[2, i] >> QUANTUM_BITS
+        x, y, z = locate_cell(quanta[:, i])
         slots[i] = first_slot(index, x, y, z)
     for i in range(len(points)):
         found[i] = index[slots[i]]
@@ -173,7 +179,7 @@ def enter_cells(
 ) -> tuple[int, int]:
     """Write the row (n,) of each point's cell, made if it is missing; return the counts of `add_points`."""
     for i in range(len(found)):
-        x, y, z = quanta[0, i] >> QUANTUM_BITS, quanta[1, i] >> QUANTUM_BITS, quanta[2, i] >> QUANTUM_BITS
+        x, y, z = locate_cell(quanta[:, i])
         if num_voxels == len(rows) or max(abs(x), abs(y), abs(z)) >= MAX_CELL:
             return i, num_voxels
         slot = find_slot(index, rows, slots[i], x, y, z)

@@ -24,7 +24,6 @@ from .query import Query
 from .settings import DRAWN_VIEW
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
-DRAWN = b"drawn"
 DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
 LEAST_SHARED = 0.3  # fraction of what the poorer view shows
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
@@ -186,23 +185,20 @@ def compare_cells(
                     kept[i] = F0
 
 
-def compare(query: Query, pose: Pose) -> Comparison:
-    """Compare the scan at a pose with the photo, by blocks; kept with the query."""
-    kept: dict[bytes, Comparison] = query.cache.comparisons
-    if pose.key not in kept:
-        kept[pose.key] = compare_from(query, pose, pose)
-    return kept[pose.key]
+def compare(query: Query, pose: Pose, config: ViewConfig | None = None) -> Comparison:
+    """Compare the scan at a pose with the photo, by blocks, by default on fine cells; kept with the query."""
+    kept: dict[tuple[bytes, ViewConfig | None], Comparison] = query.cache.comparisons
+    key = (pose.key, config)
+    if key not in kept:
+        kept[key] = compare_from(query, pose, pose, config)
+    return kept[key]
 
 
 def score_drawn(query: Query, pose: Pose) -> float | None:
-    """Score a pose by the edges drawn there, in a scan without colours; kept with the query. Else None."""
+    """Score a pose by the edges drawn there, in a scan without colours; else None."""
     if query.evidence != "shape":
         return None
-    key = pose.key + DRAWN
-    if key not in query.cache.comparisons:
-        query.cache.comparisons[key] = compare_from(query, pose, pose, DRAWN_VIEW)
-    drawn: Comparison = query.cache.comparisons[key]
-    return drawn.score_beyond(DRAWN_CHANCE)
+    return compare(query, pose, DRAWN_VIEW).score_beyond(DRAWN_CHANCE)
 
 
 def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig | None = None) -> Comparison:

@@ -46,7 +46,7 @@ class Cache:
     """Results computed once for one photo in one map, shared by threads and copies of a query."""
 
     views: RecentViews  # of the map
-    comparisons: dict[bytes, Any] = field(default_factory=dict)  # `comparison.compare`, by the pose's key
+    comparisons: dict[Any, Any] = field(default_factory=dict)  # of `comparison.compare`
     masked: dict[bytes, "Query"] = field(default_factory=dict)  # `comparison.mask_occluders`, by its blocks
     matches: dict[bytes, Any] = field(default_factory=dict)  # `verification.matches_near`, by its grid
     fits: dict[bytes, Any] = field(default_factory=dict)  # `focal_length.fit_matches`, by the pose's key
@@ -84,7 +84,7 @@ class Query:
     @property
     def beam(self) -> Beam:
         """The number of poses that go on to each stage of a search."""
-        return self.method.narrow_beam if self.photo.is_partial else self.method.beam
+        return self.method.partial_beam if self.photo.is_partial else self.method.beam
 
     @property
     def pixel(self) -> float:

@@ -88,7 +88,7 @@ class MethodConfig(NamedTuple):
     full_view: ViewConfig = ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150)
     scales: ImageScales = ImageScales()
     beam: Beam = Beam(400, 48, 8, 2)
-    narrow_beam: Beam = Beam(1600, 192, 12, 3)  # of a photo of a part of the sphere: many places look like it
+    partial_beam: Beam = Beam(1600, 192, 12, 3)  # of a part of the sphere: many places look like it
     uses_features: bool = True
     uses_search: bool = True  # by whole views
     min_starts: int = 1000
