@@ -168,7 +168,7 @@ def _fake_profile(true, noise=0.0):
 @pytest.mark.parametrize("true", [0.0, 0.23, -0.31])
 def test_a_profile_without_a_minimum_is_followed_downhill(monkeypatch, true):
     monkeypatch.setattr(focal, "take_profile", _fake_profile(true))
-    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.NEXT_REACH)
+    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.LAST_REACH)
     assert minimum.change[0] == pytest.approx(true, abs=0.01)
     assert minimum.variance < 0.01
 

@@ -105,6 +105,8 @@ class Distortion(NamedTuple):
 
     def max_radius(self) -> float:
         """Radius up to which r g(r^2) grows, infinite if it always does: beyond, a pixel is two rays."""
+        if self == Distortion():
+            return math.inf
         n = self.numerator
         d = self.denominator
         r2 = Polynomial([0.0, 1.0])

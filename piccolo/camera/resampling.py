@@ -23,6 +23,7 @@ COLUMNS = 128  # as well
 CELL = 4  # [px] within a block in the picture, places are found so far apart and linear between: to 0.05 px
 LOOK = 8  # [px] every so many it is seen first which blocks a camera shows
 MAX_SAMPLES = 8  # a pixel, across and down
+AS_FINE = 0.8  # a picture is not made smaller by less: that would blur it
 MAX_SIDE = 32_000  # [px] of what cv2.remap reads
 
 Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
@@ -70,9 +71,9 @@ def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:
     camera = view.mount.camera
     largest = MAX_SIDE / max(camera.width, camera.height)
     factor = min(1.0, width / (2.0 * math.pi * camera.resolution), largest)
-    if factor == 1.0:
-        return view
     size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
+    if size[0] >= AS_FINE * view.pixels.shape[1]:
+        return view
     return view._replace(pixels=np.asarray(cv2.resize(view.pixels, size, interpolation=cv2.INTER_AREA)))
 
 

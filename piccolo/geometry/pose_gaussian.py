@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Array
-from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, skew
+from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
 LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible
@@ -121,6 +121,21 @@ def differentiate(pose: Pose, other_from_cam: Pose) -> Array:
     J[:3, :3] = other_from_cam.R_cam_from_world
     J[3:, :3] = pose.R_cam_from_world.T @ skew(other_from_cam.center_world)
     return J
+
+
+def differentiate_rays(points_world: Array, pose: Pose) -> tuple[Array, Array]:
+    """Return unit rays (N, 3) to points (N, 3) in the camera's axes, and derivatives (N, 3, 6) by the pose.
+
+    The pose turns about the camera's axes [rad] and moves along the world's [m]: a ray u to a point at
+    distance r changes by w x u - (I - u u^T) R d / r.
+    """
+    offsets = rotate_points(points_world - pose.center_world, pose.R_cam_from_world)
+    ranges = np.linalg.norm(offsets, axis=1)
+    rays = offsets / ranges[:, None]
+    across = rays[:, :, None] * rays[:, None] - np.eye(3)
+    of_moves = across @ pose.R_cam_from_world / ranges[:, None, None]
+    of_turns = np.cross(np.eye(3), rays[:, None]).swapaxes(1, 2)
+    return rays, np.concatenate([of_turns, of_moves], axis=2)
 
 
 def subtract(pose: Pose, other: Pose) -> Array:

@@ -15,8 +15,14 @@ from ..arrays import Array
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
-from ..geometry.pose import Pose, skew
-from ..geometry.pose_gaussian import LOOSE, PoseGaussian, probability_within, turn_positions
+from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import (
+    LOOSE,
+    PoseGaussian,
+    differentiate_rays,
+    probability_within,
+    turn_positions,
+)
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
 from ..local_features.matching import Matches
@@ -142,18 +148,9 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
 
 
 def match_covariance(matches: Matches, pose: Pose) -> Array:
-    """Return the covariance (6, 6) of a pose by its matches: turns in the camera's axes, moves in the map's.
-
-    A ray u to a point at distance r changes by w x u - (I - u u^T) R d / r.
-    """
+    """Return the covariance (6, 6) of a pose by its matches: turns in the camera's axes, moves in the map's."""
     agreeing = find_inliers(matches, pose, COS_EXACT)
-    offsets = (matches.points[agreeing] - pose.center_world) @ pose.R_cam_from_world.T
-    ranges = np.linalg.norm(offsets, axis=1)
-    rays = offsets / ranges[:, None]
-    J = np.empty((len(rays), 3, 6))
-    for k, (ray, distance) in enumerate(zip(rays, ranges, strict=True)):
-        J[k, :, :3] = -skew(ray)
-        J[k, :, 3:] = -(np.eye(3) - np.outer(ray, ray)) @ pose.R_cam_from_world / distance
+    rays, J = differentiate_rays(matches.points[agreeing], pose)
     information = np.einsum("kai,kaj->ij", J, J)
     squares = np.square(rays - matches.rays[agreeing]).sum()
     variance = max(squares / max(2 * len(rays) - 6, 1), LEAST_ERROR**2)

@@ -21,8 +21,8 @@ from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
 from ..confidence.focal_length import WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
-from ..geometry.pose import Pose, exp_so3, rotate_points
-from ..geometry.pose_gaussian import subtract
+from ..geometry.pose import Pose, rotate_points
+from ..geometry.pose_gaussian import add, differentiate_rays, subtract
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
 from ..local_features.matching import NO_MATCHES
@@ -44,14 +44,12 @@ K1_DEVIATION = 0.05  # of k1 where the camera is a guess
 NUM_VALUES = 7  # of the parameter in a design of one
 NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
 FIRST_REACH = 0.1  # of a design to either side, at first
-NEXT_REACH = 0.04
-LAST_REACH = 0.02
-NARROWER = 0.4  # times the reach, where a design has a minimum
-WIDER = 2.0  # and where it has none
+LAST_REACH = 0.02  # where a design has a minimum
+WIDER = 2.0  # times the reach, where it has none
 LIMIT = 0.4  # of the change that is searched
 END_DEVIATION = 0.05  # of a minimum that lies there or beyond
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
-STEP = 1e-4  # [rad, m] with which that is differentiated
+STEP = 1e-4  # of the focal length's logarithm, with which rays are differentiated
 AGREES = 0.25  # least weight of a match that agrees
 ENOUGH_AGREEING = 12  # fewer tell nothing
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
@@ -99,8 +97,7 @@ class FocalFit(NamedTuple):
 
     def move(self, pose: Pose) -> Pose:
         """Move a pose in the map by the change of the calibration."""
-        delta = self.motion @ self.change
-        return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:])
+        return add(pose, self.motion @ self.change)
 
     def focal_length(self, panorama: Panorama) -> FocalLength:
         """Return the focal length of a photo with its deviation, and its prior."""
@@ -144,7 +141,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         k1 = names.index(RADIAL)
         expected = np.append(expected, prior.view.mount.camera.params[k1] - camera.params[k1])
     precision = np.diag([prior.deviation**-2, K1_DEVIATION**-2][:num])
-    minimum = find_minimum(query, pose, num, FIRST_REACH if is_first else NEXT_REACH)
+    minimum = find_minimum(query, pose, num, FIRST_REACH if is_first else LAST_REACH)
     if minimum.information.any():
         per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
         covariance = np.linalg.pinv(minimum.information)
@@ -177,7 +174,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
 
 
 def find_minimum(query: Query, pose: Pose, num: int, reach: float) -> Minimum:
-    """Find the minimum of the profile about a pose in ever narrower designs, moved downhill if they miss it.
+    """Find the minimum of the profile about a pose in a wide and a narrow design, moved if they miss it.
 
     Of the designs that have a minimum, the one with the least variance counts. If none has, the picture does
     not determine the calibration: the information is 0. If the loss clearly falls to the end of the range,
@@ -201,7 +198,7 @@ def find_minimum(query: Query, pose: Pose, num: int, reach: float) -> Minimum:
             return minimum._replace(change=lowest, information=fit_end(changes, losses))
         middle = np.clip(minimum.change if has_minimum else lowest, middle - reach, middle + reach)
         pose = ends[int(np.argmin(np.abs(changes - middle).sum(axis=1)))]
-        reach = max(NARROWER * reach, LAST_REACH) if is_inside else min(WIDER * reach, FIRST_REACH)
+        reach = LAST_REACH if is_inside else min(WIDER * reach, FIRST_REACH)
     return found or Minimum(np.zeros(num), np.zeros((num, num)), minimum.motion)
 
 
@@ -228,9 +225,9 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
 
     Return the losses (K, B) of each block of the sphere at the ends, and the ends.
     """
-    given = query.given
     shown = mask_occluders(query, compare(query, pose))
     whole = query.photo.panorama
+    given = query.given.shrink_picture(whole.rgb.shape[1])
     is_left = shown.photo.panorama.is_valid | ~whole.is_valid  # what does not contradict the scan
 
     @cache
@@ -338,37 +335,30 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
     matches = matches_near(query, pose) if query.uses_matches else NO_MATCHES
     before = query.given.cameras[0]
 
-    def move(delta: Array) -> Pose:
-        return Pose(exp_so3(delta[:3]) @ pose.R_cam_from_world, pose.center_world + delta[3:6])
-
-    @cache
     def find_rays(change: float) -> Array32:
         return _turn_rays(matches.rays, before, before.with_camera(before.camera.change(change)))
-
-    def find_residuals(delta: Array) -> Array:
-        end = move(delta)
-        offsets = rotate_points(matches.points - end.center_world, end.R_cam_from_world)
-        rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
-        return np.asarray(rays - find_rays(float(delta[6])))
 
     if len(matches.rays) < ENOUGH_AGREEING:
         return 0.0, 0.0, pose
     known: tuple[float, float, Pose] | None = query.cache.fits.get(pose.key)
     if known is not None:
         return known
-    delta = np.zeros(7)
+    end = pose
+    change = 0.0
     for scale in MATCH_SCALES:
-        steps = [find_residuals(delta + h) - find_residuals(delta - h) for h in STEP * np.eye(7)]
-        J = np.stack(steps, axis=-1) / (2.0 * STEP)
-        residuals = find_residuals(delta)
+        rays, of_pose = differentiate_rays(matches.points, end)
+        of_focal = (find_rays(change - STEP) - find_rays(change + STEP)) / (2.0 * STEP)
+        J = np.concatenate([of_pose, of_focal[..., None]], axis=2)
+        residuals = rays - find_rays(change)
         weights = 1.0 / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure's loss
         slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
         inverse = np.linalg.inv(np.einsum("n,nij,nik->jk", weights, J, J) + 1e-6 * np.eye(7))
-        delta -= inverse @ slopes.sum(axis=0)
-        delta[6] = np.clip(delta[6], -1.0, 1.0)  # the focal length stays one
+        step = inverse @ slopes.sum(axis=0)
+        end = add(end, -step[:6])
+        change = float(np.clip(change - step[6], -1.0, 1.0))  # the focal length stays one
     variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
-    is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
-    fit = float(delta[6]), is_known / variance, move(delta)
+    is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(change) < LIMIT
+    fit = change, is_known / variance, end
     query.cache.fits[pose.key] = fit
     return fit
 

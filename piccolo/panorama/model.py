@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Bytes, Mask
 from ..camera import Camera, Mount
-from ..camera.resampling import View, make_sphere
+from ..camera.resampling import View, make_sphere, shrunk
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,11 @@ class Panorama:
             at_width = cv2.resize(hidden.view(np.uint8), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
             is_valid = is_valid & (at_width == 0)
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
+
+    def shrink_picture(self, width: int) -> "Panorama":
+        """Return the panorama, which has a focal_prior, with a picture no finer than a sphere of this width."""
+        assert self.focal_prior is not None
+        return replace(self, focal_prior=replace(self.focal_prior, view=shrunk(self.focal_prior.view, width)))
 
     def expect_focal(self, focal_px: float, deviation: float) -> "Panorama":
         """Return the panorama, which has a focal_prior, by the focal length of other photos."""

@@ -48,7 +48,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.beam": ("FAINT_PART", "FIRST_STARTS", "NUM_FOUND", "NUM_SCORED", "PLAIN_SCORE"),
     "localization.comparison": ("LEAST_SHARED",),
     "localization.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
-    "localization.focal_length": ("CLEARLY", "EDGE_ERROR", "INFLATION", "MATCHED_DEVIATION", "NEXT_REACH"),
+    "localization.focal_length": ("CLEARLY", "EDGE_ERROR", "INFLATION", "MATCHED_DEVIATION", "LAST_REACH"),
     "localization.judge": ("ENOUGH_EXPLAINED", "MIRROR_RATIO", "WORTH_ASKING"),
     "localization.ladder": ("MAX_PERTURBATIONS", "MIN_GAIN", "PERTURBED_ANGLE", "PERTURBED_DISTANCE"),
     "localization.last_descent": ("FAINT_MATCHES", "FAINT_SCORE", "NEAR_MATCHES", "NEAR_SCORE"),
