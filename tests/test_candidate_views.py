@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import rooms
 
+from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
@@ -144,7 +145,7 @@ def test_views_and_points_count_from_their_place():
     query, pose = _query(), _pose(0.307, 0.191, 0.304)
     place = points_around.round_position(pose)
     expected = rooms.view(query.scan_map.octree, place, FINE, FINE_CELLS)
-    points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), 30_000)
+    points = visible_points(query.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000)
     for found, wanted in ((query.view_at(pose, "fine"), expected), (query.view_at(pose, "points"), points)):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)

@@ -14,6 +14,7 @@ from piccolo.cloud import octree as octree_module, voxels as voxel_table
 from piccolo.cloud.octree import MAX_NODES, build_octree, collect
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.errors import InputError
+from piccolo.geometry.cone import EVERYWHERE, Cone
 from piccolo.geometry.pose import rotate_points
 
 CORNER = -voxel_table.PHASE / voxel_table.QUANTA_PER_METRE
@@ -187,10 +188,30 @@ def test_collects_the_coarsest_nodes_that_are_small_from_where_one_is(voxel_per_
     points = np.concatenate([wall.astype(np.float32), _cloud()[0]])
     octree = _octree(points, np.full((len(points), 3), 90, np.uint8))
     found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
-    count = collect(octree, np.array(center), voxel_per_range, found, directions)
+    count = collect(octree, np.array(center), voxel_per_range, EVERYWHERE, found, directions)
     assert sorted(found[:count].tolist()) == _drawn(octree, np.float32(center), voxel_per_range)
     expected = octree.nodes[found[:count], :3] - np.float32(center)
     np.testing.assert_allclose(directions[:, :count].T, expected, atol=1e-5)
+
+
+@pytest.mark.parametrize("half_angle", [10.0, 45.0, 100.0, 175.0])
+@pytest.mark.parametrize("voxel_per_range", [1 / 15, 1 / 80])
+def test_of_nodes_in_a_cone_none_is_left_out_and_their_order_stays(voxel_per_range, half_angle):
+    octree = _octree(*_cloud())
+    center = np.array([0.3, -0.2, 0.1])
+    found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
+    every = found[: collect(octree, center, voxel_per_range, EVERYWHERE, found, directions)].copy()
+    rays = octree.nodes[every, :3] - center
+    rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+    for axis in np.random.default_rng(3).normal(size=(8, 3)):
+        cone = Cone(1.0, 0.0, 0.0, np.cos(np.radians(half_angle))).turn(
+            np.outer(axis / np.linalg.norm(axis), [1.0, 0.0, 0.0])
+        )
+        some = found[: collect(octree, center, voxel_per_range, cone, found, directions)].copy()
+        is_in = np.arccos(np.clip(rays @ cone.axis, -1.0, 1.0)) < np.radians(half_angle - 0.01)
+        assert set(every[is_in]) <= set(some)
+        np.testing.assert_array_equal(some, every[np.isin(every, some)])
+        assert len(some) < 0.6 * len(every) or half_angle > 45.0
 
 
 def test_without_leaves_their_parents_are_the_leaves():
@@ -202,12 +223,12 @@ def test_without_leaves_their_parents_are_the_leaves():
             thin.level(voxel_table.LEAF_SIZE * 2**k), whole.level(voxel_table.LEAF_SIZE * 2**k)
         )
     found, directions = np.empty(MAX_NODES, np.int32), np.empty((3, MAX_NODES), np.float32)
-    count = collect(thin, np.zeros(3), 1e-6, found, directions)
+    count = collect(thin, np.zeros(3), 1e-6, EVERYWHERE, found, directions)
     np.testing.assert_array_equal(np.sort(found[:count]), np.arange(*thin.level_start[-2:]))
 
 
 def test_collects_no_more_than_there_is_room_for():
     octree = _octree(*_cloud())
     found, directions = np.full(110, -1, np.int32), np.zeros((3, 100), np.float32)
-    assert collect(octree, np.zeros(3), 1 / 300, found[:100], directions) == 100
+    assert collect(octree, np.zeros(3), 1 / 300, EVERYWHERE, found[:100], directions) == 100
     assert (found[100:] == -1).all()

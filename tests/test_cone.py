@@ -6,9 +6,10 @@ import naive
 import numpy as np
 import pytest
 
+from piccolo.geometry.cone import Cone
 from piccolo.geometry.pose import exp_so3, rotate_points, yaw_rotation
 from piccolo.geometry.sphere import pixel_rays
-from piccolo.localization.cone import CONE_MARGIN, Cone, find_cone, select_cells
+from piccolo.localization.cone import CONE_MARGIN, find_cone, select_cells
 from piccolo.panorama.texels import find_valid, pack_texels
 from research.synthetic.world import mask_outside_field
 
@@ -87,12 +88,12 @@ def test_the_cells_are_those_within_the_margin_of_the_cone_around_the_photo():
     rng = np.random.default_rng(7)
     image = _narrow(ROLLED)
     cone = find_cone(image)
-    np.testing.assert_allclose(cone.axis_cam, ROLLED[:, 0], atol=0.02)
+    np.testing.assert_allclose(cone.axis, ROLLED[:, 0], atol=0.02)
     corner = math.atan(math.hypot(1.0, 0.75) * math.tan(math.radians(35.0)))
     assert math.acos(cone.cos_angle) - CONE_MARGIN == pytest.approx(corner, abs=PIXEL)
     R, center, offsets = exp_so3(rng.normal(size=3)), rng.normal(0.0, 0.1, 3), _cells(rng)
     rays_cam = rotate_points(offsets.T * float(UNIT) - center, R)
-    angle = np.arccos(rays_cam @ cone.axis_cam / np.linalg.norm(rays_cam, axis=1))
+    angle = np.arccos(rays_cam @ cone.axis / np.linalg.norm(rays_cam, axis=1))
     off = np.abs(angle - math.acos(cone.cos_angle))
     is_kept = np.isin(np.arange(offsets.shape[1]), _select(offsets, cone, R, center))
     is_plain = off > 1e-4

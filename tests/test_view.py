@@ -6,6 +6,7 @@ from scipy.spatial import cKDTree
 
 from piccolo.cloud.octree import build_octree
 from piccolo.geometry.colors import unpack_rgb
+from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.sphere import find_cell, make_grid
 from piccolo.jobs.threads import Workers
 from piccolo.scan_map import camera_positions
@@ -57,13 +58,13 @@ def test_cells_that_are_not_shown_change_nothing_elsewhere(octree):
     channels = naive.normalized_cells(twin[1], (twin[2] > 0) & shown, 24, 16, 22.0)
     both = part.weights > 0
     assert np.abs(part.channels[:, both] - channels[both].T).mean() < 0.01
-    points = visible_points(octree, center, LEAVES, shown.tobytes(), 3000)
+    points = visible_points(octree, center, LEAVES, shown.tobytes(), EVERYWHERE, 3000)
     assert shown[_cells(points.offsets.T)].mean() > 0.99
 
 
 def test_points_that_are_seen_lie_at_the_front_and_are_bounded(octree):
     center = rooms.scene(1)[2].center_world
-    offsets, _, weights, _ = visible_points(octree, center, LEAVES, ALL.tobytes(), 3000)
+    offsets, _, weights, _ = visible_points(octree, center, LEAVES, ALL.tobytes(), EVERYWHERE, 3000)
     assert 1000 < len(weights) <= 3000
     ranges = np.linalg.norm(offsets, axis=0)
     nearest = np.full(len(make_grid(24)), np.inf)

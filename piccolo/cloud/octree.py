@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s
+from ..geometry.cone import Cone, is_apart
 from ..geometry.vectors import Triple
 from ..jobs.memory import check_memory
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
@@ -169,12 +170,15 @@ def take_far(
 
 
 @kernel
-def collect(tree: Octree, center: Array, voxel_per_range: float, found: Int32s, directions: Array32) -> int:
+def collect(
+    tree: Octree, center: Array, voxel_per_range: float, cone: Cone, found: Int32s, directions: Array32
+) -> int:
     """Write the nodes that, seen from `center`, are small enough, or leaves; return their number.
 
-    Small enough are voxels of at most `voxel_per_range` times their distance. `directions` (3, N) get the
-    positions relative to the centre [m]. If all below a node is drawn at one level, its nodes there are
-    consecutive: most nodes are found in this way, without a test of each.
+    Most of those outside of a cone are left out; the order of the others stays. Small enough are voxels of
+    at most `voxel_per_range` times their distance. `directions` (3, N) get the positions relative to the
+    centre [m]. If all below a node is drawn at one level, its nodes there are consecutive: most nodes are
+    found in this way, without a test of each.
     """
     nodes = tree.nodes
     first_child = tree.first_child
@@ -191,6 +195,8 @@ def collect(tree: Octree, center: Array, voxel_per_range: float, found: Int32s, 
         least_distance[level] = size / voxel_per_range
         diagonal[level] = size * DIAGONAL
     least_distance[num_levels - 1] = F0
+    sine = np.float32(math.sqrt(max(1.0 - cone.cos_angle**2, 0.0)))
+    has_cone = cone.cos_angle >= -1.0
     least = least_distance[0] * least_distance[0]
     count, top = take_far(nodes, 0, min(num_roots, len(found)), at, least, found, directions, 0, stack, 0)
     levels[:top] = 0
@@ -198,11 +204,13 @@ def collect(tree: Octree, center: Array, voxel_per_range: float, found: Int32s, 
         top -= 1
         node = stack[top]
         level = levels[top] + 1
+        dx, dy, dz = nodes[node, 0] - at[0], nodes[node, 1] - at[1], nodes[node, 2] - at[2]
+        if has_cone and is_apart(cone, sine, dx, dy, dz, diagonal[level - 1]):
+            continue
         first = np.int64(first_child[node])
         last = np.int64(first_child[node + 1])
         is_uniform = level == num_levels - 1
         if voxel_per_range < RANGES_BELOW and level < num_levels - 2:
-            dx, dy, dz = nodes[node, 0] - at[0], nodes[node, 1] - at[1], nodes[node, 2] - at[2]
             distance = math.sqrt(dx * dx + dy * dy + dz * dz)
             reach = diagonal[level - 1]
             uniform = uniform_level(least_distance, level, distance - reach, distance + reach)

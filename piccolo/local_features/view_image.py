@@ -8,6 +8,7 @@ import numpy as np
 
 from ..arrays import Array, Array32, Bytes, Floats, Mask
 from ..cloud.octree import Octree, collect, find_level
+from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.pose import Pose
 from ..geometry.sphere import direction_to_pixel
 from ..geometry.vectors import rotate
@@ -25,6 +26,7 @@ WIDER = 4  # [px] of a wider pixel
 FILL_LEVELS = 4  # gaps up to 16 px are filled
 LEAST_FILLED = 0.25  # of a wider pixel that fills finer ones
 NOTHING = np.float32(1e30)
+ROUNDING = 1e-3  # [rad] of a cone in float32
 NEAREST = np.float32(0.1)  # cosine of the angle between a pinhole's axis and what it shows, at least
 
 
@@ -57,9 +59,17 @@ def project(
 
 @kernel
 def project_voxels(
-    tree: Octree, center: Array, R_cam_from_map: Array32, focal: np.float32, is_drawn: Mask, scratch: Scratch
+    tree: Octree,
+    center: Array,
+    R_cam_from_map: Array32,
+    focal: np.float32,
+    is_drawn: Mask,
+    cone: Cone,
+    scratch: Scratch,
 ) -> int:
     """Project the voxels whose middles a mask (H, W) of the picture shows, and return their number.
+
+    What it shows lies in the cone, in the map's frame.
 
     Of each voxel `scratch` gets the node, as `directions` the pixel u, v and the range, and as `ranges` and
     `turns` half of the height and of the width that is drawn for it [px].
@@ -69,7 +79,7 @@ def project_voxels(
     pixels = scratch.directions
     up = scratch.ranges
     across = scratch.turns
-    count = collect(tree, center, VOXEL_PER_RANGE, nodes, pixels)
+    count = collect(tree, center, VOXEL_PER_RANGE, cone, nodes, pixels)
     num = 0
     for k in range(count):
         x, y, z = rotate(R_cam_from_map, (pixels[0, k], pixels[1, k], pixels[2, k]))
@@ -182,6 +192,12 @@ def _resize_image(image: Floats, size: tuple[int, int]) -> Floats:
     return np.asarray(cv2.resize(image, size, interpolation=how))
 
 
+def cone_of_picture(shape: tuple[int, int], focal: float) -> Cone:
+    """Return the cone around a pinhole's picture (H, W) with a focal length [px], in the camera's frame."""
+    half_diagonal = 0.5 * math.hypot(*shape)
+    return Cone(1.0, 0.0, 0.0, focal / math.hypot(focal, half_diagonal)).widen(ROUNDING)
+
+
 def render_gray(octree: Octree, pose: Pose, is_drawn: Mask, focal: float = 0.0) -> ViewImage:
     """Draw the scan at a pose in the map, where the mask (H, W) says so, and a little beyond.
 
@@ -194,7 +210,8 @@ def render_gray(octree: Octree, pose: Pose, is_drawn: Mask, focal: float = 0.0) 
     center = np.asarray(pose.center_world, np.float64)
     R = np.asarray(pose.R_cam_from_world, np.float32)
     wraps = focal == 0.0
-    count = project_voxels(octree, center, R, np.float32(focal), is_drawn, scratch)
+    cone = EVERYWHERE if wraps else cone_of_picture(is_drawn.shape, focal).turn(R.T)
+    count = project_voxels(octree, center, R, np.float32(focal), is_drawn, cone, scratch)
     draw_voxels(octree, scratch, count, wraps, ranges, sums)
     weight = is_in_front(ranges, wraps).astype(np.float32)
     gray = weight * sums[..., 0] / np.maximum(sums[..., 1], np.float32(1e-6))

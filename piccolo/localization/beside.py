@@ -148,7 +148,7 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
 
 
 def match_covariance(matches: Matches, pose: Pose) -> Array:
-    """Return the covariance (6, 6) of a pose by its matches: turns in the camera's axes, moves in the map's."""
+    """Return the covariance (6, 6) of a pose by its matches, as of `PoseGaussian`."""
     agreeing = find_inliers(matches, pose, COS_EXACT)
     rays, J = differentiate_rays(matches.points[agreeing], pose)
     information = np.einsum("kai,kaj->ij", J, J)

@@ -209,7 +209,7 @@ def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig |
     config = config or query.method.fine_view
     view = config.arrays
     place = round_position(seen_from)
-    sums = query.cache.views.averages(place, config)
+    sums = query.averages_at(pose, place, config)
     offsets, colors, weights, center = empty_cells(len(sums), place)
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, np.ones(len(sums), np.bool_), offsets, colors, weights, moments)

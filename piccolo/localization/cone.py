@@ -1,12 +1,12 @@
 """A cone around what a photo shows: cells outside of it have no part in the first descents."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s
+from ..geometry.cone import Cone, cone_around
 from ..geometry.sphere import pixel_rays
 from ..geometry.vectors import rotate
 from ..kernels.jit import inline_kernel
@@ -15,20 +15,9 @@ from ..panorama.texels import Texels, find_valid
 CONE_MARGIN = math.radians(20.0)  # that a camera turns in a descent, at most
 
 
-class Cone(NamedTuple):
-    """A cone in the camera's frame."""
-
-    axis_cam: Array  # (3,) unit vector
-    cos_angle: float  # of its half angle; -2 for the whole sphere
-
-
-def find_cone(image: Texels) -> Cone:
-    """Return the cone around what an image shows, wider by CONE_MARGIN."""
-    rays = pixel_rays(image.width)[find_valid(image)]
-    axis = rays.sum(axis=0)
-    axis /= max(float(np.linalg.norm(axis)), 1e-9)
-    angle = math.acos(np.clip((rays @ axis).min(initial=1.0), -1.0, 1.0)) + CONE_MARGIN
-    return Cone(axis, math.cos(angle) if angle < math.pi else -2.0)
+def find_cone(image: Texels, margin: float = CONE_MARGIN) -> Cone:
+    """Return the cone, in the camera's frame, around the pixels that an image shows, wider by `margin`."""
+    return cone_around(pixel_rays(image.width)[find_valid(image)]).widen(margin)
 
 
 @inline_kernel
@@ -41,7 +30,7 @@ def select_cells(
     kept: Int64s,
 ) -> int:
     """Write the indices of the cells with offsets (3, N) that lie in a cone; return their number."""
-    axis = rotate(R_cam_from_map.T, cone.axis_cam)
+    axis = rotate(R_cam_from_map.T, (cone.x, cone.y, cone.z))
     num = 0
     for j in range(offsets.shape[1]):
         x = np.float32(offsets[0, j]) * unit - center[0]

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from ..arrays import Array, Mask
+from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.sphere import compute_indices, make_grid
 from ..jobs.threads import Once, Workers
@@ -24,10 +25,12 @@ from ..panorama.edges import soften
 from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize
 from ..panorama.texels import Texels, find_valid, pack_texels
+from .cone import find_cone
 from .settings import ImageName, ImageScale, ImageScales
 
 WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
 ALL_SHOWN = 0.98  # of the sphere: a photo that shows more counts as showing all cells
+BESIDE = math.radians(5.0)  # by which what is seen at a pose shifts from one pose to another near it
 ACROSS = np.diag([1.0, -1.0, 1.0])  # mirrors a camera's axes left for right
 
 
@@ -55,6 +58,7 @@ class Photo:
     images: Images
     small: Texels  # colours at the size of fine images, at which poses are compared
     seen: Once[Seen]  # what verification compares with the scan drawn at a pose
+    shown: Once[Cone]  # the cone around what it shows, in the camera's axes
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     has_tilt: bool  # R_cam_from_level is known, from metadata or a gravity vector
     scales: ImageScales
@@ -78,6 +82,12 @@ class Photo:
         rays_cam = rotate_points(grid.directions.astype(np.float64), pose.R_cam_from_world)
         return np.asarray(self.panorama.is_valid[compute_indices(rays_cam, self.panorama.is_valid.shape[1])])
 
+    def find_cone(self, num_rings: int, pose: Pose) -> Cone:
+        """Return the cone, in the map's axes, around the cells of a grid that the photo shows."""
+        if not self.is_partial:
+            return EVERYWHERE
+        return self.shown().widen(BESIDE + 1.5 * math.pi / num_rings).turn(pose.R_cam_from_world.T)
+
     def mask(self, is_hidden: Mask) -> "Photo":
         """Return the photo without pixels (h, 2 h), the rest normalised again."""
         height, width = self.panorama.is_valid.shape
@@ -96,6 +106,7 @@ class Photo:
             images=Images(*(Once(Texels.mirror, image) for image in self.images)),
             small=small,
             seen=Once(find_seen, panorama, small, self.workers),
+            shown=Once(find_cone, small, 0.0),
             R_cam_from_level=ACROSS @ self.R_cam_from_level @ ACROSS,
         )
 
@@ -116,7 +127,8 @@ def make_photo(
     small = pack_texels(least.rgb, least.is_valid)
     seen = Once(find_seen, panorama, small, workers)
     images = make_images(panorama, scales)
-    return Photo(panorama, images, small, seen, R_cam_from_level, has_tilt, scales, workers)
+    shown = Once(find_cone, small, 0.0)
+    return Photo(panorama, images, small, seen, shown, R_cam_from_level, has_tilt, scales, workers)
 
 
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Mask
+from ..arrays import Array, Array32, Mask
 from ..cloud.soa import PackedPoints
 from ..confidence.confidence import EvidenceKind
 from ..geometry.pose import Pose
@@ -23,8 +23,8 @@ from ..panorama.gpano import rotation_to_level
 from ..panorama.model import shrink
 from ..panorama.texels import Texels, pack_texels
 from ..scan_map.scan_map import ScanMap
-from ..views.points_around import RecentViews, round_position
-from ..views.view import Cells, normalize_view
+from ..views.points_around import Place, RecentViews, round_position
+from ..views.view import Cells, ViewConfig, normalize_view
 from .photo import ACROSS, Photo, make_photo
 from .settings import METHOD, SHAPE_SCALES, Beam, CoarseToFineSettings, MethodConfig, ViewName
 
@@ -140,8 +140,13 @@ class Query:
         place = round_position(pose)
         shown = self.photo.find_shown_cells(config.num_rings, pose)
         if name == "points":
-            return self.cache.views.points(place, config, shown.tobytes(), NUM_POINTS)
-        return normalize_view(self.cache.views.averages(place, config), place, config, shown)
+            cone = self.photo.find_cone(config.num_rings, pose)
+            return self.cache.views.points(place, config, shown.tobytes(), cone, NUM_POINTS)
+        return normalize_view(self.averages_at(pose, place, config), place, config, shown)
+
+    def averages_at(self, pose: Pose, place: Place, config: ViewConfig) -> Array32:
+        """Return the sums (cells, 8) of a view from a place near a pose, of what the photo shows."""
+        return self.cache.views.averages(place, config, self.photo.find_cone(config.num_rings, pose))
 
     def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
         """Return the points around a pose with which the photo is compared, and coarser ones."""

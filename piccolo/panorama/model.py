@@ -54,7 +54,7 @@ class Panorama:
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def shrink_picture(self, width: int) -> "Panorama":
-        """Return the panorama, which has a focal_prior, with a picture no finer than a sphere of this width."""
+        """Return the panorama, which has a focal_prior, with its picture as fine as a sphere's."""
         assert self.focal_prior is not None
         return replace(self, focal_prior=replace(self.focal_prior, view=shrunk(self.focal_prior.view, width)))
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Bytes, Int8s, Int64s, Mask
 from ..cloud.octree import Octree
+from ..geometry.cone import EVERYWHERE
 from ..geometry.sphere import SEARCH_RINGS, make_grid
 from ..jobs.memory import check_memory
 from ..jobs.threads import Workers
@@ -79,7 +80,7 @@ def render_block(
     shown = np.ones(n, np.bool_)
     sums = np.empty((n, 8), np.float32)
     for k in range(len(views.centers)):
-        average_nodes(tree, views.centers[k], voxel_per_range, view, scratch, sums)
+        average_nodes(tree, views.centers[k], voxel_per_range, view, EVERYWHERE, scratch, sums)
         normalize_cells(sums, view, shown, points, channels, weights)
         largest = np.float32(1e-3)
         for i in range(3):
@@ -121,7 +122,7 @@ def render_wide_block(
     for c in range(n):
         area[view.stats_cell[c]] += view.solid_angle[c]
     for k in range(len(centers)):
-        average_nodes(tree, centers[k], voxel_per_range, view, scratch, sums)
+        average_nodes(tree, centers[k], voxel_per_range, view, EVERYWHERE, scratch, sums)
         normalize_cells(sums, view, shown, points, channels, weights)
         wide[:] = F0
         for c in range(n):

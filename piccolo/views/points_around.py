@@ -11,6 +11,7 @@ import numpy as np
 from ..arrays import Array32, Int32s, Mask
 from ..cloud.octree import Octree, collect
 from ..cloud.soa import PackedPoints, pack_points
+from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.pose import Pose
 from ..kernels.jit import F0, F1, HALF, inline_kernel, kernel
 from ..panorama.local_normalization import opponent, zscore
@@ -89,9 +90,15 @@ def take_children(tree: Octree, nodes: Int32s, kept: np.float32, found: Int32s) 
 
 @kernel
 def sample_visible(
-    tree: Octree, voxel_per_range: float, view: ViewArrays, shown: Mask, scratch: Scratch, sample: Cells
+    tree: Octree,
+    voxel_per_range: float,
+    view: ViewArrays,
+    shown: Mask,
+    cone: Cone,
+    scratch: Scratch,
+    sample: Cells,
 ) -> int:
-    """Write a sample of the visible points in cells that are shown; return their number.
+    """Write a sample of the visible points in cells that are shown, all in a cone; return their number.
 
     It fits the arrays of `sample`. Offsets and channels are as in `normalize_cells`, weights are 1. Occlusion
     and local statistics are computed from voxels twice as large.
@@ -104,7 +111,7 @@ def sample_visible(
     cell_offsets = np.empty((3, num_cells), np.float32)
     cell_channels = np.empty((3, num_cells), np.float32)
     cell_weights = np.empty(num_cells, np.float32)
-    n = average_nodes(tree, center, 2.0 * voxel_per_range, view, scratch, sums)
+    n = average_nodes(tree, center, 2.0 * voxel_per_range, view, cone, scratch, sums)
     describe_cells(sums, view, shown, cell_offsets, cell_channels, cell_weights, stats)
     for c in range(num_cells):  # how far what is seen reaches; nothing of cells that are not shown
         sums[c, 7] = sums[c, 7] * view.visible + VISIBLE_OFFSET if cell_weights[c] > F0 else F0
@@ -136,14 +143,18 @@ def sample_visible(
     return count
 
 
-def visible_points(octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, count: int) -> Cells:
+def visible_points(
+    octree: Octree, center_map: Center, config: ViewConfig, shown: bytes, cone: Cone, count: int
+) -> Cells:
     """Return what is seen from a centre (3,) [m] as at most `count` points of equal weights, not as cells.
 
-    `shown` has a byte for each cell of `config`: 1 if points in it are wanted, else 0.
+    `shown` has a byte for each cell of `config`: 1 if points in it are wanted, else 0. These cells lie in a
+    cone, in the map's frame.
     """
     sample = empty_cells(count, center_map)
     is_shown = np.frombuffer(shown, np.bool_)
-    n = sample_visible(octree, config.voxel_per_range, config.arrays, is_shown, thread_scratch(), sample)
+    scratch = thread_scratch()
+    n = sample_visible(octree, config.voxel_per_range, config.arrays, is_shown, cone, scratch, sample)
     offsets, channels, weights = (values[..., :n].copy() for values in sample[:3])
     return Cells(offsets, channels, weights, sample.center_map)
 
@@ -155,9 +166,8 @@ def points_around(octree: Octree, center_map: Center, voxel_per_range: float) ->
     however large the scan.
     """
     scratch = thread_scratch()
-    n = collect(
-        octree, np.asarray(center_map, np.float64), voxel_per_range, scratch.nodes, scratch.directions
-    )
+    center = np.asarray(center_map, np.float64)
+    n = collect(octree, center, voxel_per_range, EVERYWHERE, scratch.nodes, scratch.directions)
     nodes = octree.nodes[scratch.nodes[:n]]
     # rounded so that half a level goes up
     return pack_points(nodes[:, :3], (nodes[:, 3:] * np.float32(255.0) + HALF).astype(np.uint8))
@@ -168,10 +178,10 @@ class RecentViews:
 
     def __init__(self, octree: Octree, averaged: Octree | None = None) -> None:
         """Prepare for views of an octree; averages are of another one, if it is given."""
-        self.averages: Callable[[Place, ViewConfig], Array32] = lru_cache(NUM_VIEWS)(
+        self.averages: Callable[[Place, ViewConfig, Cone], Array32] = lru_cache(NUM_VIEWS)(
             partial(average_view, averaged or octree)
         )
-        self.points: Callable[[Place, ViewConfig, bytes, int], Cells] = lru_cache(NUM_POINT_SETS)(
+        self.points: Callable[[Place, ViewConfig, bytes, Cone, int], Cells] = lru_cache(NUM_POINT_SETS)(
             partial(visible_points, octree)
         )
         self.surroundings: Callable[[Place, float], PackedPoints] = lru_cache(NUM_SURROUNDINGS)(

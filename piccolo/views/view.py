@@ -11,6 +11,7 @@ import numpy as np
 
 from ..arrays import Array, Array32, Floats, Int32s, Mask
 from ..cloud.octree import MAX_NODES, Octree, collect
+from ..geometry.cone import EVERYWHERE, Cone
 from ..geometry.sphere import BLOCK_RINGS, PI, atan2, find_cell, interpolation, make_grid, make_neighbors
 from ..kernels.jit import F0, F1, HALF, kernel, whole
 from ..panorama.local_normalization import mean_and_inverse_std, opponent, zscore
@@ -131,11 +132,11 @@ def locate(
 
 @kernel
 def locate_nodes(
-    tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, scratch: Scratch
+    tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, cone: Cone, scratch: Scratch
 ) -> int:
     """Fill the scratch with the nodes to draw, their offsets, cells and ranges; return their number."""
     s = scratch
-    n = collect(tree, center, voxel_per_range, s.nodes, s.directions)
+    n = collect(tree, center, voxel_per_range, cone, s.nodes, s.directions)
     x = s.directions[0, :n]  # a row each: of a cut of all three, the stride is unknown to the compiler
     y = s.directions[1, :n]
     z = s.directions[2, :n]
@@ -145,14 +146,21 @@ def locate_nodes(
 
 @kernel
 def average_nodes(
-    tree: Octree, center: Array, voxel_per_range: float, view: ViewArrays, scratch: Scratch, sums: Array32
+    tree: Octree,
+    center: Array,
+    voxel_per_range: float,
+    view: ViewArrays,
+    cone: Cone,
+    scratch: Scratch,
+    sums: Array32,
 ) -> int:
     """Write (cells, 8): sums of x, y, z, r, g, b, and the count, of each cell's nearest nodes; and its range.
 
     Positions are relative to the centre [m], colours in [0, 1]. Nearest nodes are those up to `view.front`
-    times the range [m] of the very nearest. All nodes stay in the scratch; their number is returned.
+    times the range [m] of the very nearest. Cells of which a part lies outside of the cone may miss some.
+    All nodes stay in the scratch; their number is returned.
     """
-    n = locate_nodes(tree, center, voxel_per_range, view, scratch)
+    n = locate_nodes(tree, center, voxel_per_range, view, cone, scratch)
     s = scratch
     cells = s.cells[:n]
     sums[:] = F0
@@ -278,7 +286,7 @@ def nearest_ranges(
 ) -> None:
     """Write ranges [m] of the nearest nodes in the cells (n, cells) around each centre (n, 3), 0 for none."""
     for k in range(len(centers)):
-        n = locate_nodes(tree, centers[k], voxel_per_range, view, scratch)
+        n = locate_nodes(tree, centers[k], voxel_per_range, view, EVERYWHERE, scratch)
         ranges[k] = F0
         for i in range(n):
             cell = scratch.cells[i]
@@ -299,11 +307,14 @@ def thread_scratch() -> Scratch:
     return scratch
 
 
-def average_view(octree: Octree, center_map: Center, config: ViewConfig) -> Array32:
-    """Render a view from a centre (3,) [m]; return its sums (cells, 8) as `average_nodes` writes them."""
+def average_view(octree: Octree, center_map: Center, config: ViewConfig, cone: Cone = EVERYWHERE) -> Array32:
+    """Render a view from a centre (3,) [m]; return its sums (cells, 8) as `average_nodes` writes them.
+
+    Only the cells in a cone, in the map's frame, are needed.
+    """
     sums = np.empty((len(make_grid(config.num_rings)), 8), np.float32)
     center = np.asarray(center_map, np.float64)
-    average_nodes(octree, center, config.voxel_per_range, config.arrays, thread_scratch(), sums)
+    average_nodes(octree, center, config.voxel_per_range, config.arrays, cone, thread_scratch(), sums)
     if config.draws_edges:
         draw_edges(sums, config.num_rings)
     return sums
