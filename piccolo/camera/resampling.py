@@ -72,7 +72,7 @@ def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:
     largest = MAX_SIDE / max(camera.width, camera.height)
     factor = min(1.0, width / (2.0 * math.pi * camera.resolution), largest)
     size = max(1, round(factor * camera.width)), max(1, round(factor * camera.height))
-    if size[0] >= AS_FINE * view.pixels.shape[1]:
+    if size[0] >= AS_FINE * view.pixels.shape[1] and max(view.pixels.shape) <= MAX_SIDE:
         return view
     return view._replace(pixels=np.asarray(cv2.resize(view.pixels, size, interpolation=cv2.INTER_AREA)))
 

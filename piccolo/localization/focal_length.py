@@ -41,7 +41,7 @@ from .verification import matches_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
-NUM_VALUES = 7  # of the parameter in a design of one
+NUM_VALUES = 5  # of the parameter in a design of one
 NUM_VALUES_OF_TWO = 4  # of each parameter in one of two
 FIRST_REACH = 0.1  # of a design to either side, at first
 LAST_REACH = 0.02  # where a design has a minimum

@@ -28,7 +28,7 @@ from ..views.view import Cells, ViewConfig, normalize_view
 from .photo import ACROSS, Photo, make_photo
 from .settings import METHOD, SHAPE_SCALES, Beam, CoarseToFineSettings, MethodConfig, ViewName
 
-MAX_WIDTH = 4096  # [px] of the photo for the loss: more costs seconds and gains nothing
+MAX_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
 VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
 COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
