@@ -83,10 +83,30 @@ def resize(panorama: Panorama, width: int) -> Panorama:
     if panorama.is_valid.all():
         rgb = np.asarray(cv2.resize(panorama.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
+    step, rest = divmod(panorama.rgb.shape[1], width)
+    if rest or step < 2:
+        return Panorama(*_resize_masked(panorama.rgb, panorama.is_valid, size))
+    rgb = np.zeros((*size[::-1], 3), np.uint8)
+    is_valid = np.zeros(size[::-1], np.bool_)
+    rows, columns = (_extent(panorama.is_valid.any(axis=axis), step) for axis in (1, 0))
+    box = rows, columns
+    shown = slice(rows.start * step, rows.stop * step), slice(columns.start * step, columns.stop * step)
+    size = columns.stop - columns.start, rows.stop - rows.start
+    rgb[box], is_valid[box] = _resize_masked(panorama.rgb[shown], panorama.is_valid[shown], size)
+    return Panorama(rgb, is_valid)
+
+
+def _extent(is_met: Mask, step: int) -> slice:
+    """Return the range of the larger pixels, of `step` pixels (N,) each, from the first met to the last."""
+    met = np.flatnonzero(is_met) // step
+    return slice(int(met[0]), int(met[-1]) + 1) if len(met) else slice(0, 1)
+
+
+def _resize_masked(rgb: Bytes, is_valid: Mask, size: tuple[int, int]) -> tuple[Bytes, Mask]:
     # in bytes, as floating-point copies of a large picture would take gigabytes
-    counts = panorama.is_valid.view(np.uint8) * np.uint8(255)
+    counts = is_valid.view(np.uint8) * np.uint8(255)
     weight = cv2.resize(counts, size, interpolation=cv2.INTER_AREA).astype(np.float32) / 255.0
-    masked = cv2.bitwise_and(panorama.rgb, panorama.rgb, mask=counts)
+    masked = cv2.bitwise_and(rgb, rgb, mask=counts)
     total = cv2.resize(masked, size, interpolation=cv2.INTER_AREA)
-    rgb = np.round(total / np.maximum(weight, 1e-6)[..., None]).clip(0, 255).astype(np.uint8)
-    return Panorama(rgb, weight >= 0.5)
+    means = np.round(total / np.maximum(weight, 1e-6)[..., None]).clip(0, 255).astype(np.uint8)
+    return means, weight >= 0.5
