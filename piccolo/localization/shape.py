@@ -19,7 +19,9 @@ from .search import search_poses
 from .selection import CLEAR_MARGIN, CLEAR_SHAPE, Selection
 
 NUM_TILTS = 3  # that are searched in full, at most
-LEAST_ALIKE = 0.5  # of what the scan shows at a pose, that it shows at a copy of that place too
+# of what the scan shows at a pose, that it shows at a copy of that place too; chosen between panoramas of
+# three photorealistic buildings (at most 0.42) and made racks and hotel rooms (0.54 to 0.84)
+LEAST_ALIKE = 0.5
 LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the horizon, at most
 
 
