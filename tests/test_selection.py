@@ -206,6 +206,19 @@ def test_copies_are_credited_with_the_most_matches_of_one(monkeypatch):
     assert asked == [0.0]
 
 
+def test_copies_by_shape_are_as_likely_as_the_best_unless_a_prior_excludes_them(monkeypatch):
+    """The pose that was found at the same place as a copy is not reported beside it."""
+    query = replace(QUERY, evidence="shape")
+    monkeypatch.setattr(judging, "find_alike", lambda _, best: [at(best.center_world[0] + 3.0, 0.0).pose])
+    monkeypatch.setattr(judging, "score_pose", lambda _, pose: at(place(pose), 0.1))
+    found = Selection(at(0.0, 0.3), (at(3.1, 0.2), at(6.0, 0.1)))
+    reported, is_copy = judging.list_reported(query, found)
+    assert (places(reported), is_copy) == ([3.0, 6.0], [True, True, False])
+    standings = [Standing(r, s, None, "shape", p, s) for r, s, p in ((1.0, 0.3, 0.0), (0.4, 0.1, -4.0))]
+    best, copy, other = judging.credit_copies([*standings, standings[1]], is_copy)
+    assert (best, copy, other) == (standings[0], standings[0]._replace(log_prior=-4.0), standings[1])
+
+
 @pytest.mark.parametrize(("is_copy", "order"), [(True, [3.0, 0.0, 6.0]), (False, [0.0, 3.0, 6.0])])
 def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(monkeypatch, is_copy, order):
     query = compared(monkeypatch, {0.0: 0.3, 3.0: 0.5, 6.0: 0.1}, {0.0: 20, 3.0: 20})

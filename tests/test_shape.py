@@ -21,7 +21,7 @@ from piccolo.cli import localize as command_line
 from piccolo.cloud.octree import build_octree
 from piccolo.cloud.readers.reader import RawCloud
 from piccolo.cloud.settings import IN_COLORS, WITHOUT_COLORS, CloudSettings
-from piccolo.cloud.stream import open_cloud
+from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.cloud.surfaces import paint_shape
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import log_odds
@@ -37,12 +37,17 @@ from piccolo.panorama import Panorama
 from piccolo.panorama.edges import draw_edges, find_axes, soften
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
+from research.synthetic.places import make_alike
+from research.synthetic.world import World, make_query, scan_world
 
 WIDTH = 1024
 SEED = 6  # of a room whose walls are plain: strong patterns hide its edges
 NUM_POINTS = 200_000
 PATTERNED = 12  # of a room with patterns on its walls
 LEVEL = np.eye(3)
+RACKS = 102  # of a store of racks
+AISLE = 2.4  # [m] between two of them
+BAY = 1.6  # [m] of a rack
 TILTED = exp_so3(np.array([0.5, 0.3, 0.2]))
 
 
@@ -251,6 +256,20 @@ def test_a_photo_of_another_room_is_not_localized():
     photo = rooms.as_panorama(rooms.query(2, width=WIDTH).rgb)
     found = rooms.locate(photo, _shape_map())
     assert found.status == "not_localized"
+
+
+def test_a_photo_of_an_aisle_that_looks_as_the_one_scanned_is_ambiguous():
+    """Taken between racks that no station saw. They are as those two metres beside, bay after bay."""
+    world = World(RACKS, make_alike("racks", RACKS, 0.0))
+    points = scan_world(world, 360_000, Workers(2))[0]
+    scan_map = prepare_map(stream_of_arrays(points.astype(float), None), Workers(2), has_features=False)
+    taken = make_query(world, 0, "clean", WIDTH, Workers(2))
+    found = rooms.locate(rooms.as_panorama(taken.rgb), scan_map, rooms.KNOWN)
+    assert found.pose.distance(taken.pose) > AISLE - 0.1
+    assert found.status == "ambiguous"
+    copy = found.alternatives[0]
+    assert copy.probability == pytest.approx(found.confidence)
+    assert copy.pose.distance(found.pose) == pytest.approx(BAY, abs=0.05)
 
 
 def test_edges_drawn_at_the_true_pose_agree_better_than_elsewhere():

@@ -26,12 +26,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
+from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis, suppress_near
 from ..confidence.confidence import LOCALIZED, Standing, classify, posterior
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
 from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
+from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from ..local_features.hypotheses import propose_poses
@@ -43,7 +44,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .attempts import FIRST_BEAM
 from .beam import brief_query, descend_briefly, refine_matches, refine_starts, score_briefly, score_near
-from .comparison import compare
+from .comparison import compare, score_pose
 from .covariance import Errors, estimate_covariance
 from .focal_length import FocalFit, fit_focal
 from .ladder import settle
@@ -52,6 +53,7 @@ from .prior import contradictions
 from .query import Query
 from .search import search_poses
 from .selection import Selection, assess_poses
+from .shape import find_alike
 from .verification import count_agreeing, count_each, find_copies, list_rivals
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
@@ -84,8 +86,7 @@ def judge(
     measured = measure(query, found, fit)
     if measured is None:
         return Localization()
-    reported = found.alternatives[:MAX_ALTERNATIVES]
-    is_copy = list_copies(query, found.best, reported)
+    reported, is_copy = list_reported(query, found)
     standings = credit_copies(assess_poses(query, found.best, reported), is_copy)
     probabilities = posterior(standings, std_of(measured.errors.gaussian), measured.errors.std_of_fit)
     likeliest = int(probabilities[:-1].argmax())
@@ -236,6 +237,19 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     return Measured(pose, errors, loss, collect_evidence(query, found, agreement, fractions))
 
 
+def list_reported(query: Query, found: Selection) -> tuple[tuple[Hypothesis, ...], list[bool]]:
+    """Return the alternatives to report, and as `list_copies` which poses are copies, the best pose first.
+
+    In a scan without colours copies are searched. They are reported before other poses.
+    """
+    if query.evidence != "shape":
+        reported = found.alternatives[:MAX_ALTERNATIVES]
+        return reported, list_copies(query, found.best, reported)
+    copies = [score_pose(query, pose) for pose in find_alike(query, found.best.pose)]
+    reported = tuple(suppress_near([*copies, *found.alternatives], MAX_ALTERNATIVES, ONE_ANSWER))
+    return reported, [True, *(k < len(copies) for k in range(len(reported)))]
+
+
 def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[bool]:
     """Return True for the best pose and for copies of its place; of a photo without matches there False."""
     if not query.uses_matches:
@@ -249,8 +263,13 @@ def list_copies(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) ->
 def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:
     """Give every copy of a place the greatest number of matches among the copies.
 
-    How many agree tells how well a copy was scanned, not which of them it is.
+    How many agree tells how well a copy was scanned, not which of them it is. So do edges: in a scan without
+    colours every copy has the best pose's evidence.
     """
+    if standings[0].evidence == "shape":
+        best = standings[0]
+        credited = [best._replace(log_prior=s.log_prior) for s in standings]
+        return [c if copied else s for c, s, copied in zip(credited, standings, is_copy, strict=True)]
     most = max((s.num_matches or 0 for s in compress(standings, is_copy)), default=0)
     pairs = zip(standings, is_copy, strict=True)
     return [s._replace(num_matches=most) if copied else s for s, copied in pairs]

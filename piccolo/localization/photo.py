@@ -93,7 +93,7 @@ class Photo:
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
-        return self._remake(rest)
+        return self.take(rest)
 
     def mirror(self) -> "Photo":
         """Return the photo mirrored left to right."""
@@ -112,9 +112,10 @@ class Photo:
 
     def forget(self) -> "Photo":
         """Return the photo with its images as they are before they are asked for."""
-        return self._remake(self.panorama)
+        return self.take(self.panorama)
 
-    def _remake(self, panorama: Panorama) -> "Photo":
+    def take(self, panorama: Panorama) -> "Photo":
+        """Return the photo of another panorama, by a camera of the same tilt."""
         return make_photo(panorama, self.scales, self.R_cam_from_level, self.has_tilt, self.workers)
 
 
