@@ -95,7 +95,7 @@ def find_alike(query: Query, pose: Pose) -> list[Pose]:
 def draw_scan(query: Query, pose: Pose) -> Query:
     """Return a brief query in which the scan as seen from a pose takes the photo's place, at its tilt."""
     view = query.method.fine_view
-    sums = query.cache.views.averages(round_position(pose), view)
+    sums = query.averages_at(pose, round_position(pose), view)
     shown = query.photo.panorama.is_valid
     rays = pixel_rays(shown.shape[1]) @ pose.R_cam_from_world
     cells = find_cell(rays.reshape(-1, 3).astype(np.float32), view.num_rings).reshape(shown.shape)
