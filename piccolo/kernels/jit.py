@@ -271,7 +271,7 @@ def inline_kernel(function: Function) -> Function:
     """
     dispatcher: Any = _compile(function, no_cpython_wrapper=True)
     alone = cache(lambda: kernel(function))
-    dispatcher._insert = lambda *_: None
+    dispatcher._insert = lambda *_: None  # it would be called without its wrapper, and crash
     dispatcher._compile_for_args = lambda *_: alone()
     return cast(Function, dispatcher)
 
