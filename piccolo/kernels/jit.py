@@ -259,15 +259,21 @@ HALF = np.float32(0.5)
 
 # A function of scalars that kernels call. Always inlined, as are kernels in kernels: a call would go to
 # whichever copy of the callee was loaded first, and a first run had other last bits than the runs after it.
-_njit: Callable[..., Any] = numba.njit  # its type does not know that no wrapper for C is an option
-_compile_inline = _njit(
-    nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True, no_cfunc_wrapper=True
+_compile: Callable[..., Any] = partial(  # whose type does not know that wrappers are options
+    numba.njit, nogil=True, error_model="numpy", fastmath=FASTMATH, forceinline=True, no_cfunc_wrapper=True
 )
 
 
 def inline_kernel(function: Function) -> Function:
-    """Compile a function of arrays and scalars as part of each kernel that calls it."""
-    return cast(Function, _compile_inline(function))
+    """Compile a function of arrays and scalars as part of each kernel that calls it.
+
+    It gets no wrapper for Python, which takes a sixth of the time: Python calls a kernel of its own.
+    """
+    dispatcher: Any = _compile(function, no_cpython_wrapper=True)
+    alone = cache(lambda: kernel(function))
+    dispatcher._insert = lambda *_: None  # it would be called without its wrapper, and crash
+    dispatcher._compile_for_args = lambda *_: alone()
+    return cast(Function, dispatcher)
 
 
 @inline_kernel
@@ -288,7 +294,7 @@ def copy_to(target: NDArray[Any], source: NDArray[Any]) -> None:
 
 def kernel(function: Function) -> Function:
     """Compile a function of arrays and scalars on its first call; KernelCache keeps it between runs."""
-    dispatcher: Any = _compile_inline(function)  # Numba gives it no type
+    dispatcher: Any = _compile(function)  # Numba gives it no type
     if hasattr(dispatcher, "enable_caching"):  # not with NUMBA_DISABLE_JIT=1
         dispatcher._cache = KernelCache(function)
         KERNELS[dispatcher._cache.name] = dispatcher

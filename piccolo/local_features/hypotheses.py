@@ -104,13 +104,13 @@ def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scala
     """Return the cosine from a match's ray to its point; -1 below `cos_rough` or if the keypoint differs."""
     ray = rotate(R, minus(row(m.points, j), t))
     length = math.sqrt(dot(ray, ray))
-    cosine = dot(ray, m.rays[j]) / max(length, 1e-9)
+    cosine = dot(ray, row(m.rays, j)) / max(length, 1e-9)
     if cosine < cos_rough:
         return -1.0
     ratio = m.sizes[j] / (length * m.angles[j])
     if not 1.0 / SIZE_RATIO < ratio < SIZE_RATIO:
         return -1.0
-    return cosine if dot(m.ray_tangents[j], rotate(R, m.tangents[j])) > COS_TANGENT else -1.0
+    return cosine if dot(rotate(R, row(m.tangents, j)), row(m.ray_tangents, j)) > COS_TANGENT else -1.0
 
 
 @inline_kernel

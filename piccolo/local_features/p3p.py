@@ -69,14 +69,9 @@ def simple_cubic_root(b: float, c: float, d: float) -> float:
 @inline_kernel
 def adjugate(m: Array) -> Cofactors:
     """Return the six cofactors 00, 01, 02, 11, 12, 22 of a symmetric matrix (3, 3)."""
-    return (
-        m[1, 1] * m[2, 2] - m[1, 2] * m[1, 2],
-        m[0, 2] * m[1, 2] - m[0, 1] * m[2, 2],
-        m[0, 1] * m[1, 2] - m[0, 2] * m[1, 1],
-        m[0, 0] * m[2, 2] - m[0, 2] * m[0, 2],
-        m[0, 1] * m[0, 2] - m[0, 0] * m[1, 2],
-        m[0, 0] * m[1, 1] - m[0, 1] * m[0, 1],
-    )
+    a, b, c = m[0, 0], m[0, 1], m[0, 2]
+    d, e, f = m[1, 1], m[1, 2], m[2, 2]
+    return d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
 
 
 @inline_kernel
@@ -140,14 +135,14 @@ def split_conic(conic: Array, lines: Array) -> bool:
     conic[2, 0] -= scale * p[1]
     conic[1, 2] -= scale * p[0]
     conic[2, 1] += scale * p[0]
-    place = 0
-    for k in range(9):
-        if abs(conic[k // 3, k % 3]) > abs(conic[place // 3, place % 3]):
-            place = k
+    largest = 0.0
     for i in range(3):
-        lines[0, i] = conic[place // 3, i]
-        lines[1, i] = conic[i, place % 3]
-    largest: float = abs(conic[place // 3, place % 3])
+        for j in range(3):
+            if abs(conic[i, j]) > largest:
+                largest = abs(conic[i, j])
+                for k in range(3):
+                    lines[0, k] = conic[i, k]
+                    lines[1, k] = conic[k, j]
     return largest > 0.0
 
 
@@ -256,8 +251,8 @@ def p3p(bearings: Array, points: Array, rotations: Array, centers: Array) -> int
     b0 = bearings[i0]
     b1 = bearings[i1]
     b2 = bearings[i2]
-    e01 = minus(points[i1], points[i0])
-    e02 = minus(points[i2], points[i0])
+    e01 = minus(row(points, i1), row(points, i0))
+    e02 = minus(row(points, i2), row(points, i0))
     normal = cross(e01, e02)
     a01 = dot(e01, e01)
     a02 = dot(e02, e02)
@@ -272,21 +267,20 @@ def p3p(bearings: Array, points: Array, rotations: Array, centers: Array) -> int
     if not split_conic(conics[1 - other], work[2]):
         return 0
     count = 0
-    for k in range(4):
-        if k % 2 == 0:
-            num_met = meet(work[2, k // 2], conics[other], work[3])
-        d = work[3, k % 2]
-        if k % 2 >= num_met or not polish_distances(d, cosines, sides2):
-            continue
-        x, y, z = scale(math.sqrt(longest2), d)
-        d01 = minus(scale(y, b1), scale(x, b0))
-        d02 = minus(scale(z, b2), scale(x, b0))
-        R = rotations[count]
-        solve_triangle(d01, d02, e01, e02, R)
-        for i in range(3):
-            back = 0.0
-            for j in range(3):
-                back += R[j, i] * (x * b0[j] + y * b1[j] + z * b2[j])
-            centers[count, i] = (points[0, i] + points[1, i] + points[2, i] - back) / 3.0
-        count += 1
+    for n in range(2):
+        for k in range(meet(work[2, n], conics[other], work[3])):
+            d = work[3, k]
+            if not polish_distances(d, cosines, sides2):
+                continue
+            x, y, z = scale(math.sqrt(longest2), d)
+            d01 = minus(scale(y, b1), scale(x, b0))
+            d02 = minus(scale(z, b2), scale(x, b0))
+            R = rotations[count]
+            solve_triangle(d01, d02, e01, e02, R)
+            for i in range(3):
+                back = 0.0
+                for j in range(3):
+                    back += R[j, i] * (x * b0[j] + y * b1[j] + z * b2[j])
+                centers[count, i] = (points[0, i] + points[1, i] + points[2, i] - back) / 3.0
+            count += 1
     return count
