@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32
+from ..arrays import Array, Floats
 from ..kernels.jit import F0, Scalar, inline_kernel
 
 
@@ -22,7 +22,7 @@ class Cone(NamedTuple):
         """Return the axis (3,)."""
         return np.array(self[:3])
 
-    def turn(self, R_target_from_source: Array) -> "Cone":
+    def turn(self, R_target_from_source: Floats) -> "Cone":
         """Return the cone in another frame, given the rotation (3, 3)."""
         x, y, z = (float(value) for value in R_target_from_source @ self.axis)
         return Cone(x, y, z, self.cos_angle)
@@ -36,7 +36,7 @@ class Cone(NamedTuple):
 EVERYWHERE = Cone(1.0, 0.0, 0.0, -2.0)
 
 
-def cone_around(rays: Array | Array32) -> Cone:
+def cone_around(rays: Floats) -> Cone:
     """Return the cone around the mean of unit directions (N, 3) that holds them all; their own frame."""
     axis = rays.sum(axis=0, dtype=np.float64)
     axis /= max(float(np.linalg.norm(axis)), 1e-9)
@@ -52,4 +52,5 @@ def is_apart(cone: Cone, sine: np.float32, x: Scalar, y: Scalar, z: Scalar, radi
     """
     along = np.float32(cone.x) * x + np.float32(cone.y) * y + np.float32(cone.z) * z
     across = math.sqrt(max(x * x + y * y + z * z - along * along, F0))
-    return across * np.float32(cone.cos_angle) - along * sine > radius
+    beyond: bool = across * np.float32(cone.cos_angle) - along * sine > radius
+    return beyond

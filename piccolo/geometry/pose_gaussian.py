@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Array
+from ..arrays import Array, Floats
 from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
@@ -123,7 +123,7 @@ def differentiate(pose: Pose, other_from_cam: Pose) -> Array:
     return J
 
 
-def differentiate_rays(points_world: Array, pose: Pose) -> tuple[Array, Array]:
+def differentiate_rays(points_world: Floats, pose: Pose) -> tuple[Array, Array]:
     """Return unit rays (N, 3) to points (N, 3) in the camera's axes, and derivatives (N, 3, 6) by the pose.
 
     The pose turns about the camera's axes [rad] and moves along the world's [m]: a ray u to a point at

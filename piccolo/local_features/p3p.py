@@ -69,8 +69,12 @@ def simple_cubic_root(b: float, c: float, d: float) -> float:
 @inline_kernel
 def adjugate(m: Array) -> Cofactors:
     """Return the six cofactors 00, 01, 02, 11, 12, 22 of a symmetric matrix (3, 3)."""
-    a, b, c = m[0, 0], m[0, 1], m[0, 2]
-    d, e, f = m[1, 1], m[1, 2], m[2, 2]
+    a = m[0, 0]
+    b = m[0, 1]
+    c = m[0, 2]
+    d = m[1, 1]
+    e = m[1, 2]
+    f = m[2, 2]
     return d * f - e * e, c * e - b * f, b * e - c * d, a * f - c * c, b * c - a * e, a * d - b * b
 
 

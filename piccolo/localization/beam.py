@@ -10,6 +10,7 @@ import numpy as np
 
 from ..arrays import Array, Int64s
 from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
+from ..geometry.cone import Cone
 from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..kernels.jit import F0, kernel
@@ -19,7 +20,7 @@ from ..panorama.texels import Texels
 from ..views.candidate_views import SEARCH_VIEW, Views
 from ..views.view import ViewArrays
 from .comparison import compare, score_pose
-from .cone import Cone, find_cone, select_cells
+from .cone import find_cone, select_cells
 from .ladder import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage, climb, refine
 from .query import Query
 from .search import Starts, search_poses

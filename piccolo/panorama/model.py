@@ -88,7 +88,8 @@ def resize(panorama: Panorama, width: int) -> Panorama:
         return Panorama(*_resize_masked(panorama.rgb, panorama.is_valid, size))
     rgb = np.zeros((*size[::-1], 3), np.uint8)
     is_valid = np.zeros(size[::-1], np.bool_)
-    rows, columns = (_extent(panorama.is_valid.any(axis=axis), step) for axis in (1, 0))
+    rows = _extent(np.asarray(panorama.is_valid.any(axis=1)), step)
+    columns = _extent(np.asarray(panorama.is_valid.any(axis=0)), step)
     box = rows, columns
     shown = slice(rows.start * step, rows.stop * step), slice(columns.start * step, columns.stop * step)
     size = columns.stop - columns.start, rows.stop - rows.start
