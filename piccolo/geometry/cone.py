@@ -52,5 +52,4 @@ def is_apart(cone: Cone, sine: np.float32, x: Scalar, y: Scalar, z: Scalar, radi
     """
     along = np.float32(cone.x) * x + np.float32(cone.y) * y + np.float32(cone.z) * z
     across = math.sqrt(max(x * x + y * y + z * z - along * along, F0))
-    beyond: bool = across * np.float32(cone.cos_angle) - along * sine > radius
-    return beyond
+    return bool(across * np.float32(cone.cos_angle) - along * sine > radius)
