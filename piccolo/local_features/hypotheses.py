@@ -22,7 +22,7 @@ from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
 from ..panorama.texels import in_camera, pose_float32
-from .matching import LEAST_WEIGHT, Matches
+from .matching import Matches
 from .p3p import p3p
 
 COS_ROUGH = math.cos(math.radians(20.0))  # a match whose error is smaller agrees roughly
@@ -36,7 +36,6 @@ LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
 NUM_CLUSTERS = 48  # that are made exact, at most
-FIRST_CLUSTERS = 8  # of them, before the rest is chosen by the votes
 FAIR_PART = 0.2  # of the best pose's matches
 NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
@@ -349,16 +348,9 @@ def propose_poses(
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
     kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
-
-    def exact_ones(clusters: Int64s) -> list[MatchedPose]:
-        rough = [Pose(rotations[k], centers[k]) for k in clusters]
-        ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
-        return [end for end in ends if end]
-
-    found = exact_ones(kept[:FIRST_CLUSTERS])
-    least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
-    rest = kept[FIRST_CLUSTERS:]
-    found += exact_ones(rest[votes[rest] >= LEAST_WEIGHT * least])  # others hardly have so many matches
+    rough = [Pose(rotations[k], centers[k]) for k in kept]
+    ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
+    found = [end for end in ends if end]
     least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
     found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)
     R = np.array([f.pose.R_cam_from_world for f in found]).reshape(-1, 3, 3)
