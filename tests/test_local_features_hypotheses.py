@@ -59,9 +59,8 @@ def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin(pose, is_
     matches = matches._replace(query=np.repeat(np.arange(20, dtype=np.int32), 2))
     voters = np.arange(40)
     rotations, centers, votes = np.empty((40, 3, 3)), np.empty((40, 3)), np.empty(40)
-    columns = np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
     how = LEVEL if is_upright else np.eye(3), is_upright
-    rough_poses(matches, columns, voters, *how, rotations, centers, votes)
+    rough_poses(matches, voters, *how, rotations, centers, votes)
     np.testing.assert_allclose(centers[:30], np.tile(pose.center_world, (30, 1)), atol=1e-4)
     np.testing.assert_allclose(rotations[:30], np.tile(pose.R_cam_from_world, (30, 1, 1)), atol=2e-3)
     expected = [naive.votes(matches, *rough) for rough in zip(rotations, centers, strict=True)]

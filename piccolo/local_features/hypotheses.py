@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Int64s, Mask
+from ..arrays import Array, Array32, Int64s
 from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..geometry.vectors import cross, dot, minus, rotate, row
@@ -21,14 +21,11 @@ from ..kernels.jit import F0, Scalar, copy_to, inline_kernel, kernel
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
-from ..panorama.texels import in_camera, pose_float32
 from .matching import Matches
 from .p3p import p3p
 
 COS_ROUGH = math.cos(math.radians(20.0))  # a match whose error is smaller agrees roughly
 COS_EXACT = math.cos(math.radians(1.0))
-# in float32 first, and a little wider
-COS2_NEAR, COS2_CLOSE = (np.float32(math.cos(math.radians(angle)) ** 2) for angle in (20.1, 1.1))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
 COS_TILT = math.cos(math.radians(12.0))  # most angle between a pose's vertical and the known one
@@ -138,28 +135,12 @@ def write_turned(m: Matches, j: int, R: Array) -> None:
 
 
 @inline_kernel
-def find_near(points: Array32, rays: Array32, R: Array, t: Array, cos2: np.float32, is_near: Mask) -> None:
-    """Write the mask (M,) of the matches whose points (3, M) a pose puts near their rays (3, M).
-
-    This rules out most matches, in float32. The squared cosine `cos2` is a little below that of the exact
-    test, which follows in float64.
-    """
-    pose = pose_float32(R, t)
-    for i in range(points.shape[1]):
-        x, y, z = in_camera(points[0, i], points[1, i], points[2, i], pose)
-        along = x * rays[0, i] + y * rays[1, i] + z * rays[2, i]
-        is_near[i] = (along > F0) & (along * along >= cos2 * (x * x + y * y + z * z))
-
-
-@inline_kernel
-def agreeing_weight(m: Matches, is_near: Mask, R: Array, t: Array) -> Scalar:
+def agreeing_weight(m: Matches, R: Array, t: Array) -> Scalar:
     """Sum, over the photo's features, the largest weight of a match that roughly agrees with a pose."""
     total: Scalar = 0.0
     last = -1
     best = F0
     for i in range(len(m.query)):
-        if not is_near[i]:
-            continue
         if m.query[i] != last:
             total += best
             last = m.query[i]
@@ -172,7 +153,6 @@ def agreeing_weight(m: Matches, is_near: Mask, R: Array, t: Array) -> Scalar:
 @kernel
 def rough_poses(
     matches: Matches,
-    columns: tuple[Array32, Array32],
     voters: NDArray[np.intp],
     R_cam_from_level: Array,
     is_upright: bool,
@@ -182,11 +162,9 @@ def rough_poses(
 ) -> None:
     """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of all that agree.
 
-    `columns` are the matches' points and rays, transposed to (3, M). `is_upright`: the rotation is that of
-    `R_cam_from_level` (3, 3) but for the yaw.
+    `is_upright`: the rotation is that of `R_cam_from_level` (3, 3) but for the yaw.
     """
     m = matches
-    is_near = np.empty(len(m.query), np.bool_)
     for k in range(len(voters)):
         j = voters[k]
         distance = m.sizes[j] / max(m.angles[j], LEAST_ANGLE)
@@ -196,31 +174,27 @@ def rough_poses(
             write_upright(m, j, R_cam_from_level, rotations[k])
         else:
             write_turned(m, j, rotations[k])
-        find_near(columns[0], columns[1], rotations[k], centers[k], COS2_NEAR, is_near)
-        votes[k] = agreeing_weight(m, is_near, rotations[k], centers[k])
+        votes[k] = agreeing_weight(m, rotations[k], centers[k])
 
 
 @kernel
 def count_exact(
     matches: Matches,
     members: Int64s,
-    columns: Array32,
     rotations: Array,
     centers: Array,
     counts: Int64s,
 ) -> None:
     """Count for each pose (n, 3, 3), (n, 3) the photo's features that a member agrees with within a degree.
 
-    `columns` (6, m) are the members' points and rays; the counts (n,) are written.
+    The counts (n,) are written.
     """
-    is_near = np.empty(len(members), np.bool_)
     for n in range(len(counts)):
         count = 0
         last = -1
-        find_near(columns[:3], columns[3:], rotations[n], centers[n], COS2_CLOSE, is_near)
         for k in range(len(members)):
             j = members[k]
-            is_other = is_near[k] and matches.query[j] != last
+            is_other = matches.query[j] != last
             if is_other and agreement(matches, j, rotations[n], centers[n], COS_EXACT) > 0.0:
                 count += 1
                 last = matches.query[j]
@@ -258,38 +232,21 @@ def sample_poses(columns: Array32, up_cam: Array, cos_tilt: float, rotations: Ar
 
 @kernel
 def list_members(
-    matches: Matches,
-    columns: tuple[Array32, Array32],
-    R_cam_from_map: Array,
-    center_map: Array,
-    cos_rough: float,
-    members: Int64s,
+    matches: Matches, R_cam_from_map: Array, center_map: Array, cos_rough: float, members: Int64s
 ) -> int:
-    """Write the indices of the matches that agree with a pose; return their number.
-
-    `columns` as in `rough_poses`; the angle whose cosine is `cos_rough` is 20 degrees at most.
-    """
+    """Write the indices of the matches that agree with a pose; return their number."""
     count = 0
-    is_near = np.empty(len(matches.query), np.bool_)
-    find_near(columns[0], columns[1], R_cam_from_map, center_map, COS2_NEAR, is_near)
     for j in range(len(matches.query)):
-        if is_near[j] and agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
+        if agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
             members[count] = j
             count += 1
     return count
 
 
-def transpose_matches(matches: Matches) -> tuple[Array32, Array32]:
-    """Return the matches' points and rays, transposed to (3, M) each."""
-    return np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
-
-
 def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> Int64s:
     """Return the indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
-    R = pose.R_cam_from_world
-    t = pose.center_world
-    return members[: list_members(matches, transpose_matches(matches), R, t, cos_rough, members)]
+    return members[: list_members(matches, pose.R_cam_from_world, pose.center_world, cos_rough, members)]
 
 
 def count_matches(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) -> int:
@@ -308,7 +265,7 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
     rotations = np.empty((4 * NUM_SAMPLES, 3, 3))
     centers = np.empty((4 * NUM_SAMPLES, 3))
     counts = np.empty(sample_poses(columns, up_cam, cos_tilt, rotations, centers), np.int64)
-    count_exact(matches, members, columns, rotations, centers, counts)
+    count_exact(matches, members, rotations, centers, counts)
     if max(counts, default=0) < LEAST_MATCHES:
         return None
     best = np.argmax(counts)
@@ -337,13 +294,10 @@ def propose_poses(
     votes = np.empty(len(voters))
     is_upright = R_cam_from_level is not None
     level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
-    columns = transpose_matches(matches)
 
     def vote(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        rough_poses(
-            matches, columns, voters[part], level, is_upright, rotations[part], centers[part], votes[part]
-        )
+        rough_poses(matches, voters[part], level, is_upright, rotations[part], centers[part], votes[part])
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
