@@ -7,6 +7,7 @@ and Bolles, 1981) on those matches.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, Scalar, copy_to, inline_kernel, kernel
+from ..kernels.jit import F0, Scalar, inline_kernel, kernel
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
@@ -28,7 +29,6 @@ COS_ROUGH = math.cos(math.radians(20.0))  # a match whose error is smaller agree
 COS_EXACT = math.cos(math.radians(1.0))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
-COS_TILT = math.cos(math.radians(12.0))  # most angle between a pose's vertical and the known one
 LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
@@ -110,21 +110,6 @@ def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scala
 
 
 @inline_kernel
-def write_upright(m: Matches, j: int, R_cam_from_level: Array, R: Array) -> None:
-    """Write the rotation (3, 3) whose yaw takes the azimuth of a match's direction to that of its ray."""
-    L = R_cam_from_level
-    d = m.directions[j]
-    x, y, _ = rotate(L.T, m.rays[j])
-    per = 1.0 / max(math.sqrt((x * x + y * y) * (d[0] * d[0] + d[1] * d[1])), 1e-9)
-    c = (x * d[0] + y * d[1]) * per
-    s = (y * d[0] - x * d[1]) * per
-    for i in range(3):
-        R[i, 0] = L[i, 0] * c + L[i, 1] * s
-        R[i, 1] = L[i, 1] * c - L[i, 0] * s
-        R[i, 2] = L[i, 2]
-
-
-@inline_kernel
 def write_turned(m: Matches, j: int, R: Array) -> None:
     """Write the rotation (3, 3) that takes a match's direction and tangent to its ray and ray's tangent."""
     cam = (m.rays[j], m.ray_tangents[j], cross(m.rays[j], m.ray_tangents[j]))
@@ -152,28 +137,16 @@ def agreeing_weight(m: Matches, R: Array, t: Array) -> Scalar:
 
 @kernel
 def rough_poses(
-    matches: Matches,
-    voters: NDArray[np.intp],
-    R_cam_from_level: Array,
-    is_upright: bool,
-    rotations: Array,
-    centers: Array,
-    votes: Array,
+    matches: Matches, voters: NDArray[np.intp], rotations: Array, centers: Array, votes: Array
 ) -> None:
-    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of all that agree.
-
-    `is_upright`: the rotation is that of `R_cam_from_level` (3, 3) but for the yaw.
-    """
+    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of its votes."""
     m = matches
     for k in range(len(voters)):
         j = voters[k]
         distance = m.sizes[j] / max(m.angles[j], LEAST_ANGLE)
         for i in range(3):
             centers[k, i] = m.points[j, i] - distance * m.directions[j, i]
-        if is_upright:
-            write_upright(m, j, R_cam_from_level, rotations[k])
-        else:
-            write_turned(m, j, rotations[k])
+        write_turned(m, j, rotations[k])
         votes[k] = agreeing_weight(m, rotations[k], centers[k])
 
 
@@ -202,11 +175,10 @@ def count_exact(
 
 
 @kernel
-def sample_poses(columns: Array32, up_cam: Array, cos_tilt: float, rotations: Array, centers: Array) -> int:
+def sample_poses(columns: Array32, rotations: Array, centers: Array) -> int:
     """Write poses (n, 3, 3), (n, 3) of three matches each, at most 4 NUM_SAMPLES; return their number.
 
-    `columns` (6, m) are points and rays of the matches. Poses are left out if the cosine of the angle between
-    their vertical and `up_cam` (3,) is below `cos_tilt`. The samples are the same in every run.
+    `columns` (6, m) are points and rays of the matches. The samples are the same in every run.
     """
     num_poses = 0
     bearings = np.empty((3, 3))
@@ -219,14 +191,7 @@ def sample_poses(columns: Array32, up_cam: Array, cos_tilt: float, rotations: Ar
             for c in range(3):
                 points[i, c] = columns[c, drawn]
                 bearings[i, c] = columns[3 + c, drawn]
-        num_found = p3p(bearings, points, rotations[num_poses:], centers[num_poses:])
-        end = num_poses + num_found
-        for k in range(num_poses, end):
-            R = rotations[k]
-            if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] >= cos_tilt:
-                copy_to(rotations[num_poses], R)
-                copy_to(centers[num_poses], centers[k])
-                num_poses += 1
+        num_poses += p3p(bearings, points, rotations[num_poses:], centers[num_poses:])
     return num_poses
 
 
@@ -254,17 +219,15 @@ def count_matches(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) ->
     return len(np.unique(matches.query[find_inliers(matches, pose, cos_agree)]))
 
 
-def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) -> MatchedPose | None:
+def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
     """Return the pose that most matches near a rough one agree with, refined; None if they are too few."""
-    up_cam = np.array([0.0, 0.0, 1.0]) if R_cam_from_level is None else R_cam_from_level[:, 2].copy()
-    cos_tilt = -2.0 if R_cam_from_level is None else COS_TILT
     members = find_inliers(matches, rough, COS_ROUGH)
     if len(members) < LEAST_MATCHES:
         return None
     columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
     rotations = np.empty((4 * NUM_SAMPLES, 3, 3))
     centers = np.empty((4 * NUM_SAMPLES, 3))
-    counts = np.empty(sample_poses(columns, up_cam, cos_tilt, rotations, centers), np.int64)
+    counts = np.empty(sample_poses(columns, rotations, centers), np.int64)
     count_exact(matches, members, rotations, centers, counts)
     if max(counts, default=0) < LEAST_MATCHES:
         return None
@@ -277,33 +240,28 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
         rays = matches.rays[members].astype(np.float64)
         points = matches.points[members].astype(np.float64)
         descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
-    return MatchedPose(pose, count_matches(matches, pose)) if R[:, 2] @ up_cam >= cos_tilt else None
+    return MatchedPose(pose, count_matches(matches, pose))
 
 
-def propose_poses(
-    matches: Matches, R_cam_from_level: Array | None, count: int, workers: Workers
-) -> list[MatchedPose]:
+def propose_poses(matches: Matches, count: int, workers: Workers) -> list[MatchedPose]:
     """Return at most `count` poses that most matches agree with, best first, in the map's frame.
 
     Poses with less than FAIR_PART of the best one's matches are left out.
-    R_cam_from_level (3, 3) is the camera's tilt, None if it is unknown.
     """
     voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
     rotations = np.empty((len(voters), 3, 3))
     centers = np.empty((len(voters), 3))
     votes = np.empty(len(voters))
-    is_upright = R_cam_from_level is not None
-    level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
 
     def vote(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        rough_poses(matches, voters[part], level, is_upright, rotations[part], centers[part], votes[part])
+        rough_poses(matches, voters[part], rotations[part], centers[part], votes[part])
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
     kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
     rough = [Pose(rotations[k], centers[k]) for k in kept]
-    ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
+    ends = workers.map(partial(exact_pose, matches), rough, "sample")
     found = [end for end in ends if end]
     least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
     found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)

@@ -4,6 +4,7 @@ A first look by whole views finds most upright photos of the whole sphere, witho
 features show that a photo is mirrored, so the first look briefly searches its mirror image too.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -34,6 +35,7 @@ NUM_VERIFIED = 7  # alternatives of the best pose that are verified
 ENOUGH_MATCHES = 40  # of a part of the features: if the pose is sure, the others are not asked
 CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do: with more, the pose fitted to them is added
 NUM_MATCHED = 6  # poses from matches that are refined
+COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
 Poses = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
 # one search with its refinement, which adds to the known hypotheses
@@ -166,9 +168,11 @@ def match_poses(query: Query, watch: Stopwatch) -> list[Pose]:
         with watch.stage("prepare"):
             query.scan_map.features_now(query.workers)
     is_level = query.settings.gravity == "known" and (query.photo.has_tilt or not query.photo.is_partial)
-    level = query.photo.R_cam_from_level if is_level else None
+    up_cam = query.photo.R_cam_from_level[:, 2]
     with watch.stage("match"):
-        poses = [f.pose for f in propose_poses(query.matches, level, NUM_MATCHED, query.workers)]
+        poses = [f.pose for f in propose_poses(query.matches, NUM_MATCHED, query.workers)]
+    if is_level:
+        poses = [pose for pose in poses if pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
     if query.method.uses_search:
         return poses
     return [pose for pose in poses if not contradictions(query.scan_map, pose, query.settings.prior)]

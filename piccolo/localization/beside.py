@@ -116,7 +116,7 @@ def list_agreeing(
     own = scan_map.from_world(judged.pose)
     agreeing = []
     for other, turned in zip(found, matches, strict=True):
-        exact = exact_pose(turned, own, None)
+        exact = exact_pose(turned, own)
         if exact and exact.num_matches >= SURE_MATCHES and CONFIRMED.holds(exact.pose, own):
             agreeing.append(other._replace(matches=turned, pose=exact.pose))
     return agreeing
@@ -175,7 +175,7 @@ def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor,
     """
     name, picture = named
     matches = match_beside(query, picture.located)
-    found = propose_poses(matches, None, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
+    found = propose_poses(matches, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
     if not found or found[0].num_matches < SURE_MATCHES:
         return None
     return Neighbor(name, picture, matches, found[0].pose), found[0].num_matches

@@ -316,7 +316,7 @@ def search_mirrored(query: Query, mirrored: Query, pose: Pose) -> list[Hypothesi
     """
     if query.features:
         matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
-        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, None, 1, query.workers)])
+        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, 1, query.workers)])
     yaws = uniform_yaws(query.settings.num_yaws)
     tilt = ACROSS @ pose.R_cam_from_world @ ACROSS
     asked = mirrored.with_rotations(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))

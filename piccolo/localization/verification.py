@@ -90,7 +90,7 @@ def verify(query: Query, pose: Pose) -> Verified:
     the one picture with which most agree are counted. A wrong pose of a photo beside misleads this one.
     """
     pictures = [matches_near(query, pose), *query.beside]
-    found = exact_pose(merge_matches(pictures), pose, None)
+    found = exact_pose(merge_matches(pictures), pose)
     if found is None:
         return Verified(pose, 0)
     return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
@@ -129,7 +129,7 @@ def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
     keypoints = find_all_drawn(query, pose).keypoints
 
     def is_copy(other: Pose) -> bool:
-        found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other, None)
+        found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other)
         return found is not None and CONFIRMED.holds(found.pose, other)
 
     return query.workers.map(is_copy, others, "compare places")
