@@ -246,7 +246,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
-        images = make_images(retake(*change), query.method.scales)
+        images = make_images(retake(*change), query.photo.scales)
         full = images.full()
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
         near = pose if is_near else descend(fine, images.fine(), pose, FINE.limits)
@@ -379,7 +379,7 @@ def recalibrate(query: Query, change: Array) -> Query:
     before = given.cameras[0]
     after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
-    fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
+    fresh = prepare_query(taken, query.scan_map, query.settings, query.workers)
     features = tuple(Once(_turn_features, part, before, after) for part in query.features)
     beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in query.beside)
     found = replace(fresh, features=features, beside=beside)

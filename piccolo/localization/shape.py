@@ -58,7 +58,7 @@ def find_tilts(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) 
     for axis in axes:
         x, y, z = -axis
         source = replace(query.source, gpano=attitude_of_gravity((float(x), float(y), float(z))))
-        turned = prepare_query(source, query.scan_map, query.settings, query.workers, query.method)
+        turned = prepare_query(source, query.scan_map, query.settings, query.workers)
         tried.append(align_level(turned, axes, yaw_of_walls))
     scores = []
     for one in tried:

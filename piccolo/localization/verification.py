@@ -33,6 +33,7 @@ TURN = 0.05  # [rad] and at rotation vectors on one of this
 AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))
+CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
 SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do
 MOST_RIVALS = 4  # of a whole photo, at each of which four pictures are drawn
 RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
