@@ -86,7 +86,9 @@ def localize_beside(
     with watch.stage("match"):
         query = prepare_query(panorama, allowed_map, settings, workers)
         is_asked = query.is_narrow and len(allowed_map.sparse) > 0
-        found = find_beside(query, pictures) if is_asked else []
+        asked = list(pictures.items()) if is_asked else []
+        matched = filter(None, workers.map(partial(match_picture, query), asked, "match"))
+        found = [other for other, _ in sorted(matched, key=lambda pair: -pair[1])[:MOST_BESIDE]]
     if not found:
         return Localization(), ()
     with watch.stage("refine"):
@@ -158,14 +160,6 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
     squares = np.square(rays - matches.rays[agreeing]).sum()
     variance = max(squares / max(2 * len(rays) - 6, 1), LEAST_ERROR**2)
     return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
-
-
-def find_beside(query: Query, pictures: Mapping[str, SurePhoto]) -> list[Neighbor]:
-    """Find the photos that show what a photo shows, those with the most matches first."""
-    compared = query.workers.map(partial(match_picture, query), list(pictures.items()), "match")
-    found = [pair for pair in compared if pair]
-    ranked = sorted(found, key=lambda pair: -pair[1])
-    return [other for other, _ in ranked[:MOST_BESIDE]]
 
 
 def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor, int] | None:
