@@ -62,8 +62,14 @@ def compare_occlusion(points: PackedPoints, panorama: Panorama, pose: Pose) -> O
     of_photo = opponent_channels(small.rgb.astype(np.float32) / np.float32(255.0))
     of_scan = opponent_channels(view.rgb)
     shared = weight = is_shared.astype(np.float32)
+    difference = np.empty_like(weight)
+    is_seen = is_shared[..., None]
     for _ in range(NUM_ROUNDS):
-        difference = _squared_difference(of_photo, of_scan, is_shared, weight)
+        photo, scan = (_statistics(c, weight) for c in (of_photo, of_scan))
+        contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
+        low = _extreme(np.where(is_seen, contrast, np.float32(9.0)), cv2.erode)
+        high = _extreme(np.where(is_seen, contrast, np.float32(-9.0)), cv2.dilate)
+        write_squares(of_photo, photo, scan, low, high, difference)
         weight = np.asarray(shared / (1.0 + difference / CONTRADICTING) ** 2, np.float32)
     is_compared = small.is_valid & _extreme(is_shared.view(np.uint8), cv2.dilate).astype(bool)
     return Occlusion(small.is_valid, is_compared, is_compared & (difference > CONTRADICTING))
@@ -99,27 +105,13 @@ def occlusion_mask(points: PackedPoints, panorama: Panorama, pose: Pose) -> Byte
     return mask
 
 
-def _squared_difference(of_photo: Array32, of_scan: Array32, is_shared: Mask, weight: Array32) -> Array32:
-    """Return the squared differences (H, W) of the photo's contrast from the scan's range within one cell.
-
-    An edge that is displaced by less than a cell, or blurred, makes no difference.
-    """
-    photo, scan = (_statistics(c, weight) for c in (of_photo, of_scan))
-    contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
-    is_seen = is_shared[..., None]
-    low = _extreme(np.where(is_seen, contrast, np.float32(9.0)), cv2.erode)
-    high = _extreme(np.where(is_seen, contrast, np.float32(-9.0)), cv2.dilate)
-    squares = np.empty(is_shared.shape, np.float32)
-    write_squares(of_photo, photo, scan, low, high, squares)
-    return squares
-
-
 @kernel
 def write_squares(
     channels: Array32, photo: Array32, scan: Array32, low: Array32, high: Array32, squares: Array32
 ) -> None:
     """Write the squared distances (H, W) of the photo's contrast from a range (H, W, 3), `low` to `high`.
 
+    The range is that of the scan within one cell, so that an edge displaced by less makes no difference.
     They are summed over the photo's channels (H, W, 3), normalised by its statistics (H, W, 6). In flat
     surroundings, of the photo or of the scan (H, W, 6), they count less.
     """

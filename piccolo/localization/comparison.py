@@ -21,7 +21,7 @@ from ..panorama.texels import CHUNK, Texels, make_chunk, project, sample
 from ..views.points_around import round_position
 from ..views.view import ViewArrays, ViewConfig, average_colors, cell_statistics, empty_cells, locate
 from .query import Query
-from .settings import DRAWN_VIEW, VIEWS
+from .settings import VIEWS
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
 DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
@@ -193,13 +193,6 @@ def compare(query: Query, pose: Pose, config: ViewConfig = FINE_VIEW) -> Compari
     if key not in kept:
         kept[key] = compare_from(query, pose, pose, config)
     return kept[key]
-
-
-def score_drawn(query: Query, pose: Pose) -> float | None:
-    """Score a pose by the edges drawn there, in a scan without colours; else None."""
-    if query.evidence != "shape":
-        return None
-    return compare(query, pose, DRAWN_VIEW).score_beyond(DRAWN_CHANCE)
 
 
 def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:

@@ -162,7 +162,9 @@ def prepare_query(
 ) -> Query:
     """Prepare a panorama for the search in a map; the photo may give the camera's tilt."""
     source = panorama
-    R_cam_from_level, has_tilt = find_tilt(panorama)
+    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
+    has_tilt = R_level_from_cam is not None
+    R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
     scales = SHAPE_SCALES if scan_map.has_shape else ImageScales()
@@ -191,12 +193,6 @@ def make_views(scan_map: ScanMap) -> RecentViews:
     # leaves have narrow edges, which only the last descent is near enough to
     averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
     return RecentViews(scan_map.octree, averaged)
-
-
-def find_tilt(panorama: Panorama) -> tuple[Array, bool]:
-    """Return R_cam_from_level (3, 3) of a camera, and True if the photo gives its tilt."""
-    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
-    return (np.eye(3), False) if R_level_from_cam is None else (R_level_from_cam.T, True)
 
 
 def find_features(

@@ -9,9 +9,10 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
-from .comparison import compare, score_drawn
+from .comparison import DRAWN_CHANCE, compare
 from .prior import contradictions
 from .query import Query
+from .settings import DRAWN_VIEW
 from .verification import SURE_MATCHES, count_each
 
 MAX_COMPARED = 8  # alternatives of the best pose
@@ -67,11 +68,10 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     for h, wrong, count in zip(hypotheses, is_wrong, counts, strict=True):
         num_matches = count if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
-        has_few_blocks = query.evidence == "shape" and query.photo.is_partial
-        # and chance explains more of them
-        part = math.sqrt(query.photo.small.valid_share) if has_few_blocks else 1.0
-        drawn = score_drawn(query, h.pose)
-        drawn = None if drawn is None else part * drawn
+        is_shape = query.evidence == "shape"
+        # of few blocks chance explains more
+        part = math.sqrt(query.photo.small.valid_share) if is_shape and query.photo.is_partial else 1.0
+        drawn = compare(query, h.pose, DRAWN_VIEW).score_beyond(DRAWN_CHANCE) * part if is_shape else None
         standings.append(Standing(1.0, part * h.score, num_matches, query.evidence, of_prior, drawn))
     return standings
 
