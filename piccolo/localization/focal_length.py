@@ -35,7 +35,7 @@ from .last_descent import refine_best
 from .photo import make_images
 from .query import Features, Query, prepare_query
 from .selection import Selection
-from .verification import matches_near
+from .verification import SURE_MATCHES, matches_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
@@ -51,7 +51,6 @@ END_DEVIATION = 0.05  # of a minimum that lies there or beyond
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 STEP = 1e-4  # [rad, m] with which that is differentiated
 AGREES = 0.25  # least weight of a match that agrees
-ENOUGH_AGREEING = 12  # fewer tell nothing
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
 CLEARLY = 2.5  # deviations by which matches must tell another one
@@ -339,7 +338,7 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         rays = offsets / np.linalg.norm(offsets, axis=1, keepdims=True)
         return np.asarray(rays - find_rays(float(delta[6])))
 
-    if len(matches.rays) < ENOUGH_AGREEING:
+    if len(matches.rays) < SURE_MATCHES:
         return 0.0, 0.0, pose
     known: tuple[float, float, Pose] | None = query.cache.fits.get(pose.key)
     if known is not None:
@@ -355,7 +354,7 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         delta -= inverse @ slopes.sum(axis=0)
         delta[6] = np.clip(delta[6], -1.0, 1.0)  # the focal length stays one
     variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
-    is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(delta[6]) < LIMIT
+    is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(delta[6]) < LIMIT
     fit = float(delta[6]), is_known / variance, move(delta)
     query.cache.fits[pose.key] = fit
     return fit

@@ -52,7 +52,6 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
         "CHANCE_MATCHES",
         "COS_AGREE",
         "DISTINCT_RATIO",
-        "MOST_RIVALS",
         "RIVAL_SCORE",
         "SURE_MATCHES",
     ),
