@@ -127,9 +127,10 @@ def prepare_run(arguments: Arguments) -> Run:
 
 def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
-    if localizer.priors and (names := localizer.priors.names_without_panorama):
+    priors = localizer.priors
+    if priors and (names := [name for name in priors.by_name if name not in priors.used]):
         note = f"{len(names)} names without a photo, such as {names[0]}"
-        arguments.note(f"warning: {localizer.priors.path}: {note}")
+        arguments.note(f"warning: {priors.path}: {note}")
 
 
 def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
