@@ -16,20 +16,22 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..arrays import Array, Array32
+from ..arrays import Array, Array32, Mask
 from ..camera import Mount
 from ..camera.model import MODELS, RADIAL
 from ..confidence.focal_length import WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, exp_so3, rotate_points
 from ..geometry.pose_gaussian import subtract
+from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
 from ..local_features.matching import NO_MATCHES
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.normal_equations import LOSS
 from ..panorama import Panorama
+from ..views.view import Cells
 from .comparison import compare, mask_occluders, score_pose
-from .covariance import SCALE, remove_hidden, remove_poles, sort_by_block, sum_by_block
+from .covariance import SCALE, remove_poles, sort_by_block, sum_by_block
 from .ladder import FINE, LAST, descend, to_levels
 from .last_descent import refine_best
 from .photo import make_images
@@ -234,10 +236,9 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
         return replace(found, is_valid=found.is_valid & is_left)
 
     narrowest = retake(*changes.max(axis=0)).is_valid
-    inner = cv2.erode(narrowest.view(np.uint8), np.ones((EDGE, EDGE), np.uint8)) > 0
-    points = remove_hidden(shown.view_at(pose, "points").around(pose.center_world), inner, pose)
+    points = mask_edge(shown.view_at(pose, "points"), pose, narrowest)
     fine = shown.view_at(pose, "fine")
-    around, begins = sort_by_block(remove_poles(points, pose))
+    around, begins = sort_by_block(remove_poles(points.around(pose.center_world), pose))
     levels = to_levels(around.channels)
     middle = changes.mean(axis=0)
 
@@ -253,6 +254,15 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
 
     ends = query.workers.map(end_with, list(changes), "fit the focal length")
     return np.array([losses for _, losses in ends]), [end for end, _ in ends]
+
+
+def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
+    """Remove the points near the edge of what a photo (H, W) shows."""
+    inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
+    offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
+    rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
+    is_kept = inner[compute_indices(rays, is_valid.shape[1])] > 0
+    return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
 def fit_minimum(changes: Array, losses: Array, poses: Sequence[Pose], pose: Pose) -> Minimum:
