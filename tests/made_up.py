@@ -11,9 +11,9 @@ from piccolo.jobs.threads import Once, Workers
 from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import last_descent, selection
-from piccolo.localization.comparison import Comparison
+from piccolo.localization.comparison import FINE_VIEW, Comparison
 from piccolo.localization.query import Cache, Features, Query
-from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.optimize.channel_loss import CHANCE
 
 WHOLE = SimpleNamespace(is_partial=False, has_tilt=False)  # photos, of which nothing else is asked
@@ -30,7 +30,6 @@ QUERY = Query(
     scan_map=SimpleNamespace(octree=None, to_world=lambda pose: pose, has_shape=False),
     settings=CoarseToFineSettings(),
     workers=Workers(1),
-    method=METHOD,
     features=(NO_FEATURES, NO_FEATURES),
     evidence="drawn scan",
     cache=Cache(VIEWS),
@@ -64,5 +63,5 @@ def compared(monkeypatch, explains, counts):
 
     for module in (selection, last_descent):
         monkeypatch.setattr(module, "count_each", count_each)
-    known = {(at(x, 0.0).pose.key, None): seen(part) for x, part in explains.items()}
+    known = {(at(x, 0.0).pose.key, FINE_VIEW): seen(part) for x, part in explains.items()}
     return replace(QUERY, cache=Cache(VIEWS, known))

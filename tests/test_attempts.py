@@ -16,7 +16,7 @@ from piccolo.localization import attempts, beam, localize as method, query
 from piccolo.localization.photo import ACROSS
 from piccolo.localization.search import search_poses
 from piccolo.localization.selection import is_clear
-from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.verification import Verified
 from piccolo.panorama import GPano
 from piccolo.photo import Prior
@@ -159,6 +159,11 @@ def test_a_brief_search_keeps_what_little_a_prior_leaves():
     assert 0.3 < len(attempts.thin_query(asked).scan_map.sparse) / len(whole.sparse) < 0.7
 
 
+def _name_attempts(query):
+    found = attempts.plan_attempts(query)
+    return [(len(by.features), getattr(run, "__name__", None) or run.keywords) for by, run in found]
+
+
 LOOK = (0, "look_first")
 HALF = (1, "search_part")
 ALL = (2, "search_matches")
@@ -171,30 +176,30 @@ TILTED = (2, {"tilts": "any", "is_brief": False})
 
 
 @pytest.mark.parametrize(
-    ("photo", "gravity", "parts", "expected"),
+    ("photo", "gravity", "expected"),
     [
-        (WHOLE, "auto", {}, [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (WHOLE, "known", {}, [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
-        (WHOLE, "unknown", {}, [HALF, ALL, TILTED]),
-        (TILTED_WHOLE, "auto", {}, [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
-        (PARTIAL, "auto", {}, [HALF, ALL, ABOUT_LEVEL, TILTED]),
-        (PARTIAL, "known", {}, [HALF, ALL, ABOUT_LEVEL]),
-        (PARTIAL, "unknown", {}, [HALF, ALL, ABOUT_LEVEL, TILTED]),
-        (TILTED_PARTIAL, "auto", {}, [HALF, ALL, UPRIGHT, TILTED]),
-        (TILTED_PARTIAL, "known", {}, [HALF, ALL, UPRIGHT]),
-        (WHOLE, "auto", {"uses_features": False}, [UPRIGHT, TILTED]),
-        (PARTIAL, "auto", {"uses_features": False}, [ABOUT_LEVEL, TILTED]),
-        (WHOLE, "auto", {"uses_search": False}, [HALF, ALL]),
-        (PARTIAL, "auto", {"uses_search": False}, [HALF, ALL]),
+        (WHOLE, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
+        (WHOLE, "known", [LOOK, DRAWN, FIRST_UPRIGHT, HALF, ALL]),
+        (WHOLE, "unknown", [HALF, ALL, TILTED]),
+        (TILTED_WHOLE, "auto", [LOOK, DRAWN, FIRST_UPRIGHT, FIRST_TILTED, HALF, ALL]),
+        (PARTIAL, "auto", [HALF, ALL, ABOUT_LEVEL, TILTED]),
+        (PARTIAL, "known", [HALF, ALL, ABOUT_LEVEL]),
+        (PARTIAL, "unknown", [HALF, ALL, ABOUT_LEVEL, TILTED]),
+        (TILTED_PARTIAL, "auto", [HALF, ALL, UPRIGHT, TILTED]),
+        (TILTED_PARTIAL, "known", [HALF, ALL, UPRIGHT]),
     ],
 )
-def test_attempts_are_made_in_this_order(photo, gravity, parts, expected):
+def test_attempts_are_made_in_this_order(photo, gravity, expected):
     """Photos of a part of the sphere are searched about level, unless their tilt is known."""
     settings = CoarseToFineSettings(gravity=gravity)
-    query = replace(QUERY, photo=photo, method=METHOD._replace(**parts), settings=settings)
-    found = attempts.plan_attempts(query)
-    named = [(len(by.features), getattr(run, "__name__", None) or run.keywords) for by, run in found]
-    assert named == expected
+    query = replace(QUERY, photo=photo, settings=settings)
+    assert _name_attempts(query) == expected
+
+
+@pytest.mark.parametrize(("photo", "upright"), [(WHOLE, "known"), (PARTIAL, "level")])
+def test_without_features_of_the_map_whole_views_are_searched_alone(photo, upright):
+    query = replace(QUERY, photo=photo, features=())
+    assert _name_attempts(query) == [(0, {"tilts": upright}), (0, {"tilts": "any", "is_brief": False})]
 
 
 @pytest.mark.parametrize(("sure", "num_made"), [(1, 1), (2, 2), (None, 3)])
@@ -245,11 +250,11 @@ def test_half_of_the_features_count_where_these_leave_no_doubt(
 
 @pytest.mark.parametrize(
     ("photo", "expected"),
-    [(PARTIAL, [*range(9), 1.5]), (TILTED_PARTIAL, [*range(9), 1.5]), (WHOLE, range(9))],
+    [(PARTIAL, [*range(10), 1.5]), (TILTED_PARTIAL, [*range(10), 1.5]), (WHOLE, range(10))],
 )
 def test_poses_of_a_part_of_the_sphere_are_verified(monkeypatch, photo, expected):
-    """The best and seven alternatives; what matches more than chance does is added, scored where it went."""
-    num_matches = {0.0: 6, 1.0: 7, 8.0: 99}
+    """The best and eight alternatives; what matches more than chance does is added, scored where it went."""
+    num_matches = {0.0: 6, 1.0: 7, 9.0: 99}
     asked = []
     scored = []
 
@@ -259,11 +264,11 @@ def test_poses_of_a_part_of_the_sphere_are_verified(monkeypatch, photo, expected
 
     monkeypatch.setattr(attempts, "verify", verify)
     monkeypatch.setattr(attempts, "score_pose", lambda _, pose: scored.append(place(pose)) or at(1.5, 0.7))
-    known = [at(k, 0.9 - 0.1 * k) for k in range(9)]
+    known = [at(k, 0.9 - 0.05 * k) for k in range(10)]
     query = replace(QUERY, photo=photo)
     found = attempts.add_verified(query, known)
     assert places(found) == list(expected)
-    assert found[:9] == known
-    assert asked == (list(range(8)) if photo.is_partial else [])
+    assert found[:10] == known
+    assert asked == (list(range(9)) if photo.is_partial else [])
     assert scored == ([1.5] if photo.is_partial else [])
     assert attempts.add_verified(query, []) == []

@@ -73,7 +73,7 @@ def test_the_covariance_of_matches_is_that_of_poses_found_by_them(noise, count):
     squares = []
     for _ in range(100):
         matches = _matches_of(true, noise, rng, count)
-        found = exact_pose(matches, true, None).pose
+        found = exact_pose(matches, true).pose
         step = subtract(true, found)
         squares.append(step @ np.linalg.solve(match_covariance(matches, found), step))
     assert 3.0 < np.median(squares) < 9.0  # of 6 parameters 5.3

@@ -10,7 +10,7 @@ from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
-from piccolo.localization.settings import METHOD
+from piccolo.localization.settings import VIEWS
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
 from piccolo.views import candidate_views, points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
@@ -106,7 +106,7 @@ def test_views_have_the_same_bits_for_any_number_of_threads(render, count):
         np.testing.assert_array_equal(a, b)
 
 
-FINE, FULL = METHOD.fine_view, METHOD.full_view
+FINE, FULL = VIEWS["fine"], VIEWS["points"]
 FINE_CELLS = np.ones(len(make_grid(FINE.num_rings)), bool)
 
 

@@ -216,5 +216,5 @@ def test_the_mirrored_photo_is_searched_as_thoroughly_as_its_own_pose_needs(monk
     judging.search_mirrored(query, query.mirror(), _clean()[1])
     ((by, beam),) = asked
     assert (by.settings.max_starts < query.settings.max_starts) == is_brief
-    assert (beam != query.method.beam) == is_brief
+    assert (beam != query.beam) == is_brief
     assert len(by.rotations) == 2 * query.settings.num_yaws

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rooms
 
-from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
@@ -49,59 +49,45 @@ def _exact_matches(pose, count, num_wrong=0, seed=0):
 
 
 POSE = Pose(exp_so3(np.array([0.3, -0.8, 1.9])), np.array([0.4, -0.2, 0.3]))
-LEVEL = exp_so3(np.array([0.2, -0.4, 0.0]))  # R_cam_from_level
-TILTED = Pose(LEVEL @ yaw_rotation(2.2), np.array([0.4, -0.2, 0.3]))
 
 
-@pytest.mark.parametrize(("pose", "is_upright"), [(POSE, False), (TILTED, True)])
-def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin(pose, is_upright):
-    matches = _exact_matches(pose, 40, num_wrong=10)
+def test_one_exact_match_gives_the_pose_and_its_votes_equal_their_twin():
+    matches = _exact_matches(POSE, 40, num_wrong=10)
     matches = matches._replace(query=np.repeat(np.arange(20, dtype=np.int32), 2))
     voters = np.arange(40)
     rotations, centers, votes = np.empty((40, 3, 3)), np.empty((40, 3)), np.empty(40)
-    columns = np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
-    how = LEVEL if is_upright else np.eye(3), is_upright
-    rough_poses(matches, columns, voters, *how, rotations, centers, votes)
-    np.testing.assert_allclose(centers[:30], np.tile(pose.center_world, (30, 1)), atol=1e-4)
-    np.testing.assert_allclose(rotations[:30], np.tile(pose.R_cam_from_world, (30, 1, 1)), atol=2e-3)
+    rough_poses(matches, voters, rotations, centers, votes)
+    np.testing.assert_allclose(centers[:30], np.tile(POSE.center_world, (30, 1)), atol=1e-4)
+    np.testing.assert_allclose(rotations[:30], np.tile(POSE.R_cam_from_world, (30, 1, 1)), atol=2e-3)
     expected = [naive.votes(matches, *rough) for rough in zip(rotations, centers, strict=True)]
     np.testing.assert_allclose(votes, expected)
     assert votes[:30].min() > votes[30:].max()
 
 
-@pytest.mark.parametrize("R_cam_from_level", [None, LEVEL])
-def test_the_pose_is_found_among_wrong_matches(R_cam_from_level):
-    matches = _exact_matches(TILTED, 60, num_wrong=40)
-    found = propose_poses(matches, R_cam_from_level, 6, Workers())
+def test_the_pose_is_found_among_wrong_matches():
+    matches = _exact_matches(POSE, 60, num_wrong=40)
+    found = propose_poses(matches, 6, Workers())
     assert found[0].num_matches >= 20
-    assert rooms.errors(found[0].pose, TILTED)[0] < 1e-4
+    assert rooms.errors(found[0].pose, POSE)[0] < 1e-4
     assert all(one.num_matches <= 6 for one in found[1:])
-    assert count_matches(matches, TILTED) == found[0].num_matches
-    elsewhere = Pose(TILTED.R_cam_from_world, TILTED.center_world + np.array([2.0, 0.0, 0.0]))
+    assert count_matches(matches, POSE) == found[0].num_matches
+    elsewhere = Pose(POSE.R_cam_from_world, POSE.center_world + np.array([2.0, 0.0, 0.0]))
     assert count_matches(matches, elsewhere) < 4
 
 
-def test_a_pose_off_the_known_vertical_is_none():
-    matches = _exact_matches(POSE, 30)
-    assert exact_pose(matches, POSE, None).num_matches == 30
-    near = exp_so3(np.array([0.1, 0.1, 0.0])) @ POSE.R_cam_from_world
-    off = exp_so3(np.array([0.5, 0.5, 0.0])) @ POSE.R_cam_from_world
-    assert exact_pose(matches, POSE, near).num_matches == 30
-    assert exact_pose(matches, POSE, off) is None
-    assert exact_pose(_exact_matches(POSE, 3), POSE, None) is None
+def test_the_pose_of_too_few_matches_is_none():
+    assert exact_pose(_exact_matches(POSE, 30), POSE).num_matches == 30
+    assert exact_pose(_exact_matches(POSE, 3), POSE) is None
 
 
-@pytest.mark.parametrize(
-    ("variant", "is_known"), [("clean", True), ("clean", False), ("tilt", False), ("photo", True)]
-)
-def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant, is_known):
+@pytest.mark.parametrize("variant", ["clean", "tilt", "photo"])
+def test_a_photo_is_found_in_its_room_with_the_same_bits_for_any_threads(variant):
     query = _query(1, variant)
-    level = query.photo.R_cam_from_level if is_known else None
-    found = propose_poses(query.matches, level, 6, Workers(2))
+    found = propose_poses(query.matches, 6, Workers(2))
     rooms.assert_near(found[0].pose, _true_pose(1, variant), 0.05, 1.0)
     assert found[0].num_matches >= 12
     assert [one.num_matches for one in found] == sorted((one.num_matches for one in found), reverse=True)
-    alone = propose_poses(query.matches, level, 6, Workers(1))
+    alone = propose_poses(query.matches, 6, Workers(1))
     for one, other in zip(found, alone, strict=True):
         assert one.pose.key == other.pose.key
         assert one.num_matches == other.num_matches
@@ -111,11 +97,10 @@ def test_noise_has_no_pose_that_many_matches_agree_with():
     rgb = np.random.default_rng(9).integers(0, 256, (256, 512, 3)).astype(np.uint8)
     panorama, scan_map = rooms.as_panorama(rgb), rooms.scan_map(1)
     query = rooms.ask(panorama, scan_map)
-    for level in (None, np.eye(3)):
-        found = propose_poses(query.matches, level, 6, Workers(2))
-        assert max([0, *(one.num_matches for one in found)]) < 8
+    found = propose_poses(query.matches, 6, Workers(2))
+    assert max([0, *(one.num_matches for one in found)]) < 8
     flat = rooms.ask(rooms.as_panorama(np.full_like(rgb, 90)), scan_map)
-    assert propose_poses(flat.matches, None, 6, Workers(2)) == []
+    assert propose_poses(flat.matches, 6, Workers(2)) == []
 
 
 def test_poses_that_contradict_a_prior_are_told():

@@ -13,7 +13,7 @@ from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
 from piccolo.localization.photo import make_images
-from piccolo.localization.settings import METHOD, CoarseToFineSettings
+from piccolo.localization.settings import CoarseToFineSettings, ImageScales
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
@@ -43,7 +43,7 @@ def test_what_is_masked_does_not_bleed():
     is_valid[200:] = False
     black, white = panorama.rgb.copy(), panorama.rgb.copy()
     black[200:], white[200:] = 0, 255
-    black_and_white = (make_images(Panorama(rgb, is_valid), METHOD.scales).search() for rgb in (black, white))
+    black_and_white = (make_images(Panorama(rgb, is_valid), ImageScales()).search() for rgb in (black, white))
     (a, valid), (b, _) = map(_levels, black_and_white)
     np.testing.assert_array_equal(a[valid], b[valid])
     assert valid.mean() == pytest.approx(200 / 256, abs=0.02)
@@ -224,12 +224,12 @@ def test_heading_is_the_worlds_where_the_map_was_levelled(tilts):
 
 
 @pytest.mark.parametrize(("fewest", "most", "expected"), [(150, 4000, 150), (150, 20, 20), (1, 4000, None)])
-def test_number_of_starts(fewest, most, expected):
+def test_number_of_starts(monkeypatch, fewest, most, expected):
     """One for every two candidates that are searched, but not fewer and not more than asked for."""
     query = _query()
-    method = query.method._replace(min_starts=fewest)
+    monkeypatch.setattr(search, "MIN_STARTS", fewest)
     settings = dataclasses.replace(query.settings, max_starts=most)
-    few = dataclasses.replace(query, method=method, settings=settings)
+    few = dataclasses.replace(query, settings=settings)
     for tilts in ("known", "any"):
         starts = search.search_poses(few, tilts)
         num_searched = len(query.scan_map.sparse)

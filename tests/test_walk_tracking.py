@@ -11,10 +11,10 @@ from piccolo.confidence.confidence import log_odds
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
 from piccolo.localization import ladder, near, verification
-from piccolo.localization.attempts import CHANCE_MATCHES
 from piccolo.localization.beam import brief_query, score_briefly, score_mirror
 from piccolo.localization.comparison import Comparison, score_pose
 from piccolo.localization.near import Near
+from piccolo.localization.verification import CHANCE_MATCHES
 from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, Motion, State

@@ -201,11 +201,6 @@ class PriorTable:
             except InputError as error:
                 raise InputError(str(error).replace("`within`", f"{self.path}: within, of {name}")) from error
 
-    @property
-    def names_without_panorama(self) -> list[str]:
-        """Names in the table that no panorama has had."""
-        return [name for name in self.by_name if name not in self.used]
-
 
 def _row_from(row: Mapping[str, float], within: tuple[str, ...], general: Prior) -> Row:
     """Return a row of numbers and names; `general` fills what they leave open."""

@@ -113,7 +113,11 @@ def read_odometry(
         rows = _rows(path)
         is_kitti = all(len(row) == NUM_KITTI for row in rows)
         with naming(path, ODOMETRY):
-            poses = [read_kitti_row(row) for row in rows] if is_kitti else _read_tum(path, rows)
+            if is_kitti:  # T_world_from_cam, camera axes right, down, forward
+                matrices = np.array(rows, float).reshape(-1, 3, 4)
+                poses = [("", check_transform(T, "a row", OPTICAL_FROM_CAM)) for T in matrices]
+            else:
+                poses = _read_tum(path, rows)
             clock = np.array([] if is_kitti else [row[0] for row in rows], float)
         numbers = match_times(clock, np.array(times, float), has_clock, len(poses) == len(frames))
         found = [None if k is None else poses[k][1] for k in numbers]
@@ -156,11 +160,6 @@ def _read_tum(path: Path, rows: Sequence[Sequence[str]]) -> list[NamedPose]:
     return poses
 
 
-def read_kitti_row(row: Sequence[str]) -> NamedPose:
-    """Return the pose of a row, without a name: T_world_from_cam, camera axes right, down, forward."""
-    return "", check_transform(np.array(row, float).reshape(3, 4), "a row", OPTICAL_FROM_CAM)
-
-
 def read_transforms(path: Path) -> list[NamedPose]:
     """Return the poses in a transforms.json with the photos' paths: T_world_from_cam, right, up, back."""
     poses = []
@@ -179,7 +178,8 @@ def read_lines(path: Path) -> list[NamedPose]:
     """Return the poses in a file of COLMAP or hloc, by the photos' names, or of a tracker, by times."""
     with naming(path, WANTED):
         if path.suffix == ".xml":
-            return [read_metashape(camera) for camera in read_xml(path).iter("camera") if _has_pose(camera)]
+            cameras = read_xml(path).iter("camera")
+            return [read_metashape(camera) for camera in cameras if camera.find("transform") is not None]
         if path.suffix == ".bin":
             rows = list(read_binary_images(read_bytes(path, WANTED, MAX_SIZE)))
             return [read_colmap_row(row) for row in rows]
@@ -195,10 +195,6 @@ def read_xml(path: Path) -> ElementTree.Element:
     """Return the root of an XML file; InputError if it is damaged."""
     with naming(path, WANTED):
         return parse_xml(read_text(path, WANTED))
-
-
-def _has_pose(camera: ElementTree.Element) -> bool:
-    return camera.find("transform") is not None
 
 
 def read_metashape(camera: ElementTree.Element) -> NamedPose:

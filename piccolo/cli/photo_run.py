@@ -19,7 +19,7 @@ from ..batch.results_file import FileOutput, Output, Records, StreamOutput
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..errors import InputError
 from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary_folder, write_atomically
-from ..files.line_file import LineFile, open_locked, write_line
+from ..files.line_file import open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
 from ..localization.settings import CoarseToFineSettings
@@ -127,9 +127,10 @@ def prepare_run(arguments: Arguments) -> Run:
 
 def note_unused_priors(arguments: Arguments, localizer: Localizer) -> None:
     """Warn of names in the table of priors that no panorama has had."""
-    if localizer.priors and (names := localizer.priors.names_without_panorama):
+    priors = localizer.priors
+    if priors and (names := [name for name in priors.by_name if name not in priors.used]):
         note = f"{len(names)} names without a photo, such as {names[0]}"
-        arguments.note(f"warning: {localizer.priors.path}: {note}")
+        arguments.note(f"warning: {priors.path}: {note}")
 
 
 def open_scan(run: Run, localizer: Localizer, num_threads: int) -> OpenedScan:
@@ -158,17 +159,11 @@ def open_output(run: Run) -> Iterator[tuple[Output, Records]]:
                 yield output, Records()
     else:
         with open_locked(out) as file:
-            records = take_up_results(run, file)
+            records = Records(file.path)
+            if file.size and not run.arguments.overwrite:
+                expected = run.localizer.expect(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
+                records.read(expected, None if run.total is None else run.panoramas)
             yield FileOutput(file, records), records
-
-
-def take_up_results(run: Run, file: LineFile) -> Records:
-    """Return the results of earlier runs in the output, which are to be as those of this run would be."""
-    records = Records(file.path)
-    if file.size and not run.arguments.overwrite:
-        expected = run.localizer.expect(scan_sha256_of(run.arguments.cloud, run.localizer.cache))
-        records.read(expected, None if run.total is None else run.panoramas)
-    return records
 
 
 def record(run: Run, answer: Answer, write: Write) -> None:

@@ -7,36 +7,32 @@ and Bolles, 1981) on those matches.
 """
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array, Array32, Int64s, Mask
+from ..arrays import Array, Array32, Int64s
 from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
-from ..kernels.jit import F0, Scalar, copy_to, inline_kernel, kernel
+from ..kernels.jit import F0, Scalar, inline_kernel, kernel
 from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
-from ..panorama.texels import in_camera, pose_float32
-from .matching import LEAST_WEIGHT, Matches
+from .matching import Matches
 from .p3p import p3p
 
 COS_ROUGH = math.cos(math.radians(20.0))  # a match whose error is smaller agrees roughly
 COS_EXACT = math.cos(math.radians(1.0))
-# in float32 first, and a little wider
-COS2_NEAR, COS2_CLOSE = (np.float32(math.cos(math.radians(angle)) ** 2) for angle in (20.1, 1.1))
 COS_TANGENT = math.cos(math.radians(40.0))
 SIZE_RATIO = 1.7  # of a keypoint's size as predicted and as found, at most
-COS_TILT = math.cos(math.radians(12.0))  # most angle between a pose's vertical and the known one
 LEAST_ANGLE = np.float32(1e-6)  # [rad] of a keypoint
 MAX_VOTERS = 1200  # single matches whose poses are tried
 BATCH = 64  # of them a thread tries at a time
 NUM_CLUSTERS = 48  # that are made exact, at most
-FIRST_CLUSTERS = 8  # of them, before the rest is chosen by the votes
 FAIR_PART = 0.2  # of the best pose's matches
 NUM_SAMPLES = 200  # of three matches, a cluster
 LEAST_MATCHES = 4  # that agree with a pose
@@ -114,21 +110,6 @@ def agreement(m: Matches, j: int, R: Array, t: Array, cos_rough: float) -> Scala
 
 
 @inline_kernel
-def write_upright(m: Matches, j: int, R_cam_from_level: Array, R: Array) -> None:
-    """Write the rotation (3, 3) whose yaw takes the azimuth of a match's direction to that of its ray."""
-    L = R_cam_from_level
-    d = m.directions[j]
-    x, y, _ = rotate(L.T, m.rays[j])
-    per = 1.0 / max(math.sqrt((x * x + y * y) * (d[0] * d[0] + d[1] * d[1])), 1e-9)
-    c = (x * d[0] + y * d[1]) * per
-    s = (y * d[0] - x * d[1]) * per
-    for i in range(3):
-        R[i, 0] = L[i, 0] * c + L[i, 1] * s
-        R[i, 1] = L[i, 1] * c - L[i, 0] * s
-        R[i, 2] = L[i, 2]
-
-
-@inline_kernel
 def write_turned(m: Matches, j: int, R: Array) -> None:
     """Write the rotation (3, 3) that takes a match's direction and tangent to its ray and ray's tangent."""
     cam = (m.rays[j], m.ray_tangents[j], cross(m.rays[j], m.ray_tangents[j]))
@@ -139,28 +120,12 @@ def write_turned(m: Matches, j: int, R: Array) -> None:
 
 
 @inline_kernel
-def find_near(points: Array32, rays: Array32, R: Array, t: Array, cos2: np.float32, is_near: Mask) -> None:
-    """Write the mask (M,) of the matches whose points (3, M) a pose puts near their rays (3, M).
-
-    This rules out most matches, in float32. The squared cosine `cos2` is a little below that of the exact
-    test, which follows in float64.
-    """
-    pose = pose_float32(R, t)
-    for i in range(points.shape[1]):
-        x, y, z = in_camera(points[0, i], points[1, i], points[2, i], pose)
-        along = x * rays[0, i] + y * rays[1, i] + z * rays[2, i]
-        is_near[i] = (along > F0) & (along * along >= cos2 * (x * x + y * y + z * z))
-
-
-@inline_kernel
-def agreeing_weight(m: Matches, is_near: Mask, R: Array, t: Array) -> Scalar:
+def agreeing_weight(m: Matches, R: Array, t: Array) -> Scalar:
     """Sum, over the photo's features, the largest weight of a match that roughly agrees with a pose."""
     total: Scalar = 0.0
     last = -1
     best = F0
     for i in range(len(m.query)):
-        if not is_near[i]:
-            continue
         if m.query[i] != last:
             total += best
             last = m.query[i]
@@ -172,56 +137,37 @@ def agreeing_weight(m: Matches, is_near: Mask, R: Array, t: Array) -> Scalar:
 
 @kernel
 def rough_poses(
-    matches: Matches,
-    columns: tuple[Array32, Array32],
-    voters: NDArray[np.intp],
-    R_cam_from_level: Array,
-    is_upright: bool,
-    rotations: Array,
-    centers: Array,
-    votes: Array,
+    matches: Matches, voters: NDArray[np.intp], rotations: Array, centers: Array, votes: Array
 ) -> None:
-    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of all that agree.
-
-    `columns` are the matches' points and rays, transposed to (3, M). `is_upright`: the rotation is that of
-    `R_cam_from_level` (3, 3) but for the yaw.
-    """
+    """Write the pose (n, 3, 3), (n, 3) of each voter, a single match, and the weight (n,) of its votes."""
     m = matches
-    is_near = np.empty(len(m.query), np.bool_)
     for k in range(len(voters)):
         j = voters[k]
         distance = m.sizes[j] / max(m.angles[j], LEAST_ANGLE)
         for i in range(3):
             centers[k, i] = m.points[j, i] - distance * m.directions[j, i]
-        if is_upright:
-            write_upright(m, j, R_cam_from_level, rotations[k])
-        else:
-            write_turned(m, j, rotations[k])
-        find_near(columns[0], columns[1], rotations[k], centers[k], COS2_NEAR, is_near)
-        votes[k] = agreeing_weight(m, is_near, rotations[k], centers[k])
+        write_turned(m, j, rotations[k])
+        votes[k] = agreeing_weight(m, rotations[k], centers[k])
 
 
 @kernel
 def count_exact(
     matches: Matches,
     members: Int64s,
-    columns: Array32,
     rotations: Array,
     centers: Array,
     counts: Int64s,
 ) -> None:
     """Count for each pose (n, 3, 3), (n, 3) the photo's features that a member agrees with within a degree.
 
-    `columns` (6, m) are the members' points and rays; the counts (n,) are written.
+    The counts (n,) are written.
     """
-    is_near = np.empty(len(members), np.bool_)
     for n in range(len(counts)):
         count = 0
         last = -1
-        find_near(columns[:3], columns[3:], rotations[n], centers[n], COS2_CLOSE, is_near)
         for k in range(len(members)):
             j = members[k]
-            is_other = is_near[k] and matches.query[j] != last
+            is_other = matches.query[j] != last
             if is_other and agreement(matches, j, rotations[n], centers[n], COS_EXACT) > 0.0:
                 count += 1
                 last = matches.query[j]
@@ -229,11 +175,10 @@ def count_exact(
 
 
 @kernel
-def sample_poses(columns: Array32, up_cam: Array, cos_tilt: float, rotations: Array, centers: Array) -> int:
+def sample_poses(columns: Array32, rotations: Array, centers: Array) -> int:
     """Write poses (n, 3, 3), (n, 3) of three matches each, at most 4 NUM_SAMPLES; return their number.
 
-    `columns` (6, m) are points and rays of the matches. Poses are left out if the cosine of the angle between
-    their vertical and `up_cam` (3,) is below `cos_tilt`. The samples are the same in every run.
+    `columns` (6, m) are points and rays of the matches. The samples are the same in every run.
     """
     num_poses = 0
     bearings = np.empty((3, 3))
@@ -246,51 +191,27 @@ def sample_poses(columns: Array32, up_cam: Array, cos_tilt: float, rotations: Ar
             for c in range(3):
                 points[i, c] = columns[c, drawn]
                 bearings[i, c] = columns[3 + c, drawn]
-        num_found = p3p(bearings, points, rotations[num_poses:], centers[num_poses:])
-        end = num_poses + num_found
-        for k in range(num_poses, end):
-            R = rotations[k]
-            if R[0, 2] * up_cam[0] + R[1, 2] * up_cam[1] + R[2, 2] * up_cam[2] >= cos_tilt:
-                copy_to(rotations[num_poses], R)
-                copy_to(centers[num_poses], centers[k])
-                num_poses += 1
+        num_poses += p3p(bearings, points, rotations[num_poses:], centers[num_poses:])
     return num_poses
 
 
 @kernel
 def list_members(
-    matches: Matches,
-    columns: tuple[Array32, Array32],
-    R_cam_from_map: Array,
-    center_map: Array,
-    cos_rough: float,
-    members: Int64s,
+    matches: Matches, R_cam_from_map: Array, center_map: Array, cos_rough: float, members: Int64s
 ) -> int:
-    """Write the indices of the matches that agree with a pose; return their number.
-
-    `columns` as in `rough_poses`; the angle whose cosine is `cos_rough` is 20 degrees at most.
-    """
+    """Write the indices of the matches that agree with a pose; return their number."""
     count = 0
-    is_near = np.empty(len(matches.query), np.bool_)
-    find_near(columns[0], columns[1], R_cam_from_map, center_map, COS2_NEAR, is_near)
     for j in range(len(matches.query)):
-        if is_near[j] and agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
+        if agreement(matches, j, R_cam_from_map, center_map, cos_rough) > 0.0:
             members[count] = j
             count += 1
     return count
 
 
-def transpose_matches(matches: Matches) -> tuple[Array32, Array32]:
-    """Return the matches' points and rays, transposed to (3, M) each."""
-    return np.ascontiguousarray(matches.points.T), np.ascontiguousarray(matches.rays.T)
-
-
 def find_inliers(matches: Matches, pose: Pose, cos_rough: float) -> Int64s:
     """Return the indices of the matches that agree with a pose."""
     members = np.empty(len(matches.query), np.int64)
-    R = pose.R_cam_from_world
-    t = pose.center_world
-    return members[: list_members(matches, transpose_matches(matches), R, t, cos_rough, members)]
+    return members[: list_members(matches, pose.R_cam_from_world, pose.center_world, cos_rough, members)]
 
 
 def count_matches(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) -> int:
@@ -298,18 +219,16 @@ def count_matches(matches: Matches, pose: Pose, cos_agree: float = COS_EXACT) ->
     return len(np.unique(matches.query[find_inliers(matches, pose, cos_agree)]))
 
 
-def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) -> MatchedPose | None:
+def exact_pose(matches: Matches, rough: Pose) -> MatchedPose | None:
     """Return the pose that most matches near a rough one agree with, refined; None if they are too few."""
-    up_cam = np.array([0.0, 0.0, 1.0]) if R_cam_from_level is None else R_cam_from_level[:, 2].copy()
-    cos_tilt = -2.0 if R_cam_from_level is None else COS_TILT
     members = find_inliers(matches, rough, COS_ROUGH)
     if len(members) < LEAST_MATCHES:
         return None
     columns = np.ascontiguousarray(np.hstack([matches.points[members], matches.rays[members]]).T)
     rotations = np.empty((4 * NUM_SAMPLES, 3, 3))
     centers = np.empty((4 * NUM_SAMPLES, 3))
-    counts = np.empty(sample_poses(columns, up_cam, cos_tilt, rotations, centers), np.int64)
-    count_exact(matches, members, columns, rotations, centers, counts)
+    counts = np.empty(sample_poses(columns, rotations, centers), np.int64)
+    count_exact(matches, members, rotations, centers, counts)
     if max(counts, default=0) < LEAST_MATCHES:
         return None
     best = np.argmax(counts)
@@ -321,44 +240,29 @@ def exact_pose(matches: Matches, rough: Pose, R_cam_from_level: Array | None) ->
         rays = matches.rays[members].astype(np.float64)
         points = matches.points[members].astype(np.float64)
         descend_matches((rays, points, REFINE_SCALE), REFINEMENTS, REFINE_TOLERANCE, R, t)
-    return MatchedPose(pose, count_matches(matches, pose)) if R[:, 2] @ up_cam >= cos_tilt else None
+    return MatchedPose(pose, count_matches(matches, pose))
 
 
-def propose_poses(
-    matches: Matches, R_cam_from_level: Array | None, count: int, workers: Workers
-) -> list[MatchedPose]:
+def propose_poses(matches: Matches, count: int, workers: Workers) -> list[MatchedPose]:
     """Return at most `count` poses that most matches agree with, best first, in the map's frame.
 
     Poses with less than FAIR_PART of the best one's matches are left out.
-    R_cam_from_level (3, 3) is the camera's tilt, None if it is unknown.
     """
     voters = np.argsort(-matches.weights, kind="stable")[:MAX_VOTERS]
     rotations = np.empty((len(voters), 3, 3))
     centers = np.empty((len(voters), 3))
     votes = np.empty(len(voters))
-    is_upright = R_cam_from_level is not None
-    level = np.eye(3) if R_cam_from_level is None else np.ascontiguousarray(R_cam_from_level, np.float64)
-    columns = transpose_matches(matches)
 
     def vote(lo: int) -> None:
         part = slice(lo, lo + BATCH)
-        rough_poses(
-            matches, columns, voters[part], level, is_upright, rotations[part], centers[part], votes[part]
-        )
+        rough_poses(matches, voters[part], rotations[part], centers[part], votes[part])
 
     list(workers.map(vote, range(0, len(voters), BATCH), "vote"))
     order = np.argsort(-votes, kind="stable")
     kept = order[non_maximum_suppression(rotations[order], centers[order], NUM_CLUSTERS, VOTED)]
-
-    def exact_ones(clusters: Int64s) -> list[MatchedPose]:
-        rough = [Pose(rotations[k], centers[k]) for k in clusters]
-        ends = workers.map(lambda pose: exact_pose(matches, pose, R_cam_from_level), rough, "sample")
-        return [end for end in ends if end]
-
-    found = exact_ones(kept[:FIRST_CLUSTERS])
-    least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
-    rest = kept[FIRST_CLUSTERS:]
-    found += exact_ones(rest[votes[rest] >= LEAST_WEIGHT * least])  # others hardly have so many matches
+    rough = [Pose(rotations[k], centers[k]) for k in kept]
+    ends = workers.map(partial(exact_pose, matches), rough, "sample")
+    found = [end for end in ends if end]
     least = max([LEAST_MATCHES, *(FAIR_PART * f.num_matches for f in found)])
     found = sorted((f for f in found if f.num_matches >= least), key=lambda f: -f.num_matches)
     R = np.array([f.pose.R_cam_from_world for f in found]).reshape(-1, 3, 3)

@@ -118,18 +118,14 @@ def make_view(
     R_sphere_from_view: Array, pixel: float, shape: tuple[int, int], width: int, middles: Array, place: int
 ) -> PerspectiveView:
     """Make a view of `shape` (h, w) of a sphere's picture of `width`; `pixel` as of PerspectiveView."""
-    left, up = np.meshgrid(*(centers_of_pixels(count, pixel) for count in reversed(shape)))
+    left, up = (0.5 * pixel * n * (1.0 - (2.0 * np.arange(n) + 1.0) / n) for n in reversed(shape))
+    left, up = np.meshgrid(left, up)  # of the pixels' centres, at a distance of 1
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
     columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
     is_nearest = np.argmax(rays @ middles.T, axis=-1) == place
     grown = cv2.dilate(is_nearest.astype(np.uint8) * np.uint8(255), np.ones((5, 5), np.uint8))
     own = np.asarray(grown, np.uint8)
     return PerspectiveView(R_sphere_from_view, pixel, columns, rows, own, middles, place)
-
-
-def centers_of_pixels(count: int, pixel: float) -> Array:
-    """Return the middles (count,) of pixels, at a distance of 1, the first at the greatest."""
-    return np.asarray(0.5 * pixel * count * (1.0 - (2.0 * np.arange(count) + 1.0) / count))
 
 
 def add_margin(image: Image) -> Image:

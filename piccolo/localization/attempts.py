@@ -4,6 +4,7 @@ A first look by whole views finds most upright photos of the whole sphere, witho
 features show that a photo is mirrored, so the first look briefly searches its mirror image too.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -19,21 +20,19 @@ from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from .beam import brief_query, refine_matches, refine_starts, score_mirror, score_starts
 from .comparison import score_pose
-from .prior import contradictions
 from .query import Query
 from .search import Tilts, search_poses
 from .selection import is_clear, is_sure, rank
 from .settings import Beam
-from .verification import verify
+from .verification import CHANCE_MATCHES, verify
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
 FIRST_ROTATIONS = 1000  # of SO(3)
 FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searched
-NUM_VERIFIED = 7  # alternatives of the best pose that are verified
 ENOUGH_MATCHES = 40  # of a part of the features: if the pose is sure, the others are not asked
-CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do: with more, the pose fitted to them is added
 NUM_MATCHED = 6  # poses from matches that are refined
+COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
 Poses = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
 # one search with its refinement, which adds to the known hypotheses
@@ -50,25 +49,24 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
     any tilt, ask them first. Partial photos are mostly taken about level: with a tilt that is not known
     exactly, "known" searches about level.
     """
-    method = query.method
-    looks_first = method.uses_features and method.uses_search and is_whole(query)
+    looks_first = bool(query.features) and is_whole(query)
     first: list[tuple[Query, Attempt]] = []
     if looks_first:
         first = [(query.by_views(), look_first), (query.without_features(), draw_found)]
     if query.rotations is not None:
         first.append((query, look_along_walls))
-    by_features: list[tuple[Query, Attempt]] = []
-    if method.uses_features:
-        parts = (query.features[:k] for k in range(1, len(query.features)))
-        by_features = [(replace(query, features=part), search_part) for part in parts]
-        by_features.append((query, search_matches))
+    parts = [query.features[: k + 1] for k in range(len(query.features))]
+    by_features: list[tuple[Query, Attempt]] = [
+        (replace(query, features=part), search_matches if part is parts[-1] else search_part)
+        for part in parts
+    ]
     by_views: list[tuple[Query, Attempt]] = []
     asked = query.without_features() if looks_first else query
     is_partial = query.photo.is_partial
-    if method.uses_search and (is_partial or query.settings.gravity != "unknown"):
+    if is_partial or query.settings.gravity != "unknown":
         upright: Tilts = "level" if is_partial and not query.photo.has_tilt else "known"
         by_views.append((asked, partial(search_views, tilts=upright)))
-    if method.uses_search and query.settings.gravity != "known":
+    if query.settings.gravity != "known":
         by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
     return [*first, *by_views, *by_features] if looks_first else [*first, *by_features, *by_views]
 
@@ -143,7 +141,7 @@ def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]
     """Verify the hypotheses of a photo of a part of the sphere; add poses refined on many matches."""
     if not query.photo.is_partial or not hypotheses:
         return hypotheses
-    found = rank(hypotheses, NUM_VERIFIED)
+    found = rank(hypotheses)
     poses = [h.pose for h in (found.best, *found.alternatives)]
     verified = query.workers.map(partial(verify, query), poses, "verify")
     refined = [v.pose for v in verified if v.num_matches > CHANCE_MATCHES]
@@ -152,7 +150,7 @@ def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]
 
 def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
     """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    is_asked = not query.settings.prior.is_empty and query.method.uses_search and is_whole(query)
+    is_asked = not query.settings.prior.is_empty and is_whole(query)
     if not is_asked:
         return []
     settings = replace(query.settings, prior=NOTHING_KNOWN)
@@ -161,17 +159,15 @@ def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> li
 
 
 def match_poses(query: Query, watch: Stopwatch) -> list[Pose]:
-    """Return poses from feature matches, best first; without whole views, those that the prior allows."""
+    """Return poses from feature matches, best first."""
     if query.scan_map.awaits_features:
         with watch.stage("prepare"):
             query.scan_map.features_now(query.workers)
     is_level = query.settings.gravity == "known" and (query.photo.has_tilt or not query.photo.is_partial)
-    level = query.photo.R_cam_from_level if is_level else None
+    up_cam = query.photo.R_cam_from_level[:, 2]
     with watch.stage("match"):
-        poses = [f.pose for f in propose_poses(query.matches, level, NUM_MATCHED, query.workers)]
-    if query.method.uses_search:
-        return poses
-    return [pose for pose in poses if not contradictions(query.scan_map, pose, query.settings.prior)]
+        poses = [f.pose for f in propose_poses(query.matches, NUM_MATCHED, query.workers)]
+    return [pose for pose in poses if not is_level or pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
 
 
 def is_whole(query: Query) -> bool:

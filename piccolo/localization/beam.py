@@ -1,6 +1,5 @@
 """From starts to a few poses: successive halving on ever finer views."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -28,8 +27,7 @@ from .settings import Beam
 
 BATCH = 16  # starts that a thread takes at a time
 NUM_FOUND = 12  # poses of a search, at most
-PLAIN_SCORE = 0.2  # if the best has this score, poses with less than FAINT_PART of it are dropped
-FAINT_PART = 0.25
+FAINT_PART = 0.25  # of the best score: poses with less are dropped
 FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
 NUM_SCORED = 64  # starts, if only the best score is needed
 
@@ -109,9 +107,8 @@ def keep_distinct(fine: Sequence[Hypothesis], middle: Sequence[Hypothesis]) -> l
 
 
 def keep_comparable(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Drop the fits that score far below a good best: a comparison could not bring them near it."""
-    best = max((f.score for f in ranked), default=0.0)
-    least = FAINT_PART * best if best >= PLAIN_SCORE else -math.inf
+    """Drop the fits that score far below the best: a comparison could not bring them near it."""
+    least = FAINT_PART * max((f.score for f in ranked), default=0.0)
     return [f for f in ranked if f.score >= least]
 
 

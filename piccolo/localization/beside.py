@@ -92,7 +92,9 @@ def localize_beside(
     with watch.stage("match"):
         query = prepare_query(panorama, allowed_map, settings, workers)
         is_asked = query.is_narrow and len(allowed_map.sparse) > 0
-        found = find_beside(query, pictures) if is_asked else []
+        asked = list(pictures.items()) if is_asked else []
+        matched = filter(None, workers.map(partial(match_picture, query), asked, "match"))
+        found = [other for other, _ in sorted(matched, key=lambda pair: -pair[1])[:MOST_BESIDE]]
     if not found:
         return Localization(), ()
     with watch.stage("refine"):
@@ -122,7 +124,7 @@ def list_agreeing(
     own = scan_map.from_world(judged.pose)
     agreeing = []
     for other, turned in zip(found, matches, strict=True):
-        exact = exact_pose(turned, own, None)
+        exact = exact_pose(turned, own)
         if exact and exact.num_matches >= SURE_MATCHES and CONFIRMED.holds(exact.pose, own):
             agreeing.append(other._replace(matches=turned, pose=exact.pose))
     return agreeing
@@ -157,14 +159,6 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
     return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
 
 
-def find_beside(query: Query, pictures: Mapping[str, SurePhoto]) -> list[Neighbor]:
-    """Find the photos that show what a photo shows, those with the most matches first."""
-    compared = query.workers.map(partial(match_picture, query), list(pictures.items()), "match")
-    found = [pair for pair in compared if pair]
-    ranked = sorted(found, key=lambda pair: -pair[1])
-    return [other for other, _ in ranked[:MOST_BESIDE]]
-
-
 def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor, int] | None:
     """Match a photo with another, given with its name; None if fewer agree than a sure pose has.
 
@@ -172,7 +166,7 @@ def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor,
     """
     name, picture = named
     matches = match_beside(query, picture.located)
-    found = propose_poses(matches, None, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
+    found = propose_poses(matches, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
     if not found or found[0].num_matches < SURE_MATCHES:
         return None
     return Neighbor(name, picture, matches, found[0].pose), found[0].num_matches

@@ -21,11 +21,12 @@ from ..panorama.texels import CHUNK, Texels, make_chunk, project, sample
 from ..views.points_around import round_position
 from ..views.view import ViewArrays, ViewConfig, average_colors, cell_statistics, empty_cells, locate
 from .query import Query
-from .settings import DRAWN_VIEW
+from .settings import VIEWS
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
 DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
 LEAST_SHARED = 0.3  # fraction of what the poorer view shows
+FINE_VIEW = VIEWS["fine"]
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
 
@@ -185,28 +186,20 @@ def compare_cells(
                     kept[i] = F0
 
 
-def compare(query: Query, pose: Pose, config: ViewConfig | None = None) -> Comparison:
+def compare(query: Query, pose: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
     """Compare the scan at a pose with the photo, by blocks, by default on fine cells; kept with the query."""
-    kept: dict[tuple[bytes, ViewConfig | None], Comparison] = query.cache.comparisons
+    kept: dict[tuple[bytes, ViewConfig], Comparison] = query.cache.comparisons
     key = (pose.key, config)
     if key not in kept:
         kept[key] = compare_from(query, pose, pose, config)
     return kept[key]
 
 
-def score_drawn(query: Query, pose: Pose) -> float | None:
-    """Score a pose by the edges drawn there, in a scan without colours; else None."""
-    if query.evidence != "shape":
-        return None
-    return compare(query, pose, DRAWN_VIEW).score_beyond(DRAWN_CHANCE)
-
-
-def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig | None = None) -> Comparison:
+def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
     """Compare the scan at a pose with the photo, by blocks, by default on fine cells.
 
     `seen_from` is a pose so near that it sees the same, whose view may be known.
     """
-    config = config or query.method.fine_view
     view = config.arrays
     place = round_position(seen_from)
     sums = query.averages_at(pose, place, config)

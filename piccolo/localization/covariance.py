@@ -302,14 +302,6 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
 
 
-def photo_covariance(turn: float, median_range: float) -> Array:
-    """Return the covariance (6, 6) [rad, m] of a photo's grid and stitching, by an error [rad] of all blocks.
-
-    The median range [m] converts angles to displacements.
-    """
-    return np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))
-
-
 def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
     """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
 
@@ -357,7 +349,8 @@ def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: P
     prior = query.given.focal_prior
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
     turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.pixel
-    own = turn_positions(covariance, turned) + photo_covariance(turn, median_range)
+    of_grid = np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))  # and of stitching, in all blocks
+    own = turn_positions(covariance, turned) + of_grid
     common = scan_covariance(query.scan_map, median_range)
     if query.scan_map.has_shape:
         own, common = ALONE * own, common + (1.0 - ALONE) * own

@@ -37,7 +37,7 @@ from .last_descent import refine_best
 from .photo import make_images
 from .query import Features, Query, prepare_query
 from .selection import Selection
-from .verification import matches_near
+from .verification import SURE_MATCHES, matches_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
@@ -51,12 +51,10 @@ END_DEVIATION = 0.05  # of a minimum that lies there or beyond
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 STEP = 1e-4  # of the focal length's logarithm, with which rays are differentiated
 AGREES = 0.25  # least weight of a match that agrees
-ENOUGH_AGREEING = 12  # fewer tell nothing
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
 CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
-K1_PER_FOCAL = 1.0  # reach in k1 divided by that in the focal length's logarithm
 MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 EDGE_ERROR = 0.4  # [px] of the sphere at the picture's edge, which all blocks may have in common
@@ -216,8 +214,7 @@ def fit_end(changes: Array, losses: Array) -> Array:
 def make_design(num: int, reach: float) -> Array:
     """Return changes (K, num) of a camera, on a grid with a reach to either side."""
     values = np.linspace(-reach, reach, NUM_VALUES if num == 1 else NUM_VALUES_OF_TWO)
-    scales = [values, values * K1_PER_FOCAL]
-    return np.array(list(itertools.product(*scales[:num])))
+    return np.array(list(itertools.product(values, repeat=num)))
 
 
 def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[Pose]]:
@@ -243,7 +240,7 @@ def take_profile(query: Query, pose: Pose, changes: Array) -> tuple[Array, list[
     middle = changes.mean(axis=0)
 
     def end_with(change: Array) -> tuple[Pose, Array]:
-        images = make_images(retake(*change), query.method.scales)
+        images = make_images(retake(*change), query.photo.scales)
         full = images.full()
         is_near = abs(changes - middle).max() <= 1.001 * LAST_REACH
         near = pose if is_near else descend(fine, images.fine(), pose, FINE.limits)
@@ -338,7 +335,7 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
     def find_rays(change: float) -> Array32:
         return _turn_rays(matches.rays, before, before.with_camera(before.camera.change(change)))
 
-    if len(matches.rays) < ENOUGH_AGREEING:
+    if len(matches.rays) < SURE_MATCHES:
         return 0.0, 0.0, pose
     known: tuple[float, float, Pose] | None = query.cache.fits.get(pose.key)
     if known is not None:
@@ -357,7 +354,7 @@ def fit_matches(query: Query, pose: Pose) -> tuple[float, float, Pose]:
         end = add(end, -step[:6])
         change = float(np.clip(change - step[6], -1.0, 1.0))  # the focal length stays one
     variance = INFLATION * float((inverse @ slopes.T @ slopes @ inverse)[6, 6]) + MATCHED_DEVIATION**2
-    is_known = (weights > AGREES).sum() >= ENOUGH_AGREEING and abs(change) < LIMIT
+    is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(change) < LIMIT
     fit = change, is_known / variance, end
     query.cache.fits[pose.key] = fit
     return fit
@@ -369,7 +366,7 @@ def recalibrate(query: Query, change: Array) -> Query:
     before = given.cameras[0]
     after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
-    fresh = prepare_query(taken, query.scan_map, query.settings, query.workers, query.method)
+    fresh = prepare_query(taken, query.scan_map, query.settings, query.workers)
     features = tuple(Once(_turn_features, part, before, after) for part in query.features)
     beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in query.beside)
     found = replace(fresh, features=features, beside=beside)

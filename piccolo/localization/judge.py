@@ -31,7 +31,7 @@ from ..confidence.confidence import LOCALIZED, Standing, classify, posterior
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
-from ..confidence.occlusion import Agreement, compare_occlusion, measure_agreement
+from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws
 from ..geometry.pose_gaussian import PoseGaussian, std_of
@@ -91,7 +91,10 @@ def judge(
     probabilities = posterior(standings, std_of(measured.errors.gaussian), measured.errors.std_of_fit)
     likeliest = int(probabilities[:-1].argmax())
     if likeliest and is_copy[likeliest] and may_promote:
-        found = promote(query, found, reported[likeliest - 1])
+        best = settle(query, reported[likeliest - 1])
+        others = (found.best, *(h for h in found.alternatives if h is not reported[likeliest - 1]))
+        ratios = [s.ratio for s in assess_poses(query, best, others)[1:]]
+        found = Selection(best, others, max(ratios))
         fit = fit and fit_focal(query, found.best.pose, is_first=False)
         return judge(query, found, fit, may_promote=False)
     return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
@@ -234,7 +237,18 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     if not math.isfinite(loss):
         return None
     errors = errors.widen(fit.pose_covariance) if fit else errors
-    return Measured(pose, errors, loss, collect_evidence(query, found, agreement, fractions))
+    num_matches = count_each(query, found.best, found.alternatives)
+    evidence = Evidence(
+        score=found.best.score,
+        margin=found.margin,
+        agreement=agreement.value,
+        explained_fraction=fractions[0],
+        contradicted_fraction=fractions[1],
+        seen_fraction=agreement.seen_fraction,
+        num_matches=num_matches[0] if query.uses_matches else None,
+        alternative_matches=max(num_matches[1:], default=0) if query.uses_matches else None,
+    )
+    return Measured(pose, errors, loss, evidence)
 
 
 def list_reported(query: Query, found: Selection) -> tuple[tuple[Hypothesis, ...], list[bool]]:
@@ -275,13 +289,6 @@ def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> lis
     return [s._replace(num_matches=most) if copied else s for s, copied in pairs]
 
 
-def promote(query: Query, found: Selection, alternative: Hypothesis) -> Selection:
-    """Return the selection with an alternative, refined to the end, as the best."""
-    best = settle(query, alternative)
-    others = (found.best, *(h for h in found.alternatives if h is not alternative))
-    return Selection(best, others, max(s.ratio for s in assess_poses(query, best, others)[1:]))
-
-
 def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     """Explain how the focal length makes a pose doubtful, as warnings."""
     focal = fit.focal_length(panorama)
@@ -293,23 +300,6 @@ def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
     found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
     given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
     return (f"{found} ({given}): the position is uncertain by {std:.2f} m",)
-
-
-def collect_evidence(
-    query: Query, found: Selection, agreement: Agreement, fractions: tuple[float, float]
-) -> Evidence:
-    """Collect the evidence for the best pose, from the fractions explained and contradicted."""
-    num_matches = count_each(query, found.best, found.alternatives)
-    return Evidence(
-        score=found.best.score,
-        margin=found.margin,
-        agreement=agreement.value,
-        explained_fraction=fractions[0],
-        contradicted_fraction=fractions[1],
-        seen_fraction=agreement.seen_fraction,
-        num_matches=num_matches[0] if query.uses_matches else None,
-        alternative_matches=max(num_matches[1:], default=0) if query.uses_matches else None,
-    )
 
 
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
@@ -335,7 +325,7 @@ def search_mirrored(query: Query, mirrored: Query, pose: Pose) -> list[Hypothesi
     """
     if query.features:
         matches = match(query.keypoints.mirror(), query.scan_map.features_now(query.workers), query.workers)
-        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, None, 1, query.workers)])
+        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, 1, query.workers)])
     yaws = uniform_yaws(query.settings.num_yaws)
     tilt = ACROSS @ pose.R_cam_from_world @ ACROSS
     asked = mirrored.with_rotations(tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))

@@ -17,7 +17,7 @@ from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
 from .comparison import Comparison, compare, mask_occluders, score_pose
 from .query import Query
-from .settings import ImageName, ViewName
+from .settings import VIEWS, ImageName, ViewName
 
 PERTURBED_DISTANCE = 0.25  # [m]
 PERTURBED_ANGLE = math.radians(8.0)
@@ -89,7 +89,7 @@ def descend_on(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothes
     end = descend(cells, image, pose, stage.limits)
     if stage.view == "points":
         return Hypothesis(end, math.nan)
-    return score_on_cells(cells, query.method.view(stage.view).arrays.blocks, image, end)
+    return score_on_cells(cells, VIEWS[stage.view].arrays.blocks, image, end)
 
 
 def climb(query: Query, start: Hypothesis) -> Hypothesis:
@@ -100,7 +100,7 @@ def climb(query: Query, start: Hypothesis) -> Hypothesis:
     if start.pose.key in query.cache.ends:
         return start
     cells = query.view_at(start.pose, FINE.view)
-    blocks = query.method.view(FINE.view).arrays.blocks
+    blocks = VIEWS[FINE.view].arrays.blocks
     best = score_on_cells(cells, blocks, query.photo.image(FINE.image), start.pose)
     for _ in range(MAX_PERTURBATIONS):
         around = descend_around(query, cells, best.pose, AROUND_FINE)
@@ -256,7 +256,7 @@ def score_on_cells(cells: Cells, blocks: Int32s, image: Texels, pose: Pose) -> H
 def descend_around(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
     """Return the best end of descents from a pose and around it, on the coarse image first."""
     assert stage.around is not None
-    blocks = query.method.view(stage.view).arrays.blocks
+    blocks = VIEWS[stage.view].arrays.blocks
     coarse = query.photo.image(stage.around.image)
     fine = query.photo.image(stage.image)
     limits = stage.limits

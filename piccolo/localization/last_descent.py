@@ -8,13 +8,11 @@ from ..confidence.alternatives import Hypothesis
 from .ladder import climb_to_full, climb_unoccluded, settle
 from .query import Query
 from .selection import Selection, rank, select
-from .verification import SURE_MATCHES, count_each
+from .verification import CHANCE_MATCHES, SURE_MATCHES, count_each
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
-FAINT_SCORE = 0.1  # if all poses have less, and fewer matches than below, refinement soon ends
-FAINT_MATCHES = 6
+FAINT_SCORE = 0.1  # if all poses have less, and no more matches than by chance, refinement soon ends
 NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best
-NEAR_MATCHES = 0.5  # and so is one with this fraction of its matches
 MAX_REFINED = 4  # alternatives
 
 
@@ -31,12 +29,11 @@ def refine_best(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
         found = select(query, rank([best, *found.alternatives]))
         if is_faint(query, found):
             return found
-    of_best, *of_others = count_each(query, found.best, found.alternatives)
-    least = max(NEAR_MATCHES * of_best, SURE_MATCHES)
+    _, *of_others = count_each(query, found.best, found.alternatives)
     near: list[Hypothesis] = []
     far: list[Hypothesis] = []
     for h, count in zip(found.alternatives, of_others, strict=True):
-        is_near = h.score > NEAR_SCORE * found.best.score or count >= least
+        is_near = h.score > NEAR_SCORE * found.best.score or count >= SURE_MATCHES
         (near if is_near and len(near) < MAX_REFINED else far).append(h)
     if not near:
         best = climb_unoccluded(query, found.best.pose)[1]
@@ -51,7 +48,7 @@ def is_faint(query: Query, found: Selection) -> bool:
     scores = [h.score for h in (found.best, *found.alternatives)]
     if max(scores) >= FAINT_SCORE:
         return False
-    return max(count_each(query, found.best, found.alternatives)) < FAINT_MATCHES
+    return max(count_each(query, found.best, found.alternatives)) <= CHANCE_MATCHES
 
 
 def settle_best(query: Query, found: Selection) -> Selection:

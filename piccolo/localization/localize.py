@@ -21,7 +21,7 @@ from .last_descent import is_faint, refine_best
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
 from .selection import Selection
-from .settings import METHOD, CoarseToFineSettings, MethodConfig
+from .settings import CoarseToFineSettings
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
 
 GUESSES = (
@@ -48,11 +48,10 @@ def localize(
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
-    method: MethodConfig = METHOD,
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
     with watch.stage("search"):
-        query = prepare_search(scan_map, panorama, settings, workers, method)
+        query = prepare_search(scan_map, panorama, settings, workers)
         if isinstance(query, Localization):
             return query
         query.photo.images.search()  # each search begins with it
@@ -63,11 +62,7 @@ def localize(
 
 
 def prepare_search(
-    scan_map: ScanMap,
-    panorama: Panorama,
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    method: MethodConfig = METHOD,
+    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, workers: Workers
 ) -> Query | Localization:
     """Prepare a panorama for the search where the prior allows; a result says why nothing is searched."""
     allowed_map = apply_prior(scan_map, settings.prior)
@@ -75,7 +70,7 @@ def prepare_search(
         return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
     if not panorama.is_valid.any():
         return Localization(warnings=(NO_PIXEL,))
-    return prepare_query(panorama, allowed_map, settings, workers, method)
+    return prepare_query(panorama, allowed_map, settings, workers)
 
 
 def find(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:

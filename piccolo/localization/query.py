@@ -26,7 +26,16 @@ from ..scan_map.scan_map import ScanMap
 from ..views.points_around import Place, RecentViews, round_position
 from ..views.view import Cells, ViewConfig, normalize_view
 from .photo import ACROSS, Photo, make_photo
-from .settings import METHOD, SHAPE_SCALES, Beam, CoarseToFineSettings, MethodConfig, ViewName
+from .settings import (
+    PARTIAL_BEAM,
+    SHAPE_SCALES,
+    VIEWS,
+    WHOLE_BEAM,
+    Beam,
+    CoarseToFineSettings,
+    ImageScales,
+    ViewName,
+)
 
 MAX_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
 NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
@@ -64,7 +73,6 @@ class Query:
     scan_map: ScanMap
     settings: CoarseToFineSettings
     workers: Workers
-    method: MethodConfig
     features: tuple[Once[Features], ...]  # of a part of the photo's views each; none by whole views alone
     evidence: EvidenceKind  # with what poses are compared
     cache: Cache
@@ -84,7 +92,7 @@ class Query:
     @property
     def beam(self) -> Beam:
         """The number of poses that go on to each stage of a search."""
-        return self.method.partial_beam if self.photo.is_partial else self.method.beam
+        return PARTIAL_BEAM if self.photo.is_partial else WHOLE_BEAM
 
     @property
     def pixel(self) -> float:
@@ -136,7 +144,7 @@ class Query:
 
     def view_at(self, pose: Pose, name: ViewName) -> Cells:
         """Return the cells or points seen from a position near a pose, those that the photo shows."""
-        config = self.method.view(name)
+        config = VIEWS[name]
         place = round_position(pose)
         shown = self.photo.find_shown_cells(config.num_rings, pose)
         if name == "points":
@@ -155,24 +163,18 @@ class Query:
 
 
 def prepare_query(
-    panorama: Panorama,
-    scan_map: ScanMap,
-    settings: CoarseToFineSettings,
-    workers: Workers,
-    method: MethodConfig = METHOD,
-    rotations: Array | None = None,
+    panorama: Panorama, scan_map: ScanMap, settings: CoarseToFineSettings, workers: Workers
 ) -> Query:
-    """Prepare a panorama for the search in a map; the photo may give the camera's tilt.
-
-    Of rotations (N, 3, 3), camera from map, only these are searched.
-    """
+    """Prepare a panorama for the search in a map; the photo may give the camera's tilt."""
     source = panorama
-    R_cam_from_level, has_tilt = find_tilt(panorama)
+    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
+    has_tilt = R_level_from_cam is not None
+    R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
     if scan_map.has_shape:
         panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
-        method = method._replace(uses_features=False, scales=SHAPE_SCALES)
-    photo = make_photo(panorama, method.scales, R_cam_from_level, has_tilt, workers)
-    every = cover_sphere(method.scales.full.width)
+    scales = SHAPE_SCALES if scan_map.has_shape else ImageScales()
+    photo = make_photo(panorama, scales, R_cam_from_level, has_tilt, workers)
+    every = cover_sphere(scales.full.width)
     features = tuple(
         Once(find_features, photo.panorama, scan_map, workers, [every[k] for k in half])
         for half in (() if scan_map.has_shape else HALVES)
@@ -185,11 +187,9 @@ def prepare_query(
         scan_map,
         settings,
         workers,
-        method,
         features,
         "shape" if scan_map.has_shape else "drawn scan",
         Cache(make_views(scan_map)),
-        rotations,
     )
 
 
@@ -198,12 +198,6 @@ def make_views(scan_map: ScanMap) -> RecentViews:
     # leaves have narrow edges, which only the last descent is near enough to
     averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
     return RecentViews(scan_map.octree, averaged)
-
-
-def find_tilt(panorama: Panorama) -> tuple[Array, bool]:
-    """Return R_cam_from_level (3, 3) of a camera, and True if the photo gives its tilt."""
-    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
-    return (np.eye(3), False) if R_level_from_cam is None else (R_level_from_cam.T, True)
 
 
 def find_features(

@@ -26,6 +26,7 @@ LOWEST = np.float32(-np.inf)
 Tilts = Literal["known", "level", "any"]  # of the camera that are searched: its own, about level, all
 TURNED_BYTES = 4 * 16  # of a rotation, a cell: channels, validity, energy, and what they are made from
 CANDIDATES_PER_START = 2
+MIN_STARTS = 1000  # of a whole photo
 POSES_PER_START = 12
 PITCHES_DEG = (-27.0, -18.0, -9.0, 0.0, 9.0, 18.0, 27.0)  # of a camera held about level
 NUM_LEVEL_YAWS = 40
@@ -187,7 +188,7 @@ def search_poses(query: Query, tilts: Tilts) -> Starts:
     check_memory(num_bytes, task, "set fewer num_yaws or num_rotations")
     samples, validity = turn_panorama(query.photo.images.search(), rotations)
     is_partial = query.photo.is_partial
-    enough = max(len(m.sparse) // CANDIDATES_PER_START, query.method.min_starts)
+    enough = max(len(m.sparse) // CANDIDATES_PER_START, MIN_STARTS)
     num_starts = settings.max_starts if is_partial else min(enough, settings.max_starts)
     pool = num_starts * POSES_PER_START
     sparse, turn, _ = best_poses_wide(m, samples, validity, pool, query.workers, is_partial)

@@ -9,14 +9,13 @@ import numpy as np
 from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..geometry.pose import Pose
-from .comparison import compare, score_drawn
+from .comparison import DRAWN_CHANCE, compare
 from .prior import contradictions
 from .query import Query
+from .settings import DRAWN_VIEW
 from .verification import SURE_MATCHES, count_each
 
 MAX_COMPARED = 8  # alternatives of the best pose
-SURE_SCORE = 0.05  # least score of the best pose
-SURE_WHOLE = 0.1  # of that of a whole photo
 SURE_ODDS = 3.0  # [log] least odds of the best pose against any elsewhere: 20 to 1
 CLEAR_SCORE = 0.3  # least score by whole views without features: see docs/METHOD.md
 CLEAR_SHAPE = 0.1  # least score by edges
@@ -41,12 +40,12 @@ class Selection:
 NOTHING = Selection(Hypothesis(Pose(np.eye(3), np.zeros(3)), -1.0), ())
 
 
-def rank(hypotheses: Sequence[Hypothesis], count: int = MAX_COMPARED) -> Selection:
-    """Return the best hypothesis by score, and at most `count` elsewhere; NOTHING if there are none."""
+def rank(hypotheses: Sequence[Hypothesis]) -> Selection:
+    """Return the best hypothesis by score, and at most MAX_COMPARED elsewhere; NOTHING if there are none."""
     if not hypotheses:
         return NOTHING
     best = sort_by_score(hypotheses)[0]
-    return Selection(best, tuple(alternative_poses(best.pose, hypotheses, count=count)))
+    return Selection(best, tuple(alternative_poses(best.pose, hypotheses, count=MAX_COMPARED)))
 
 
 def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
@@ -69,11 +68,10 @@ def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standin
     for h, wrong, count in zip(hypotheses, is_wrong, counts, strict=True):
         num_matches = count if query.uses_matches else None
         of_prior = log_prior if wrong else 0.0
-        has_few_blocks = query.evidence == "shape" and query.photo.is_partial
-        # and chance explains more of them
-        part = math.sqrt(query.photo.small.valid_share) if has_few_blocks else 1.0
-        drawn = score_drawn(query, h.pose)
-        drawn = None if drawn is None else part * drawn
+        is_shape = query.evidence == "shape"
+        # of few blocks chance explains more
+        part = math.sqrt(query.photo.small.valid_share) if is_shape and query.photo.is_partial else 1.0
+        drawn = compare(query, h.pose, DRAWN_VIEW).score_beyond(DRAWN_CHANCE) * part if is_shape else None
         standings.append(Standing(1.0, part * h.score, num_matches, query.evidence, of_prior, drawn))
     return standings
 
@@ -102,11 +100,10 @@ def select(query: Query, found: Selection) -> Selection:
 
 
 def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Return True if the score of the best pose, and its odds by views and matches, end the search."""
-    ranked = rank(hypotheses)
-    if ranked.best.score < (SURE_SCORE if query.photo.is_partial else SURE_WHOLE):
+    """Return True if the matches of the best pose, and its odds, end the search."""
+    if not hypotheses:
         return False
-    found = select(query, ranked)
+    found = select(query, rank(hypotheses))
     best, *others = assess_poses(query, found.best, found.alternatives)
     if (best.num_matches or 0) < SURE_MATCHES:
         return False

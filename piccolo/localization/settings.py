@@ -80,28 +80,11 @@ DRAWN_VIEW = ViewConfig(
 SHAPE_SCALES = ImageScales(fine=ImageScales().fine._replace(blur_px=1.7))
 
 
-class MethodConfig(NamedTuple):
-    """Views from coarse to fine, the image scales that go with them, and how many poses are kept."""
-
-    middle_view: ViewConfig = ViewConfig(num_rings=48, stats_rings=24, sigma_deg=14.0, voxel_per_range=1 / 30)
-    fine_view: ViewConfig = ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 80)
-    full_view: ViewConfig = ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150)
-    scales: ImageScales = ImageScales()
-    beam: Beam = Beam(400, 48, 8, 2)
-    partial_beam: Beam = Beam(1600, 192, 12, 3)  # of a part of the sphere: many places look like it
-    uses_features: bool = True
-    uses_search: bool = True  # by whole views
-    min_starts: int = 1000
-
-    def view(self, name: ViewName) -> ViewConfig:
-        """Return the configuration of a view."""
-        views: dict[ViewName, ViewConfig] = {
-            "prepared": SEARCH_VIEW,
-            "middle": self.middle_view,
-            "fine": self.fine_view,
-            "points": self.full_view,
-        }
-        return views[name]
-
-
-METHOD = MethodConfig()
+VIEWS: dict[ViewName, ViewConfig] = {  # from coarse to fine
+    "prepared": SEARCH_VIEW,
+    "middle": ViewConfig(num_rings=48, stats_rings=24, sigma_deg=14.0, voxel_per_range=1 / 30),
+    "fine": ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 80),
+    "points": ViewConfig(num_rings=96, stats_rings=24, sigma_deg=10.0, voxel_per_range=1 / 150),
+}
+WHOLE_BEAM = Beam(400, 48, 8, 2)
+PARTIAL_BEAM = Beam(1600, 192, 12, 3)  # of a part of the sphere: many places look like it

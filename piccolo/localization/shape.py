@@ -13,7 +13,7 @@ from ..panorama.gpano import attitude_of_gravity
 from ..views.points_around import round_position
 from .attempts import FIRST_BEAM
 from .beam import brief_query, refine_starts, score_starts
-from .comparison import compare
+from .comparison import FINE_VIEW, compare
 from .query import Cache, Query, prepare_query
 from .search import search_poses
 from .selection import CLEAR_MARGIN, CLEAR_SHAPE, Selection
@@ -66,7 +66,7 @@ def find_tilts(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) 
     for axis in axes:
         x, y, z = -axis
         source = replace(query.source, gpano=attitude_of_gravity((float(x), float(y), float(z))))
-        turned = prepare_query(source, query.scan_map, query.settings, query.workers, query.method)
+        turned = prepare_query(source, query.scan_map, query.settings, query.workers)
         tried.append(align_level(turned, axes, yaw_of_walls))
     scores = []
     for one in tried:
@@ -94,11 +94,10 @@ def find_alike(query: Query, pose: Pose) -> list[Pose]:
 
 def draw_scan(query: Query, pose: Pose) -> Query:
     """Return a brief query in which the scan as seen from a pose takes the photo's place, at its tilt."""
-    view = query.method.fine_view
-    sums = query.averages_at(pose, round_position(pose), view)
+    sums = query.averages_at(pose, round_position(pose), FINE_VIEW)
     shown = query.photo.panorama.is_valid
     rays = pixel_rays(shown.shape[1]) @ pose.R_cam_from_world
-    cells = find_cell(rays.reshape(-1, 3).astype(np.float32), view.num_rings).reshape(shown.shape)
+    cells = find_cell(rays.reshape(-1, 3).astype(np.float32), FINE_VIEW.num_rings).reshape(shown.shape)
     counts = sums[cells, 6:7]
     rgb = np.rint(255.0 * sums[cells, 3:6] / np.maximum(counts, 1.0)).astype(np.uint8)
     photo = query.photo.take(replace(query.photo.panorama, rgb=rgb, is_valid=shown & (counts[..., 0] > 0.0)))

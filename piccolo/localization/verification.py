@@ -33,8 +33,8 @@ TURN = 0.05  # [rad] and at rotation vectors on one of this
 AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))
+CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
 SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do
-MOST_RIVALS = 4  # of a whole photo, at each of which four pictures are drawn
 RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 
@@ -71,7 +71,7 @@ def list_rivals(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) ->
         return []
     if count_agreeing(query, best.pose) >= SURE_MATCHES:
         others = [h for h in others if h.score >= RIVAL_SCORE * best.score]
-    return list(others if query.photo.is_partial else others[:MOST_RIVALS])
+    return list(others)
 
 
 def count_each(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[int]:
@@ -90,7 +90,7 @@ def verify(query: Query, pose: Pose) -> Verified:
     the one picture with which most agree are counted. A wrong pose of a photo beside misleads this one.
     """
     pictures = [matches_near(query, pose), *query.beside]
-    found = exact_pose(merge_matches(pictures), pose, None)
+    found = exact_pose(merge_matches(pictures), pose)
     if found is None:
         return Verified(pose, 0)
     return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
@@ -129,7 +129,7 @@ def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
     keypoints = find_all_drawn(query, pose).keypoints
 
     def is_copy(other: Pose) -> bool:
-        found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other, None)
+        found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other)
         return found is not None and CONFIRMED.holds(found.pose, other)
 
     return query.workers.map(is_copy, others, "compare places")

@@ -13,7 +13,7 @@ from ..geometry.pose import Pose
 from ..geometry.sphere import compute_pixels
 from ..jobs.threads import Workers
 from ..panorama import Panorama
-from ..panorama.model import shrink
+from ..panorama.model import resize
 from .surfels import render_points
 from .zbuffer import View
 
@@ -66,12 +66,6 @@ def encode_image(image: Bytes | NDArray[np.uint16], suffix: str, quality: int = 
     return content.tobytes()
 
 
-def resize_rgb(panorama: Panorama, width: int) -> Bytes:
-    """Return the panorama's colours, resized to (width / 2, width, 3)."""
-    rgb = shrink(panorama, width).rgb
-    return np.asarray(cv2.resize(rgb, (width, width // 2), interpolation=cv2.INTER_LINEAR), np.uint8)
-
-
 def checkerboard(photo: Bytes, cloud: Bytes) -> Bytes:
     """Stack two images (H, W, 3) and a checkerboard of both, one above the other (3 H, W, 3)."""
     row, column = np.indices(photo.shape[:2]) // (photo.shape[1] // NUM_TILES)
@@ -87,7 +81,7 @@ def overlay_png(points: PackedPoints, panorama: Panorama, pose: Pose, workers: W
     if len(panorama.cameras) != 1:
         view = render_points(points, pose, OVERLAY_WIDTH, workers)
         cloud = fill_holes(view.rgb, view.is_seen)
-        return encode_image(checkerboard(resize_rgb(panorama, OVERLAY_WIDTH), cloud), ".png")
+        return encode_image(checkerboard(resize(panorama, OVERLAY_WIDTH).rgb, cloud), ".png")
     (mount,) = panorama.cameras
     camera = mount.camera.scale_to_width(OVERLAY_WIDTH)
     view = render_points(points, mount.pose(pose), sphere_width_for(camera), workers)

@@ -20,7 +20,7 @@ from ..localization.localize import localize
 from ..localization.near import refine_near
 from ..localization.prior import apply_prior
 from ..localization.query import Cache, Query, prepare_query
-from ..localization.selection import SURE_SCORE, assess_alone
+from ..localization.selection import assess_alone
 from ..localization.settings import CoarseToFineSettings
 from ..localization.verification import match_beside, place_keypoints, verify
 from ..panorama import Panorama
@@ -43,6 +43,7 @@ from .path import COPY_LOG_ODDS, EVEN, Lattice
 
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
+LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
 NUM_QUERIES = 4  # are kept, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
@@ -339,7 +340,7 @@ def track(query: Query, start: Pose) -> State | None:
     odds = [log_odds_of_place(end.probability, end.probability, end.gaussian) for end in ends]
     best = int(np.argmax(odds))
     end = ends[best]
-    is_wrong = odds[best] < 0.0 or end.seen.score < SURE_SCORE
+    is_wrong = odds[best] < 0.0 or end.seen.score < LEAST_SCORE
     return None if is_wrong else State(end.pose, odds[best], end.seen.score, end.gaussian, end.seen)
 
 
