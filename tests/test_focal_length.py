@@ -197,7 +197,9 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
     """Beyond two deviations the picture says where to look next."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
-    found = focal.Minimum(np.array([minimum]), np.array([[0.01**-2]]), np.ones((6, 1)))
+    in_common = focal.EDGE_ERROR * math.tau * TRUE / (0.5 * 320 * query.photo.panorama.rgb.shape[1])
+    information = np.array([[1.0 / (0.01**2 - in_common**2)]])
+    found = focal.Minimum(np.array([minimum]), information, np.ones((6, 1)))
     monkeypatch.setattr(focal, "find_minimum", lambda *args: found)
     monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
     fit = focal.fit_focal(query, scan().from_world(pose))

@@ -11,6 +11,7 @@ import rooms
 from made_up import QUERY, VIEWS, at, place
 
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
 from piccolo.geometry.sphere import make_grid
@@ -34,7 +35,10 @@ def _fit(x, score, yaw_deg=0.0):
 def _asked(is_partial=False):
     """A query whose images are their names, of a photo that shows all cells."""
     photo = SimpleNamespace(
-        image=lambda name: name, find_shown_cells=lambda *_: np.ones(3), is_partial=is_partial
+        image=lambda name: name,
+        find_shown_cells=lambda *_: np.ones(3),
+        find_cone=lambda *_: EVERYWHERE,
+        is_partial=is_partial,
     )
     return replace(QUERY, photo=photo, cache=Cache(VIEWS))
 
@@ -215,13 +219,17 @@ def test_cells_and_points_are_those_that_the_photo_shows(monkeypatch):
     azimuth = np.degrees(np.arctan2(*(grid.directions @ pose.R_cam_from_world.T).T[1::-1]))
     shown = narrow.photo.find_shown_cells(settings.VIEWS["points"].num_rings, pose)
     assert whole.photo.find_shown_cells(settings.VIEWS["points"].num_rings, pose).all()
+    cone = narrow.photo.find_cone(settings.VIEWS["points"].num_rings, pose)
+    assert (grid.directions[shown] @ cone.axis > cone.cos_angle).all()
+    assert (grid.directions @ cone.axis > cone.cos_angle).mean() < 0.8
+    assert whole.photo.find_cone(settings.VIEWS["points"].num_rings, pose) == EVERYWHERE
     is_inside = np.abs((azimuth - 78.75 + 180) % 360 - 180) < 33.75
     assert (shown == is_inside).mean() > 0.98
     monkeypatch.setattr(query_module, "normalize_view", lambda sums, center, config, shown: shown)
     views = SimpleNamespace(averages=lambda *_: None, points=lambda place, config, *shown: shown)
     asked = replace(narrow, cache=Cache(views))
     assert (asked.view_at(pose, "fine") == shown).all()
-    assert asked.view_at(pose, "points") == (shown.tobytes(), 30_000)
+    assert asked.view_at(pose, "points") == (shown.tobytes(), cone, 30_000)
 
 
 @pytest.mark.parametrize(("seed", "most"), [(1, 5e-5), (3, 5e-4), (4, 5e-5)])
