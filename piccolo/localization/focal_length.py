@@ -57,8 +57,8 @@ CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
-# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 a right calibration was
-# called wrong in the real corridor of tests/data
+# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 a right calibration
+# was called wrong in the real corridor of tests/data
 EDGE_ERROR = 0.8
 LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
 MOST_OF_BLOCK = 0.7  # of a block in what fixes the focal length
