@@ -59,7 +59,7 @@ MOST_DESIGNS = 8
 INFLATION = 4.0  # of the covariance, so that 95 % of true focal lengths lie within two deviations
 # [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 a right calibration
 # was called wrong in the real corridor of tests/data
-EDGE_ERROR = 0.8
+EDGE_ERROR = 0.6
 LEAST_BLOCKS = 4  # shown by a picture, per parameter: fewer give no deviation
 MOST_OF_BLOCK = 0.7  # of a block in what fixes the focal length
 AT_REST = 0.5  # deviations: a smaller change ends the fit
