@@ -1,6 +1,7 @@
 """Every camera model against OpenCV, COLMAP and itself."""
 
 import functools
+import math
 
 import cv2
 import numpy as np
@@ -13,7 +14,7 @@ from rooms import room
 
 from piccolo.camera import Camera, Mount
 from piccolo.camera.model import MODELS, camera_of_fov, pinhole
-from piccolo.camera.resampling import View, make_sphere, sphere_width
+from piccolo.camera.resampling import MAX_SIDE, View, make_sphere, shrunk, sphere_width
 from piccolo.errors import InputError
 from piccolo.geometry.pose import OPTICAL_FROM_CAM, exp_so3
 from piccolo.geometry.sphere import pixel_rays
@@ -273,3 +274,26 @@ def test_a_rig_says_how_far_apart_its_cameras_are(tmp_path):
     assert note == "the rig's cameras are up to 0.20 m from its origin: near objects appear displaced"
     (folder / "1.png").unlink()
     assert_refused("found 0 pictures for the camera '1.png' of made", read_panorama, calibrated(folder, far))
+
+
+@pytest.mark.parametrize(("finer", "is_shrunk"), [(0.5, False), (1.2, False), (1.3, True), (3.0, True)])
+def test_a_picture_that_is_hardly_finer_than_the_sphere_is_not_blurred(finer, is_shrunk):
+    camera = pinhole(400, 300, finer * 1024 / math.tau)
+    view = View(Mount(camera), np.zeros((300, 400, 4), np.uint8))
+    found = shrunk(view, 1024)
+    assert (found is not view) == is_shrunk
+    assert found.pixels.shape[1] == (round(400 / finer) if is_shrunk else 400)
+
+
+@pytest.mark.parametrize("change", [-0.1, 0.1])
+def test_a_picture_is_made_smaller_once_for_calibrations_that_differ_a_little(change):
+    camera = pinhole(400, 300, 3.0 * 1024 / math.tau)
+    found = shrunk(View(Mount(camera), np.zeros((300, 400, 4), np.uint8)), 1024)
+    beside = found._replace(mount=Mount(camera.change(change)))
+    assert shrunk(beside, 1024) is beside
+
+
+def test_a_picture_too_long_to_be_sampled_is_always_made_smaller():
+    camera = pinhole(MAX_SIDE + 100, 10, 100.0)
+    view = View(Mount(camera), np.zeros((10, MAX_SIDE + 100, 4), np.uint8))
+    assert shrunk(view).pixels.shape[1] == MAX_SIDE

@@ -106,7 +106,8 @@ def test_views_have_the_same_bits_for_any_number_of_threads(render, count):
         np.testing.assert_array_equal(a, b)
 
 
-FINE, FULL = VIEWS["fine"], VIEWS["points"]
+FINE = VIEWS["fine"]
+FULL = VIEWS["points"]
 FINE_CELLS = np.ones(len(make_grid(FINE.num_rings)), bool)
 
 

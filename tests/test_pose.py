@@ -16,6 +16,7 @@ from piccolo.geometry.pose_gaussian import (
     PoseGaussian,
     add,
     differentiate,
+    differentiate_rays,
     mean_of,
     probability_near,
     probability_within,
@@ -179,6 +180,18 @@ def test_the_derivative_is_that_of_differences():
             behind = other_from_cam @ add(pose, -1e-5 * unit)
             columns.append(subtract(ahead, behind) / 2e-5)
         np.testing.assert_allclose(differentiate(pose, other_from_cam), np.stack(columns, axis=1), atol=1e-8)
+
+
+def test_rays_to_points_follow_the_pose_as_differences_say():
+    points = np.random.default_rng(2).normal(size=(20, 3)) * 4.0
+    for pose in tilted_poses(3, NEAR):
+        rays, J = differentiate_rays(points, pose)
+        offsets = (points - pose.center_world) @ pose.R_cam_from_world.T
+        np.testing.assert_allclose(rays * np.linalg.norm(offsets, axis=1, keepdims=True), offsets)
+        for k, h in enumerate(1e-6 * np.eye(6)):
+            after = differentiate_rays(points, add(pose, h))[0]
+            before = differentiate_rays(points, add(pose, -h))[0]
+            np.testing.assert_allclose(J[..., k], (after - before) / 2e-6, atol=1e-8)
 
 
 def test_a_pose_on_a_rig_has_the_errors_of_both():

@@ -23,7 +23,7 @@ COLUMNS = 128  # as well
 CELL = 4  # [px] within a block in the picture, places are found so far apart and linear between: to 0.05 px
 LOOK = 8  # [px] every so many it is seen first which blocks a camera shows
 MAX_SAMPLES = 8  # a pixel, across and down
-AS_FINE = 0.8  # a picture is not made smaller by less: that would blur it
+AS_FINE = 0.8  # a picture is not made smaller by a factor nearer to 1: that would blur it
 MAX_SIDE = 32_000  # [px] of what cv2.remap reads
 
 Pixels = tuple[Bytes, Mask]  # rgb (H, W, 3), is_valid (H, W)
@@ -67,7 +67,7 @@ def make_sphere(views: Sequence[View], width: int) -> Pixels:
 
 
 def shrunk(view: View, width: int = MAX_SPHERE_WIDTH) -> View:
-    """Return the same area-averaged, if it is finer at the axis than a sphere of this width, or too large."""
+    """Return the same area-averaged, if it is clearly finer at the axis than a sphere, or too large."""
     camera = view.mount.camera
     largest = MAX_SIDE / max(camera.width, camera.height)
     factor = min(1.0, width / (2.0 * math.pi * camera.resolution), largest)

@@ -65,7 +65,8 @@ def compare_occlusion(points: PackedPoints, panorama: Panorama, pose: Pose) -> O
     difference = np.empty_like(weight)
     is_seen = is_shared[..., None]
     for _ in range(NUM_ROUNDS):
-        photo, scan = (_statistics(c, weight) for c in (of_photo, of_scan))
+        photo = _statistics(of_photo, weight)
+        scan = _statistics(of_scan, weight)
         contrast = (of_scan - scan[..., :3]) * scan[..., 3:]
         low = _extreme(np.where(is_seen, contrast, np.float32(9.0)), cv2.erode)
         high = _extreme(np.where(is_seen, contrast, np.float32(-9.0)), cv2.dilate)

@@ -24,8 +24,7 @@ class Cone(NamedTuple):
 
     def turn(self, R_target_from_source: Floats) -> "Cone":
         """Return the cone in another frame, given the rotation (3, 3)."""
-        x, y, z = (float(value) for value in R_target_from_source @ self.axis)
-        return Cone(x, y, z, self.cos_angle)
+        return cone_about(R_target_from_source @ self.axis, self.cos_angle)
 
     def widen(self, angle: float) -> "Cone":
         """Return the cone with a half angle larger by `angle` [rad]."""
@@ -36,12 +35,16 @@ class Cone(NamedTuple):
 EVERYWHERE = Cone(1.0, 0.0, 0.0, -2.0)
 
 
+def cone_about(axis: Floats, cos_angle: float) -> Cone:
+    """Return the cone about an axis (3,), a unit vector."""
+    return Cone(float(axis[0]), float(axis[1]), float(axis[2]), float(cos_angle))
+
+
 def cone_around(rays: Floats) -> Cone:
     """Return the cone around the mean of unit directions (N, 3) that holds them all; their own frame."""
     axis = rays.sum(axis=0, dtype=np.float64)
     axis /= max(float(np.linalg.norm(axis)), 1e-9)
-    x, y, z = (float(value) for value in axis)
-    return Cone(x, y, z, float(np.clip((rays @ axis).min(initial=1.0), -1.0, 1.0)))
+    return cone_about(axis, np.clip((rays @ axis).min(initial=1.0), -1.0, 1.0))
 
 
 @inline_kernel

@@ -118,8 +118,9 @@ def make_view(
     R_sphere_from_view: Array, pixel: float, shape: tuple[int, int], width: int, middles: Array, place: int
 ) -> PerspectiveView:
     """Make a view of `shape` (h, w) of a sphere's picture of `width`; `pixel` as of PerspectiveView."""
-    left, up = (0.5 * pixel * n * (1.0 - (2.0 * np.arange(n) + 1.0) / n) for n in reversed(shape))
-    left, up = np.meshgrid(left, up)  # of the pixels' centres, at a distance of 1
+    # of the pixels' centres, at a distance of 1
+    centers = (0.5 * pixel * n * (1.0 - (2.0 * np.arange(n) + 1.0) / n) for n in reversed(shape))
+    left, up = np.meshgrid(*centers)
     rays = np.stack([np.ones_like(left), left, up], axis=-1) @ R_sphere_from_view.T
     columns, rows = (np.asarray(a - 0.5 + MARGIN, np.float32) for a in compute_pixels(rays, width))
     is_nearest = np.argmax(rays @ middles.T, axis=-1) == place

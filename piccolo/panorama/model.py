@@ -54,7 +54,10 @@ class Panorama:
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def shrink_picture(self, width: int) -> "Panorama":
-        """Return the panorama, which has a focal_prior, with its picture as fine as a sphere's."""
+        """Return the panorama, which has a focal_prior, with its picture no finer than a sphere of a width.
+
+        By several calibrations it is then resampled from the same pixels.
+        """
         assert self.focal_prior is not None
         return replace(self, focal_prior=replace(self.focal_prior, view=shrunk(self.focal_prior.view, width)))
 
@@ -84,7 +87,7 @@ def resize(panorama: Panorama, width: int) -> Panorama:
         rgb = np.asarray(cv2.resize(panorama.rgb, size, interpolation=cv2.INTER_AREA), np.uint8)
         return Panorama(rgb, np.ones(rgb.shape[:2], np.bool_))
     step, rest = divmod(panorama.rgb.shape[1], width)
-    if rest or step < 2:
+    if rest:
         return Panorama(*_resize_masked(panorama.rgb, panorama.is_valid, size))
     rgb = np.zeros((*size[::-1], 3), np.uint8)
     is_valid = np.zeros(size[::-1], np.bool_)
