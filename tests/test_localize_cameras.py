@@ -54,7 +54,7 @@ def cut(full, mount):
 
 
 def test_a_rig_of_four_photos_equals_the_sphere_that_they_were_cut_from(tmp_path):
-    this, pose = place()
+    this, pose = place(0)
     full = photograph(this, pose, 1024, Workers(2))
     folder = tmp_path / "instant"
     folder.mkdir()
