@@ -35,6 +35,7 @@ DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at mo
 COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))
 CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
 SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do
+MOST_RIVALS = 4  # of a whole photo: the scan is drawn in four views for each, and further ones never won
 RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 
@@ -71,7 +72,7 @@ def list_rivals(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) ->
         return []
     if count_agreeing(query, best.pose) >= SURE_MATCHES:
         others = [h for h in others if h.score >= RIVAL_SCORE * best.score]
-    return list(others)
+    return list(others if query.photo.is_partial else others[:MOST_RIVALS])
 
 
 def count_each(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[int]:
