@@ -164,13 +164,14 @@ def test_margin_is_the_lesser_of_two_leads():
 @pytest.mark.parametrize(
     ("scores", "counts", "is_sure"),
     [
-        ((0.09, 0.02), (12, 0), True),
+        ((0.11, 0.02), (12, 0), True),
+        ((0.09, 0.02), (12, 0), False),  # a faint pose ends no search
         ((0.5, 0.1), (11, 0), False),
         ((0.5, 0.4), (20, 0), True),  # many features agree with the one, none with the other
         ((0.5, 0.4), (40, 25), False),
     ],
 )
-def test_a_pose_is_sure_by_its_matches_and_its_odds_elsewhere(monkeypatch, scores, counts, is_sure):
+def test_a_pose_is_sure_by_its_score_its_matches_and_its_odds_elsewhere(monkeypatch, scores, counts, is_sure):
     query = compared(monkeypatch, *(dict(zip((0.0, 3.0), pair, strict=True)) for pair in (scores, counts)))
     assert selection.is_sure(query, [at(0.0, scores[0]), at(3.0, scores[1])]) == is_sure
 

@@ -7,11 +7,10 @@ from functools import partial
 from ..confidence.alternatives import Hypothesis
 from .ladder import climb_to_full, climb_unoccluded, settle
 from .query import Query
-from .selection import Selection, rank, select
+from .selection import FAINT_SCORE, Selection, rank, select
 from .verification import CHANCE_MATCHES, SURE_MATCHES, count_each
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
-FAINT_SCORE = 0.1  # if all poses have less, and no more matches than by chance, refinement soon ends
 NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best
 MAX_REFINED = 4  # alternatives
 
@@ -44,7 +43,7 @@ def refine_best(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
 
 
 def is_faint(query: Query, found: Selection) -> bool:
-    """Return True if the best pose and all alternatives have a low score and few matches."""
+    """Return True if all poses are faint and no more features agree than by chance: refinement soon ends."""
     scores = [h.score for h in (found.best, *found.alternatives)]
     if max(scores) >= FAINT_SCORE:
         return False

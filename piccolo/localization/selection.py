@@ -16,6 +16,7 @@ from .settings import DRAWN_VIEW
 from .verification import SURE_MATCHES, count_each
 
 MAX_COMPARED = 8  # alternatives of the best pose
+FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
 SURE_ODDS = 3.0  # [log] least odds of the best pose against any elsewhere: 20 to 1
 CLEAR_SCORE = 0.3  # least score by whole views without features: see docs/METHOD.md
 CLEAR_SHAPE = 0.1  # least score by edges
@@ -100,10 +101,11 @@ def select(query: Query, found: Selection) -> Selection:
 
 
 def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Return True if the matches of the best pose, and its odds, end the search."""
-    if not hypotheses:
+    """Return True if the best pose is not faint, and its matches and its odds end the search."""
+    ranked = rank(hypotheses)
+    if ranked.best.score < FAINT_SCORE:
         return False
-    found = select(query, rank(hypotheses))
+    found = select(query, ranked)
     best, *others = assess_poses(query, found.best, found.alternatives)
     if (best.num_matches or 0) < SURE_MATCHES:
         return False
