@@ -9,22 +9,13 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-import numpy as np
-
-from ..arrays import Array
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import (
-    LOOSE,
-    PoseGaussian,
-    differentiate_rays,
-    probability_within,
-    turn_positions,
-)
+from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..local_features.hypotheses import COS_EXACT, exact_pose, find_inliers, propose_poses
+from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
@@ -37,9 +28,8 @@ from .localize import Found, fit_camera
 from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
 from .settings import CoarseToFineSettings
-from .verification import SURE_MATCHES, Located, match_beside, place_keypoints
+from .verification import SURE_MATCHES, Located, match_beside, match_covariance, place_keypoints
 
-LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 MOST_BESIDE = 3  # photos whose matches count, those with the most
 
 
@@ -147,16 +137,6 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
     fused = expected.fuse(own)
     is_contradicted = contradictions(ended.query.scan_map, fused.pose, ended.query.settings.prior)
     return None if is_contradicted else fused
-
-
-def match_covariance(matches: Matches, pose: Pose) -> Array:
-    """Return the covariance (6, 6) of a pose by its matches, as of `PoseGaussian`."""
-    agreeing = find_inliers(matches, pose, COS_EXACT)
-    rays, J = differentiate_rays(matches.points[agreeing], pose)
-    information = np.einsum("kai,kaj->ij", J, J)
-    squares = np.square(rays - matches.rays[agreeing]).sum()
-    variance = max(squares / max(2 * len(rays) - 6, 1), LEAST_ERROR**2)
-    return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
 
 
 def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor, int] | None:

@@ -56,6 +56,13 @@ class Errors(NamedTuple):
         """Return these with a further error (6, 6) that photos have in common, as of a focal length."""
         return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
 
+    def fuse(self, pose: Pose, own: Array) -> "Errors":
+        """Return the mean with another estimate of the pose in the same scan; its own covariance is (6, 6)."""
+        if self.gaussian is None:
+            return self
+        fused = self.gaussian.fuse(PoseGaussian(pose, own, self.gaussian.common))
+        return Errors(fused, largest_std(fused.covariance))
+
 
 UNKNOWN_ERRORS = Errors(None, None)
 

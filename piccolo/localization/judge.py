@@ -54,7 +54,7 @@ from .query import Query
 from .search import search_poses
 from .selection import Selection, assess_poses
 from .shape import find_alike
-from .verification import count_agreeing, count_each, find_copies, list_rivals
+from .verification import count_agreeing, count_each, find_copies, list_rivals, place_by_matches
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
@@ -113,7 +113,8 @@ def judge_together(
     if measured is None:
         return Localization()
     standings = assess_poses(query, found.best, found.alternatives)
-    measured = measured._replace(errors=measured.errors._replace(gaussian=gaussian))
+    errors = measured.errors._replace(gaussian=gaussian)
+    measured = measured._replace(pose=gaussian.pose, errors=errors)
     return conclude(query, found, fit, measured, standings, probabilities)
 
 
@@ -217,6 +218,7 @@ def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> L
 def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | None:
     """Measure how well the best pose explains a photo, and how well the photo fixes the pose.
 
+    The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan.
     None if there is no pose, or no point is visible from it.
     """
     if found.best.score < 0.0:
@@ -236,6 +238,10 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     errors, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return None
+    by_matches = place_by_matches(query, pose) if query.is_narrow else None
+    if by_matches is not None:
+        errors = errors.fuse(*by_matches)
+        pose = errors.gaussian.pose if errors.gaussian else pose
     errors = errors.widen(fit.pose_covariance) if fit else errors
     num_matches = count_each(query, found.best, found.alternatives)
     evidence = Evidence(

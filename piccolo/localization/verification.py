@@ -14,14 +14,15 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import Array32, Bytes
+from ..arrays import Array, Array32, Bytes
 from ..confidence.alternatives import Hypothesis
 from ..confidence.occlusion import EXPLAINED, occlusion_mask
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
+from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
 from ..kernels.jit import kernel
-from ..local_features.hypotheses import LEAST_MATCHES, count_matches, exact_pose
+from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView, add_margin
@@ -38,6 +39,9 @@ SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated place
 MOST_RIVALS = 4  # of a whole photo: the scan is drawn in four views for each, and further ones never won
 RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
+LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
+# of the covariance by matches with the drawn scan, whose errors are no noise: by 76 crops of three scenes
+DRAWN_INFLATION = 4.0
 
 
 class Located(NamedTuple):
@@ -95,6 +99,28 @@ def verify(query: Query, pose: Pose) -> Verified:
     if found is None:
         return Verified(pose, 0)
     return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
+
+
+def place_by_matches(query: Query, pose: Pose) -> tuple[Pose, Array] | None:
+    """Return the pose near another with which most matches with the drawn scan agree, and its covariance.
+
+    None if no more agree than by chance. The covariance (6, 6) is as of `PoseGaussian`.
+    """
+    matches = matches_near(query, pose)
+    found = exact_pose(matches, pose)
+    if found is None or found.num_matches <= CHANCE_MATCHES or not CONFIRMED.holds(found.pose, pose):
+        return None
+    return found.pose, DRAWN_INFLATION * match_covariance(matches, found.pose)
+
+
+def match_covariance(matches: Matches, pose: Pose) -> Array:
+    """Return the covariance (6, 6) of a pose by its matches, as of `PoseGaussian`."""
+    agreeing = find_inliers(matches, pose, COS_EXACT)
+    rays, J = differentiate_rays(matches.points[agreeing], pose)
+    information = np.einsum("kai,kaj->ij", J, J)
+    squares = np.square(rays - matches.rays[agreeing]).sum()
+    variance = max(squares / max(2 * len(rays) - 6, 1), LEAST_ERROR**2)
+    return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
 
 
 def matches_near(query: Query, pose: Pose) -> Matches:
