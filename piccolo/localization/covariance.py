@@ -57,7 +57,7 @@ class Errors(NamedTuple):
         return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
 
     def fuse(self, pose: Pose, own: Array) -> "Errors":
-        """Return the mean with another estimate of the pose in the same scan; its own covariance is (6, 6)."""
+        """Return the mean with another estimate of the pose; of its error `own` (6, 6) is not in common."""
         if self.gaussian is None:
             return self
         fused = self.gaussian.fuse(PoseGaussian(pose, own, self.gaussian.common))
