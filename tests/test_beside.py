@@ -15,7 +15,7 @@ from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
-from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside, match_covariance
+from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside
 from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
 from piccolo.localization.selection import NOTHING
@@ -75,7 +75,7 @@ def test_the_covariance_of_matches_is_that_of_poses_found_by_them(noise, count):
         matches = _matches_of(true, noise, rng, count)
         found = exact_pose(matches, true).pose
         step = subtract(true, found)
-        squares.append(step @ np.linalg.solve(match_covariance(matches, found), step))
+        squares.append(step @ np.linalg.solve(verification.match_covariance(matches, found), step))
     assert 3.0 < np.median(squares) < 9.0  # of 6 parameters 5.3
 
 

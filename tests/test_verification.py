@@ -13,6 +13,7 @@ from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
+from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import count_matches
@@ -159,6 +160,17 @@ def test_a_pose_is_refined_towards_the_truth():
     assert after[0] < min(0.02, 0.4 * before[0])
     assert after[1] < 0.4 * before[1]
     assert found.num_matches >= 20
+
+
+def test_matches_give_a_pose_whose_error_they_cover():
+    squares = []
+    for offset in (SMALL, -SMALL, 0.0 * SMALL):
+        pose, covariance = verification.place_by_matches(_query(), step(_true_pose(), offset))
+        off = subtract(_true_pose(), pose)
+        squares.append(off @ np.linalg.solve(covariance, off))
+        assert rooms.errors(pose, _true_pose())[0] < 0.03
+    assert max(squares) < LIKELY
+    assert verification.place_by_matches(_query(), _moved((1.0, -0.8, 0.0))) is None
 
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():
