@@ -51,7 +51,7 @@ def _text(pano, status="localized", beside=None, cameras=PHONE, confidence=0.95)
 
 def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     """A narrow photo of what a wide one shows, which is added to the run; a copy of itself is none."""
-    room, pose = place(1)
+    room, pose = place(0)
     near = Pose(yaw_rotation(0.2) @ pose.R_cam_from_world, pose.center_world + np.array([0.15, 0.1, 0.05]))
     photos = tmp_path / "photos"
     cameras = tmp_path / "cameras"
