@@ -17,8 +17,8 @@ from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
-from .comparison import compare, score_pose
-from .covariance import Errors, estimate_covariance
+from .comparison import score_pose
+from .covariance import Errors, estimate_errors
 from .focal_length import FocalFit
 from .ladder import FINE, refine
 from .last_descent import HOPELESS_SCORE
@@ -185,7 +185,7 @@ def find_support(member: Member, query: Query, bundle: Bundle, exchanged: Sequen
     poses += [score_pose(query, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in poses)]
     errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
-        errors = estimate_covariance(query, found.pose, compare(query, found.pose))
+        errors = estimate_errors(query, found.pose)
         errors = errors.widen(member.fit.pose_covariance) if member.fit else errors
     p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(errors.gaussian), errors.std_of_fit)
     k = next(k for k, h in enumerate(poses) if h is found)

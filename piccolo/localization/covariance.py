@@ -18,10 +18,11 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
-from .comparison import Comparison, mask_occluders
+from .comparison import Comparison, compare, mask_occluders
 from .ladder import LAST, to_levels
 from .query import Query
 from .settings import ImageName
+from .verification import place_by_matches
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
@@ -330,6 +331,16 @@ def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     common = scan_covariance(query.scan_map, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
+
+
+def estimate_errors(query: Query, pose: Pose) -> Errors:
+    """Estimate the errors of a pose in the map that a photo has by itself.
+
+    The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan.
+    """
+    errors = estimate_covariance(query, pose, compare(query, pose))
+    by_matches = place_by_matches(query, pose) if query.is_narrow else None
+    return errors.fuse(*by_matches) if by_matches else errors
 
 
 def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:

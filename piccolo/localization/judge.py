@@ -44,8 +44,8 @@ from ..scan_map.scan_map import ScanMap
 from ..views.zbuffer import visible_points
 from .attempts import FIRST_BEAM
 from .beam import brief_query, descend_briefly, refine_matches, refine_starts, score_briefly, score_near
-from .comparison import compare, score_pose
-from .covariance import Errors, estimate_covariance
+from .comparison import score_pose
+from .covariance import Errors, estimate_errors
 from .focal_length import FocalFit, fit_focal
 from .ladder import settle
 from .photo import ACROSS
@@ -54,7 +54,7 @@ from .query import Query
 from .search import search_poses
 from .selection import Selection, assess_poses
 from .shape import find_alike
-from .verification import count_agreeing, count_each, find_copies, list_rivals, place_by_matches
+from .verification import count_agreeing, count_each, find_copies, list_rivals
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
@@ -218,7 +218,7 @@ def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> L
 def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | None:
     """Measure how well the best pose explains a photo, and how well the photo fixes the pose.
 
-    The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan.
+    The pose is that of `estimate_errors`.
     None if there is no pose, or no point is visible from it.
     """
     if found.best.score < 0.0:
@@ -230,7 +230,7 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, make_sampling_loss(query.colors()), pose, descent).pose
     measures: list[Callable[[], Any]] = [
-        partial(estimate_covariance, query, pose, compare(query, pose)),  # takes longest
+        partial(estimate_errors, query, pose),  # takes longest
         lambda: compare_occlusion(points, query.given, pose).fractions(),
         lambda: sampling_loss(visible_points(points, pose.center_world), query.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),
@@ -238,10 +238,7 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     errors, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return None
-    by_matches = place_by_matches(query, pose) if query.is_narrow else None
-    if by_matches is not None:
-        errors = errors.fuse(*by_matches)
-        pose = errors.gaussian.pose if errors.gaussian else pose
+    pose = errors.gaussian.pose if errors.gaussian else pose
     errors = errors.widen(fit.pose_covariance) if fit else errors
     num_matches = count_each(query, found.best, found.alternatives)
     evidence = Evidence(
