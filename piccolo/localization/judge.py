@@ -218,7 +218,7 @@ def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> L
 def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | None:
     """Measure how well the best pose explains a photo, and how well the photo fixes the pose.
 
-    The pose is that of `estimate_errors`.
+    The pose is that of `estimate_errors`; evidence and loss are those of the best pose, which is near.
     None if there is no pose, or no point is visible from it.
     """
     if found.best.score < 0.0:
