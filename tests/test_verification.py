@@ -12,7 +12,7 @@ import rooms
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.confidence.alternatives import Hypothesis
-from piccolo.geometry.pose import Pose, exp_so3, log_so3, step, yaw_rotation
+from piccolo.geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
@@ -20,7 +20,10 @@ from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import verification
+from piccolo.localization.comparison import compare
+from piccolo.localization.covariance import estimate_covariance, estimate_errors
 from piccolo.panorama import Panorama
+from piccolo.photo import Prior
 from piccolo.scan_map.scan_map import prepare_map
 from research.synthetic.world import change_light, mask_outside_field, photograph, scan_world
 
@@ -171,6 +174,21 @@ def test_matches_give_a_pose_whose_error_they_cover():
         assert rooms.errors(pose, _true_pose())[0] < 0.03
     assert max(squares) < LIKELY
     assert verification.place_by_matches(_query(), _moved((1.0, -0.8, 0.0))) is None
+
+
+def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the_prior():
+    pose = step(_true_pose(), 0.5 * SMALL)
+    alone = estimate_covariance(_query(), pose, compare(_query(), pose))
+    found = estimate_errors(_query(), pose)
+    assert rooms.errors(found.gaussian.pose, _true_pose())[0] < rooms.errors(pose, _true_pose())[0]
+    assert found.std_of_fit == found.gaussian.largest_std < alone.std_of_fit
+    moved = found.gaussian.pose.center_world - pose.center_world
+    length = float(np.linalg.norm(moved))
+    before = Pose(np.eye(3), pose.center_world - moved / length)  # a metre behind
+    near = tuple(_query().scan_map.to_world(before).center_world)
+    prior = Prior(near=near, radius=1.0 + 0.5 * length - MAX_DISTANCE)
+    asked = replace(_query(), settings=replace(_query().settings, prior=prior))
+    assert estimate_errors(asked, pose).gaussian.pose.key == pose.key
 
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():

@@ -20,6 +20,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
 from .comparison import Comparison, compare, mask_occluders
 from .ladder import LAST, to_levels
+from .prior import contradictions
 from .query import Query
 from .settings import ImageName
 from .verification import place_by_matches
@@ -56,13 +57,6 @@ class Errors(NamedTuple):
     def widen(self, common: Array) -> "Errors":
         """Return these with a further error (6, 6) that photos have in common, as of a focal length."""
         return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
-
-    def fuse(self, pose: Pose, own: Array) -> "Errors":
-        """Return the mean with another estimate of the pose; of its error `own` (6, 6) is not in common."""
-        if self.gaussian is None:
-            return self
-        fused = self.gaussian.fuse(PoseGaussian(pose, own, self.gaussian.common))
-        return Errors(fused, largest_std(fused.covariance))
 
 
 UNKNOWN_ERRORS = Errors(None, None)
@@ -336,11 +330,16 @@ def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
 def estimate_errors(query: Query, pose: Pose) -> Errors:
     """Estimate the errors of a pose in the map that a photo has by itself.
 
-    The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan.
+    The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan,
+    unless that contradicts the prior.
     """
     errors = estimate_covariance(query, pose, compare(query, pose))
     by_matches = place_by_matches(query, pose) if query.is_narrow else None
-    return errors.fuse(*by_matches) if by_matches else errors
+    if errors.gaussian is None or by_matches is None:
+        return errors
+    fused = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
+    is_contradicted = contradictions(query.scan_map, fused.pose, query.settings.prior)
+    return errors if is_contradicted else Errors(fused, fused.largest_std)
 
 
 def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:

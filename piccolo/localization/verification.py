@@ -40,7 +40,8 @@ MOST_RIVALS = 4  # of a whole photo: the scan is drawn in four views for each, a
 RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
-# of the covariance by matches with the drawn scan, whose errors are no noise: by 76 crops of three scenes
+# of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
+# scenes
 DRAWN_INFLATION = 4.0
 
 
