@@ -95,6 +95,12 @@ def test_the_page_of_a_scene_says_what_was_measured(scene, tmp_path, monkeypatch
     assert float(speeds["loss"]["of cv2.remap"]) > 0.0
 
 
+def test_the_times_of_two_methods_are_compared_by_their_medians():
+    seconds = (("paper", 3.0), ("paper", 2.0), ("paper", 9.0), ("default", 0.5), ("default", 0.3))
+    rows = [SimpleNamespace(variant=variant, seconds=s) for variant, s in seconds]
+    assert page.time_ratio(rows) == pytest.approx(7.5)
+
+
 def test_sizes_are_those_asked_for(scene, monkeypatch):
     monkeypatch.setattr(speed, "NUM_QUERIES", 1)
     points, _, queries = speed.scene_case(read_scene(scene), 50_000)  # more than it has

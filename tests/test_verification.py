@@ -19,12 +19,15 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import verification
+from piccolo.localization import judge, verification
 from piccolo.localization.comparison import compare
 from piccolo.localization.covariance import estimate_covariance, estimate_errors
+from piccolo.localization.selection import Selection
+from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import Panorama
 from piccolo.photo import Prior
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.views.zbuffer import visible_points
 from research.synthetic.world import change_light, mask_outside_field, photograph, scan_world
 
 NUM_POINTS = 200_000
@@ -189,6 +192,16 @@ def test_a_pose_is_averaged_with_that_by_its_matches_unless_that_contradicts_the
     prior = Prior(near=near, radius=1.0 + 0.5 * length - MAX_DISTANCE)
     asked = replace(_query(), settings=replace(_query().settings, prior=prior))
     assert estimate_errors(asked, pose).gaussian.pose.key == pose.key
+
+
+def test_the_loss_is_that_of_the_averaged_pose():
+    query = _query()
+    pose = step(_true_pose(), 0.5 * SMALL)
+    measured = judge.measure(query, Selection(Hypothesis(pose, 0.5), ()), None)
+    assert measured.pose.key == estimate_errors(query, pose).gaussian.pose.key != pose.key
+    points = visible_points(query.surroundings_at(pose)[0], measured.pose.center_world)
+    assert measured.loss == sampling_loss(points, query.colors(), measured.pose)
+    assert measured.loss < sampling_loss(points, query.colors(), pose)
 
 
 def test_verification_is_the_same_bits_at_any_number_of_threads():

@@ -21,11 +21,11 @@ from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
 from .comparison import score_pose
-from .covariance import split_errors
+from .covariance import fuse_allowed, split_errors
 from .judge import judge, reconsider, take_pose
 from .last_descent import refine_best
 from .localize import Found, fit_camera
-from .prior import apply_prior, contradictions
+from .prior import apply_prior
 from .query import Query, prepare_query
 from .settings import CoarseToFineSettings
 from .verification import SURE_MATCHES, Located, match_beside, match_covariance, place_keypoints
@@ -134,9 +134,7 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
     expected = of_photo.attach(other_from_cam, match_covariance(other.matches, other.pose))
     if ended.fit is not None:
         expected = expected.widen(ended.fit.pose_covariance)
-    fused = expected.fuse(own)
-    is_contradicted = contradictions(ended.query.scan_map, fused.pose, ended.query.settings.prior)
-    return None if is_contradicted else fused
+    return fuse_allowed(ended.query, expected, own)
 
 
 def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor, int] | None:

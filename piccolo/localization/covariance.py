@@ -337,9 +337,14 @@ def estimate_errors(query: Query, pose: Pose) -> Errors:
     by_matches = place_by_matches(query, pose) if query.is_narrow else None
     if errors.gaussian is None or by_matches is None:
         return errors
-    fused = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
-    is_contradicted = contradictions(query.scan_map, fused.pose, query.settings.prior)
-    return errors if is_contradicted else Errors(fused, fused.largest_std)
+    fused = fuse_allowed(query, errors.gaussian, PoseGaussian(*by_matches, errors.gaussian.common))
+    return errors if fused is None else Errors(fused, fused.largest_std)
+
+
+def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
+    """Return the mean of two estimates of a pose in the map; None if it contradicts the prior."""
+    fused = one.fuse(other)
+    return None if contradictions(query.scan_map, fused.pose, query.settings.prior) else fused
 
 
 def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:

@@ -19,7 +19,6 @@ import math
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from itertools import compress
 from typing import Any, NamedTuple
 
@@ -218,7 +217,7 @@ def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> L
 def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | None:
     """Measure how well the best pose explains a photo, and how well the photo fixes the pose.
 
-    The pose is that of `estimate_errors`; evidence and loss are those of the best pose, which is near.
+    The pose is that of `estimate_errors`, the loss is taken there; the evidence is that of the best pose.
     None if there is no pose, or no point is visible from it.
     """
     if found.best.score < 0.0:
@@ -229,16 +228,21 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
     if settings.solver != "gauss-newton":
         descent = DescentSettings(solver=settings.solver, step_size=LAST_STEP)
         pose = refine(points, make_sampling_loss(query.colors()), pose, descent).pose
+
+    def find_end() -> tuple[Errors, Pose, float]:
+        """Return the errors, the pose that they are of, and the loss there."""
+        errors = estimate_errors(query, pose)
+        end = errors.gaussian.pose if errors.gaussian else pose
+        return errors, end, sampling_loss(visible_points(points, end.center_world), query.colors(), end)
+
     measures: list[Callable[[], Any]] = [
-        partial(estimate_errors, query, pose),  # takes longest
+        find_end,  # takes longest
         lambda: compare_occlusion(points, query.given, pose).fractions(),
-        lambda: sampling_loss(visible_points(points, pose.center_world), query.colors(), pose),
         lambda: measure_agreement(coarse, query.photo.panorama, pose),
     ]
-    errors, fractions, loss, agreement = query.workers.map(operator.call, measures, "evaluate")
+    (errors, end, loss), fractions, agreement = query.workers.map(operator.call, measures, "evaluate")
     if not math.isfinite(loss):
         return None
-    pose = errors.gaussian.pose if errors.gaussian else pose
     errors = errors.widen(fit.pose_covariance) if fit else errors
     num_matches = count_each(query, found.best, found.alternatives)
     evidence = Evidence(
@@ -251,7 +255,7 @@ def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | 
         num_matches=num_matches[0] if query.uses_matches else None,
         alternative_matches=max(num_matches[1:], default=0) if query.uses_matches else None,
     )
-    return Measured(pose, errors, loss, evidence)
+    return Measured(end, errors, loss, evidence)
 
 
 def list_reported(query: Query, found: Selection) -> tuple[tuple[Hypothesis, ...], list[bool]]:
