@@ -17,7 +17,7 @@ from .camera import Mount
 from .camera.calibration import document_of as camera_document, read_mounts
 from .confidence.confidence import AMBIGUOUS, LOCALIZED
 from .confidence.covariance import PoseCovariance
-from .confidence.localization import Alternative, Evidence, FocalLength, Localization
+from .confidence.localization import Alternative, Evidence, FocalLength, Localization, SphereGeometry
 from .errors import UNPRINTABLE, InputError, printable, text_of
 from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose, heading_pitch_roll_deg
@@ -26,7 +26,7 @@ from .jobs.memory import is_shortage
 from .photo import GpsPrior
 from .walk.results import WalkFrame
 
-FORMAT = "piccolo-pose/10"
+FORMAT = "piccolo-pose/11"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE = "unreadable"
 FAILED = "failed"
@@ -94,6 +94,8 @@ class Result:
         Digests of scan and photo, the photo's size and capture time.
     cameras, focal_length
         Cameras of a photo that is no sphere; the estimate of a focal length that is not exact.
+    sphere
+        What a panorama shows of the sphere, if the scan says that it is not what it claims.
     gps_prior
         Where the photo's GPS position lies in the scan, if both are known.
     walk
@@ -125,6 +127,7 @@ class Result:
     gps_prior: GpsPrior | None = None
     cameras: tuple[Mount, ...] = ()
     focal_length: FocalLength | None = None
+    sphere: SphereGeometry | None = None
     scan: str | None = None
     probability_none: float | None = None
     storey: int | None = None
@@ -225,6 +228,7 @@ class Result:
             "pano": self.pano,
             "camera": camera_document(self.cameras) if self.cameras else None,
             "focal_length": self.focal_length and asdict(self.focal_length),
+            "sphere": self.sphere and asdict(self.sphere),
             **asdict(self.source),
             **(_pose_json(self.pose) or dict.fromkeys(POSE_FIELDS)),
             "best_guess": _pose_json(self.best_guess),

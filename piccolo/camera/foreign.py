@@ -13,11 +13,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..errors import import_optional
-from .model import MODELS, Camera
+from .model import CUT_SPHERE, MODELS, Camera
 
 READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, XML of OpenCV or Metashape"
 # COLMAP's numbers of the models that are read
-MODEL_NUMBERS = dict(zip((0, 1, 2, 3, 4, 6, 7, 14, 15, 8, 9, 5, 10, 17), MODELS, strict=True))
+MODEL_NUMBERS = dict(
+    zip((0, 1, 2, 3, 4, 6, 7, 14, 15, 8, 9, 5, 10, 17), (m for m in MODELS if m != CUT_SPHERE), strict=True)
+)
 POINT_SIZE = 24  # [byte] of a point in images.bin
 MAX_NAME = 4096  # [byte]
 MATRIX = ("camera_matrix", "cameramatrix", "intrinsic_matrix", "intrinsics", "k")

@@ -7,6 +7,7 @@ is half a pixel less. Rays are in our camera axes, +x the image centre, +y left,
 A ray at the angle theta from the axis comes to the radius r in the plane in front of the lens:
     perspective r = tan theta;  equidistant r = theta (Kannala and Brandt, 2006);
     FOV r = atan(2 tan(omega / 2) tan theta) / omega (Devernay and Faugeras, 2001).
+Of a partial sphere x is the azimuth to the right and y the angle below the horizon [rad].
 Then it is distorted, with r2 = x^2 + y^2, as OpenCV (modules/calib3d, "Detailed description") has it:
     g  = (1 + k1 r2 + k2 r2^2 + k3 r2^3 + k4 r2^4) / (1 + d1 r2 + d2 r2^2 + d3 r2^3),
     x' = x g + 2 p1 x y + p2 (r2 + 2 x^2) + sx1 r2,
@@ -35,6 +36,8 @@ PERSPECTIVE = "perspective"
 EQUIDISTANT = "equidistant"
 FOV = "fov"
 SPHERE = "sphere"
+PARTIAL_SPHERE = "partial sphere"
+CUT_SPHERE = "PARTIAL_EQUIRECTANGULAR"  # the one model that is not COLMAP's
 # lens, and names of the parameters as the formulas here have them
 MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
     model: (lens, tuple(names.split()))
@@ -53,6 +56,7 @@ MODELS: dict[str, tuple[str, tuple[str, ...]]] = {
         ("OPENCV_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 k3 k4"),
         ("THIN_PRISM_FISHEYE", EQUIDISTANT, "fx fy cx cy k1 k2 p1 p2 k3 k4 sx1 sy1"),
         ("EQUIRECTANGULAR", SPHERE, "w h"),
+        (CUT_SPHERE, PARTIAL_SPHERE, "fx fy cx cy"),
     )
 }
 FOCALS = "f", "fx", "fy"
@@ -272,6 +276,9 @@ class Camera:
         right = -rays[..., 1]
         down = -rays[..., 2]
         across = np.sqrt(right * right + down * down)
+        if self.lens == PARTIAL_SPHERE:
+            angles = np.arctan2(right, forward), np.arctan2(down, np.hypot(forward, right))
+            return self._place(*angles, np.ones(forward.shape, np.bool_))
         if self.lens == PERSPECTIVE:
             is_in = (forward > 0.0) & (across <= math.tan(self.max_angle) * forward)
             per = 1.0 / np.where(is_in, forward, np.inf)
@@ -284,6 +291,10 @@ class Camera:
         if self.distortion != Distortion():
             is_in = is_in & self.distortion.keeps_sides(x, y)
             x, y = self.distortion.apply(x, y)
+        return self._place(x, y, is_in)
+
+    def _place(self, x: Array, y: Array, is_in: Mask) -> tuple[Array, Mask]:
+        """Return pixels (..., 2) of places in the plane (...), and which are in the picture."""
         u = self.focal[0] * x + self._named["cx"]
         v = self.focal[1] * y + self._named["cy"]
         is_in = is_in & (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
@@ -298,6 +309,10 @@ class Camera:
         x = (u - self._named["cx"]) / self.focal[0]
         y = (v - self._named["cy"]) / self.focal[1]
         is_found = np.ones(x.shape, np.bool_)
+        if self.lens == PARTIAL_SPHERE:
+            is_found = (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
+            flat = np.cos(y)
+            return np.stack([flat * np.cos(x), -flat * np.sin(x), -np.sin(y)], axis=-1), is_found
         if self.distortion != Distortion():
             x, y, is_found = self.distortion.invert(x, y, self._radii)
         radius = np.hypot(x, y)
@@ -334,6 +349,12 @@ class Camera:
 def pinhole(width: int, height: int, focal: float) -> Camera:
     """Return an ideal photo of this size and focal length [px], its axis in the middle."""
     return Camera("SIMPLE_PINHOLE", width, height, (focal, width / 2.0, height / 2.0))
+
+
+def whole_sphere(width: int, height: int) -> Camera:
+    """Return the camera of a picture that shows the whole sphere, the horizon in the middle."""
+    params = width / (2.0 * math.pi), height / math.pi, width / 2.0, height / 2.0
+    return Camera(CUT_SPHERE, width, height, params)
 
 
 def camera_of_fov(lens: str, fov_deg: float, width: int, height: int) -> Camera:

@@ -14,7 +14,7 @@ import numpy as np
 from ..arrays import Array, Bytes, Floats, Mask
 from ..geometry.sphere import compute_rays
 from .calibration import Mount
-from .model import SPHERE
+from .model import PARTIAL_SPHERE, SPHERE
 
 MAX_SPHERE_WIDTH = 4096  # [px] nothing looks at more
 MIN_SPHERE_WIDTH = 256  # [px]
@@ -96,7 +96,7 @@ def _resample_block(view: View, width: int, top: int, left: int) -> Pixels:
     v = top + np.arange(0.0, ROWS + 1, CELL)
     places, is_in = _places(view, width, u, v)
     num = _num_samples(places, is_in)
-    if is_in.all() and view.mount.camera.lens != SPHERE:  # whose seam is no place between two others
+    if is_in.all() and view.mount.camera.lens not in (SPHERE, PARTIAL_SPHERE):  # their seams are no place
         places = _interpolate_between(
             _interpolate_between(places, num * CELL).swapaxes(0, 1), num * CELL
         ).swapaxes(0, 1)

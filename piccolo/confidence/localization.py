@@ -72,6 +72,23 @@ class FocalLength:
 
 
 @dataclass(frozen=True)
+class SphereGeometry:
+    """What a panorama shows of the sphere, and where its horizon lies."""
+
+    width_deg: float  # 360 of a whole sphere
+    height_deg: float  # 180 of a whole sphere
+    horizon_deg: float  # below the picture's middle
+    std_deg: tuple[float, float, float]  # deviations of these
+
+    def explain(self) -> str:
+        """Say in a line what the panorama shows."""
+        shown = f"the panorama shows {self.width_deg:.1f} x {self.height_deg:.1f} of 360 x 180 degrees"
+        horizon = abs(self.horizon_deg)
+        side = "below" if self.horizon_deg > 0.0 else "above"
+        return f"{shown}, its horizon {horizon:.1f} deg {side} the middle: taken as that"
+
+
+@dataclass(frozen=True)
 class Localization:
     """The best pose for one panorama, in world coordinates, and the evidence for and against it."""
 
@@ -86,6 +103,7 @@ class Localization:
     warnings: tuple[str, ...] = ()  # one line each: why there is no pose, or to doubt it
     cameras: tuple[Mount, ...] = ()  # of a photo whose focal length was fitted: the camera found
     focal_length: FocalLength | None = None  # of such a photo
+    sphere: SphereGeometry | None = None  # of a panorama that is not as it claims
     scan: str | None = None  # as of Alternative
     storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
     height_above_floor: float | None = None  # [m] of the pose, above the floor there

@@ -44,7 +44,7 @@ from .bundle_search import (
 )
 from .comparison import score_pose
 from .focal_length import FocalFit, calibrate
-from .judge import judge, judge_together
+from .judge import Fit, judge, judge_together
 from .localize import find, find_by_edges, prepare_search
 from .query import Query
 from .selection import Selection
@@ -308,10 +308,10 @@ def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
     return math.exp(min(logs[0] - logs[1], MOST_GAIN))
 
 
-def recalibrate_at(member: Member, support: Support) -> tuple[Query, FocalFit | None]:
+def recalibrate_at(member: Member, support: Support) -> tuple[Query, Fit | None]:
     """Return the query, and the focal length fitted at a photo's own pose, if it is not exact."""
     query = member.query.forget()
-    if member.fit is None or support.own is member.selection.best:
+    if not isinstance(member.fit, FocalFit) or support.own is member.selection.best:
         return query, member.fit
     query, _, fit = calibrate(query, Selection(support.own, ()))
     return query, fit

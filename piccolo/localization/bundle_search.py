@@ -19,7 +19,7 @@ from ..geometry.pose_gaussian import PoseGaussian, std_of
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .comparison import score_pose
 from .covariance import Errors, estimate_errors
-from .focal_length import FocalFit
+from .judge import Fit
 from .ladder import FINE, refine
 from .last_descent import HOPELESS_SCORE
 from .query import Query
@@ -43,7 +43,7 @@ class Member:
 
     query: Query  # without what takes memory
     selection: Selection
-    fit: FocalFit | None
+    fit: Fit | None
     alone: Localization
     cam_from_bundle: Pose
 

@@ -167,14 +167,15 @@ def block_gradients(sums: Array) -> Array:
 
 
 def jackknife_gradients(gradients: Array, matrices: Array) -> Array:
-    """Return gradients (B, 6) as at a pose found without each block, by matrices (B, 6, 6).
+    """Return gradients (B, n) as at a pose found without each block, by matrices (B, n, n).
 
     The more information one block holds, the more the pose has followed its errors, and the less of them its
     gradient shows: g <- (I - A_b A^-1)^-1 g, with the block's part A_b of the Gauss-Newton matrix A
     (the estimate CR3 of Bell and McCaffrey, 2002).
     """
     shares = matrices @ np.linalg.pinv(matrices.sum(axis=0))
-    return np.asarray(np.linalg.solve(ONE_BLOCK * np.eye(6) - shares, gradients[..., None])[..., 0])
+    identity = np.eye(gradients.shape[1])
+    return np.asarray(np.linalg.solve(ONE_BLOCK * identity - shares, gradients[..., None])[..., 0])
 
 
 def sandwich_covariance(hessian: Array, gradients: Array) -> Array | None:

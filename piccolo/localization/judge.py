@@ -53,6 +53,7 @@ from .query import Query
 from .search import search_poses
 from .selection import Selection, assess_poses
 from .shape import find_alike
+from .sphere import SphereFit
 from .verification import count_agreeing, count_each, find_copies, list_rivals
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
@@ -60,9 +61,16 @@ WORTH_ASKING = 0.2  # least probability of all poses together, for which the mir
 FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found
 MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo; in symmetric scenes it is about 1
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
+NOT_AS_CLAIMED = (
+    "the panorama does not show 360 x 180 degrees with the horizon in the middle: give it as it was stitched, "
+    "not cropped or stretched"
+)
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
+
+
+Fit = FocalFit | SphereFit
 
 
 class Measured(NamedTuple):
@@ -74,9 +82,7 @@ class Measured(NamedTuple):
     evidence: Evidence
 
 
-def judge(
-    query: Query, found: Selection, fit: FocalFit | None = None, may_promote: bool = True
-) -> Localization:
+def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: bool = True) -> Localization:
     """Return the result for the best pose of a photo by itself.
 
     `fit` is the fitted focal length, if the photo's is not exact. If `may_promote`, a copy of the best pose's
@@ -94,13 +100,13 @@ def judge(
         others = (found.best, *(h for h in found.alternatives if h is not reported[likeliest - 1]))
         ratios = [s.ratio for s in assess_poses(query, best, others)[1:]]
         found = Selection(best, others, max(ratios))
-        fit = fit and fit_focal(query, found.best.pose, is_first=False)
+        fit = fit_focal(query, found.best.pose, is_first=False) if isinstance(fit, FocalFit) else fit
         return judge(query, found, fit, may_promote=False)
     return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
 
 
 def judge_together(
-    query: Query, found: Selection, fit: FocalFit | None, gaussian: PoseGaussian, probabilities: Array
+    query: Query, found: Selection, fit: Fit | None, gaussian: PoseGaussian, probabilities: Array
 ) -> Localization:
     """Return the result of a photo whose pose is what it and others say together.
 
@@ -120,7 +126,7 @@ def judge_together(
 def conclude(
     query: Query,
     found: Selection,
-    fit: FocalFit | None,
+    fit: Fit | None,
     measured: Measured,
     standings: Sequence[Standing],
     probabilities: Array,
@@ -147,13 +153,16 @@ def conclude(
         covariance=describe_errors(gaussian, scan_map.R_map_from_world.T),
         warnings=warnings,
         cameras=() if fit is None else query.given.cameras,
-        focal_length=None if fit is None else fit.focal_length(query.given),
+        focal_length=fit.focal_length(query.given) if isinstance(fit, FocalFit) else None,
+        sphere=fit.describe() if isinstance(fit, SphereFit) and not fit.is_claimed else None,
         is_ruled_out=bool(warnings) or (fit is not None and fit.conflict > MOST_CONFLICT),
         gaussian=gaussian,
         std_of_fit=std_of_fit,
         standings=tuple(standings),
     )
     decided = decide(described, probabilities, least)
+    if decided.sphere is not None:
+        return replace(decided, warnings=(*warnings, decided.sphere.explain()))
     if fit is None or decided.status == LOCALIZED:
         return decided
     return replace(decided, warnings=warnings + explain_doubts(query.given, fit))
@@ -214,7 +223,7 @@ def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> L
     return replace(judged, pose=scan_map.to_world(fused.pose), covariance=described, gaussian=fused)
 
 
-def measure(query: Query, found: Selection, fit: FocalFit | None) -> Measured | None:
+def measure(query: Query, found: Selection, fit: Fit | None) -> Measured | None:
     """Measure how well the best pose explains a photo, and how well the photo fixes the pose.
 
     The pose is that of `estimate_errors`, the loss is taken there; the evidence is that of the best pose.
@@ -296,8 +305,10 @@ def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> lis
     return [s._replace(num_matches=most) if copied else s for s, copied in pairs]
 
 
-def explain_doubts(panorama: Panorama, fit: FocalFit) -> tuple[str, ...]:
-    """Explain how the focal length makes a pose doubtful, as warnings."""
+def explain_doubts(panorama: Panorama, fit: Fit) -> tuple[str, ...]:
+    """Explain how the photo's geometry makes a pose doubtful, as warnings."""
+    if isinstance(fit, SphereFit):
+        return (NOT_AS_CLAIMED,) if fit.conflict > MOST_CONFLICT else ()
     focal = fit.focal_length(panorama)
     if fit.conflict > MOST_CONFLICT:
         return (contradict("the picture has", focal, focal.px),)

@@ -23,6 +23,7 @@ from .query import Query, prepare_query
 from .selection import Selection
 from .settings import CoarseToFineSettings
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
+from .sphere import SphereFit, calibrate_sphere
 
 GUESSES = (
     0.0,
@@ -38,7 +39,7 @@ class Found(NamedTuple):
 
     query: Query
     selection: Selection
-    fit: FocalFit | None  # of the photo of one camera, unless the poses are faint
+    fit: FocalFit | SphereFit | None  # None if the poses are faint, or nothing was fitted
 
 
 @one_blas_thread()
@@ -110,10 +111,17 @@ def find_by_edges(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:
 
 
 def fit_camera(query: Query, found: Selection) -> Found:
-    """Refine the poses of a photo of one camera with its focal length, unless they are faint."""
-    if query.given.focal_prior is None or is_faint(query, found):
+    """Compare what a photo says of its geometry with the scan, and refine the poses, unless they are faint.
+
+    Photos of several cameras are taken as they say; so are edges, which lie beside those of the scan.
+    """
+    if is_faint(query, found):
         return Found(query, found, None)
-    return Found(*calibrate(query, found))
+    if query.given.focal_prior is not None:
+        return Found(*calibrate(query, found))
+    if query.given.cameras or query.scan_map.has_shape:
+        return Found(query, found, None)
+    return Found(*calibrate_sphere(query, found))
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..arrays import Bytes, Mask
 from ..camera import Camera, Mount
-from ..camera.resampling import View, make_sphere, shrunk
+from ..camera.resampling import View, make_sphere, shrunk, sphere_width
 
 
 @dataclass(frozen=True)
@@ -51,6 +51,13 @@ class Panorama:
         if hidden.any():
             at_width = cv2.resize(hidden.view(np.uint8), rgb.shape[1::-1], interpolation=cv2.INTER_NEAREST)
             is_valid = is_valid & (at_width == 0)
+        return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
+
+    def retake(self, camera: Camera) -> "Panorama":
+        """Return the sphere of a picture that came as one, by the camera that shows what it shows of it."""
+        mount = Mount(camera)
+        pixels = np.dstack([self.rgb, self.is_valid.view(np.uint8) * np.uint8(255)])
+        rgb, is_valid = make_sphere([View(mount, pixels)], sphere_width([mount]))
         return replace(self, rgb=rgb, is_valid=is_valid, cameras=(mount,))
 
     def shrink_picture(self, width: int) -> "Panorama":

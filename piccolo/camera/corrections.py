@@ -1,0 +1,148 @@
+"""Corrections of a picture's geometry: what it says of itself may be a little wrong, or wrong altogether.
+
+A picture claims how its pixels map to rays, by a calibration, or as a sphere that shows 360 by 180 degrees with the
+horizon in the middle. Corrections act in the plane of the picture, (x, y) = (pixel - centre) / focal length; of
+a sphere these are the azimuth to the right and the angle below the horizon [rad]:
+    of a lens      x' = x exp(f) (1 + k r2) + cx,   y' = y exp(f + a) (1 + k r2) + cy,   r2 = x^2 + y^2;
+    of a sphere    x' = x exp(w),                   y' = y exp(h) + cy.
+A sphere cut to 1 / exp(h) of its height and resized is one with h > 0; cy is where its horizon lies.
+"""
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, Array32
+from ..geometry.sphere import HALF_PI, PI, atan2
+from ..kernels.jit import F0, F1, kernel
+from .calibration import Mount
+from .model import PARTIAL_SPHERE, Camera
+
+LENS = ("log_focal", "log_aspect", "center_x", "center_y", "radial")
+OF_SPHERE = ("log_width", "log_height", "horizon")
+STEP_PX = 0.01  # with which rays are differentiated by pixels
+
+
+class Displaced(NamedTuple):
+    """Points as a picture with corrections shows them, at the same distances; all in the camera's axes."""
+
+    points: Array32  # (3, N) [m]
+    moves: Array32  # (p, 3, N) their derivatives by the corrections
+    is_shown: Array32  # (N,) 1 of points in front of the lens, else 0
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """What may be corrected of the camera that took a picture; its `names` are LENS or OF_SPHERE."""
+
+    mount: Mount
+
+    @property
+    def is_of_sphere(self) -> bool:
+        """True for a picture that shows a sphere or a part of one."""
+        return self.mount.camera.lens == PARTIAL_SPHERE
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the corrections (p,)."""
+        return OF_SPHERE if self.is_of_sphere else LENS
+
+    def displace(self, points_cam: Array32, values: Array) -> Displaced:
+        """Return where points (3, N) are seen if the picture has corrections (p,) that nobody knew of."""
+        if not self.is_of_sphere:
+            return self._displace_in_lens(points_cam, values)
+        num = points_cam.shape[1]
+        found = Displaced(
+            np.empty((3, num), np.float32), np.empty((3, 3, num), np.float32), np.empty(num, np.float32)
+        )
+        displace_on_sphere(points_cam, np.asarray(values, np.float32), *found)
+        return found
+
+    def _displace_in_lens(self, points_cam: Array32, values: Array) -> Displaced:
+        camera = self.mount.camera
+        R_cam_from_lens = self.mount.rotation.T
+        ranges = np.linalg.norm(points_cam, axis=0).astype(np.float64)
+        rays = (points_cam / ranges).T @ R_cam_from_lens
+        pixels, is_in = camera.pixels(rays)
+        is_ahead = is_in | (rays[:, 0] > math.cos(min(camera.max_angle, 0.5 * math.pi)))
+        center = np.array(camera.center)
+        focal = np.array(camera.focal)
+        plane, by_values = correct_plane((pixels - center) / focal, values)
+        corrected = plane * focal + center
+        found, _ = camera.rays(corrected)  # also of pixels beyond the picture's edge
+        across = (camera.rays(corrected + (STEP_PX, 0.0))[0] - found) / STEP_PX * focal[0]
+        down = (camera.rays(corrected + (0.0, STEP_PX))[0] - found) / STEP_PX * focal[1]
+        moves = by_values[..., :1] * across + by_values[..., 1:] * down
+        kept = is_ahead[:, None]
+        back = R_cam_from_lens.T
+        return Displaced(
+            np.ascontiguousarray((np.where(kept, found, rays) @ back).T * ranges, np.float32),
+            np.ascontiguousarray((np.where(kept, moves, 0.0) @ back).swapaxes(1, 2) * ranges, np.float32),
+            is_ahead.astype(np.float32),
+        )
+
+    def apply(self, values: Array) -> Camera:
+        """Return the camera of a sphere with corrections (3,)."""
+        log_width, log_height, horizon = values
+        camera = self.mount.camera
+        across, down = camera.focal
+        left, top = camera.center
+        params = (across * math.exp(log_width), down * math.exp(log_height), left, top + down * horizon)
+        return Camera(camera.model, camera.width, camera.height, tuple(float(v) for v in params))
+
+
+def correct_plane(plane: Array, values: Array) -> tuple[Array, Array]:
+    """Correct places (N, 2) in a lens's plane; return also their derivatives (p, N, 2) by the corrections."""
+    log_focal, log_aspect, center_x, center_y, radial = values
+    x, y = plane.T
+    zero = np.zeros_like(x)
+    one = np.ones_like(x)
+    r2 = x * x + y * y
+    x_wide = x * math.exp(log_focal)
+    y_wide = y * math.exp(log_focal + log_aspect)
+    x_new = x_wide * (1.0 + radial * r2)
+    y_new = y_wide * (1.0 + radial * r2)
+    moves = [(x_new, y_new), (zero, y_new), (one, zero), (zero, one), (x_wide * r2, y_wide * r2)]
+    corrected = np.stack([x_new + center_x, y_new + center_y], axis=1)
+    return corrected, np.stack([np.stack(move, axis=1) for move in moves])
+
+
+@kernel
+def displace_on_sphere(
+    points: Array32, values: Array32, displaced: Array32, moves: Array32, is_shown: Array32
+) -> None:
+    """Write where points (3, N) are seen on a sphere with corrections (3,), and derivatives (3, 3, N).
+
+    Angles are those to the left and above the horizon; a point beyond the poles or the seam is not shown.
+    """
+    wide = np.float32(math.exp(values[0]))
+    high = np.float32(math.exp(values[1]))
+    horizon = values[2]
+    for n in range(points.shape[1]):
+        x = points[0, n]
+        y = points[1, n]
+        z = points[2, n]
+        rho2 = x * x + y * y
+        r = np.float32(math.sqrt(rho2 + z * z))
+        left = atan2(y, x) * wide
+        above = atan2(z, np.float32(math.sqrt(rho2))) * high
+        up = above - horizon
+        cos_left = np.float32(math.cos(left))
+        sin_left = np.float32(math.sin(left))
+        cos_up = np.float32(math.cos(up))
+        sin_up = np.float32(math.sin(up))
+        displaced[0, n] = r * cos_up * cos_left
+        displaced[1, n] = r * cos_up * sin_left
+        displaced[2, n] = r * sin_up
+        moves[0, 0, n] = -r * cos_up * sin_left * left
+        moves[0, 1, n] = r * cos_up * cos_left * left
+        moves[0, 2, n] = F0
+        moves[1, 0, n] = -r * sin_up * cos_left * above
+        moves[1, 1, n] = -r * sin_up * sin_left * above
+        moves[1, 2, n] = r * cos_up * above
+        moves[2, 0, n] = r * sin_up * cos_left
+        moves[2, 1, n] = r * sin_up * sin_left
+        moves[2, 2, n] = -r * cos_up
+        is_shown[n] = F1 if abs(left) <= PI and abs(up) <= HALF_PI else F0

@@ -1,0 +1,149 @@
+"""Poses found together with corrections of the photo's geometry, by the loss of the default method.
+
+What a photo says of its own geometry is a claim. The scan's points are displaced as a photo with corrections
+would show them (`camera.corrections`), so that pose and corrections descend together, without a new projection
+of the photo. What fixes the corrections follows from the blocks of the sphere, as for a pose's covariance.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, Array32, Int64s
+from ..camera.corrections import Corrections
+from ..geometry.pose import Pose, exp_so3, orthonormal
+from ..optimize.channel_loss import ChannelProblem
+from ..optimize.self_calibration import NUM_OF_POSE, FreeSums, sum_free_equations
+from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..panorama.texels import Texels
+from ..views.view import Cells
+from .covariance import jackknife_gradients, sort_by_block, take
+from .ladder import Limits, to_levels
+
+FIRST_DAMPING = 1e-3
+RISE = 6.0  # of the damping, after a step that does not lower the loss
+FALL = 0.2
+LEAST_DAMPING = 1e-6
+MOST_DAMPING = 1e3
+MASKED_LOSS = 0.25  # of a point on masked pixels, times the square of the loss's scale
+# of the matrix of Gauss and Newton, which ignores that the loss flattens: so that 95 % of true corrections lie
+# within two deviations
+CURVATURE = 0.2
+
+
+class Freedom(NamedTuple):
+    """Corrections that are free, and how far."""
+
+    corrections: Corrections
+    deviations: Array  # (p,) of corrections of a geometry that is claimed wrongly; infinite: any is as likely
+    most: Array  # (p,) absolute values that are searched
+
+
+class FreeEnd(NamedTuple):
+    """The end of a descent of pose and corrections."""
+
+    pose: Pose
+    values: Array  # (p,) corrections
+    loss: float  # with what the deviations of the freedom add
+    sums: FreeSums  # by the blocks of the sphere
+
+
+class Estimate(NamedTuple):
+    """Corrections by the photo and the scan alone."""
+
+    values: Array  # (p,)
+    information: Array  # (p, p) inverse of their covariance
+    motion: (
+        Array  # (6, p) of the pose with them: rotation about the camera's axes [rad], centre in the map [m]
+    )
+
+
+class Points(NamedTuple):
+    """Points around a pose, by the blocks of the sphere in which they lie."""
+
+    around: Cells
+    begins: Int64s  # (B + 1,)
+    levels: Array32  # (3, N) their channels
+
+
+def sort_points(cells: Cells, pose: Pose) -> Points:
+    """Sort the cells or points that count by their blocks around a pose."""
+    around, begins = sort_by_block(take(cells, cells.weights > 0.0).around(pose.center_world))
+    return Points(around, begins, to_levels(around.channels))
+
+
+def evaluate(
+    points: Points, image: Texels, scale: float, corrections: Corrections, pose: Pose, values: Array
+) -> FreeSums:
+    """Return the sums of the equations (of `FreeSums`) at a pose with corrections (p,); scale [levels]."""
+    offsets = points.around.around(pose.center_world).offsets
+    offsets_cam = np.ascontiguousarray(pose.R_cam_from_world.astype(np.float32) @ offsets)
+    shown = corrections.displace(offsets_cam, values)
+    weights = points.around.weights * shown.is_shown
+    problem = ChannelProblem(shown.points, points.levels, weights, image.rgbx, image.width, scale)
+    return sum_free_equations(problem, shown.moves, points.begins)
+
+
+def relate_to_chance(sums: FreeSums) -> float:
+    """Return the factor that makes the loss the negative logarithm of a likelihood, by its gradients."""
+    gradients = sums.gradients
+    matrix = sums.matrices.sum(axis=0)
+    return len(matrix) / max(float(np.trace(np.linalg.pinv(matrix) @ gradients.T @ gradients)), 1e-12)
+
+
+def descend_freely(
+    cells: Cells, image: Texels, freedom: Freedom, pose: Pose, values: Array, limits: Limits
+) -> FreeEnd:
+    """Descend from a pose and corrections (p,), both free, by Levenberg and Marquardt."""
+    points = sort_points(cells, pose)
+    scale = limits.loss_scale * LEVELS_PER_UNIT
+    total_weight = float(points.around.weights.sum())
+    precision = np.zeros(NUM_OF_POSE + len(values))
+
+    def at(where: Pose, corrected: Array) -> FreeEnd:
+        sums = evaluate(points, image, scale, freedom.corrections, where, corrected)
+        masked = MASKED_LOSS * scale * scale * (total_weight - float(sums.weight.sum()))
+        of_values = 0.5 * float(precision[NUM_OF_POSE:] @ corrected**2)
+        return FreeEnd(where, corrected, float(sums.loss.sum()) + masked + of_values, sums)
+
+    end = at(pose, values)
+    precision[NUM_OF_POSE:] = freedom.deviations**-2.0 / relate_to_chance(end.sums)
+    end = end._replace(loss=end.loss + 0.5 * float(precision[NUM_OF_POSE:] @ values**2))
+    damping = FIRST_DAMPING
+    for _ in range(limits.num_iterations):
+        matrix = end.sums.matrices.sum(axis=0) + np.diag(precision)
+        slopes = end.sums.gradients.sum(axis=0)
+        slopes[NUM_OF_POSE:] += precision[NUM_OF_POSE:] * end.values
+        step = -np.linalg.solve(matrix + np.diag(damping * matrix.diagonal() + 1e-9), slopes)
+        corrected = np.clip(end.values + step[NUM_OF_POSE:], -freedom.most, freedom.most)
+        after = at(take_step(end.pose, step), corrected)
+        if after.loss > end.loss:
+            damping *= RISE
+            if damping > MOST_DAMPING:
+                break
+            continue
+        length = float(np.linalg.norm([*step[:NUM_OF_POSE], *(corrected - end.values)]))
+        end = after
+        damping = max(FALL * damping, LEAST_DAMPING)
+        if length < limits.tolerance:
+            break
+    return end
+
+
+def take_step(pose: Pose, step: Array) -> Pose:
+    """Apply a step of the normal equations: turn [rad] and move [m], both in the camera's axes."""
+    R = pose.R_cam_from_world
+    return Pose(orthonormal(exp_so3(step[:3]) @ R), pose.center_world + R.T @ step[3:NUM_OF_POSE])
+
+
+def estimate_corrections(end: FreeEnd) -> Estimate:
+    """Estimate the corrections by the photo and the scan alone, with the pose free, at the end of a descent."""
+    matrix = CURVATURE * end.sums.matrices.sum(axis=0)
+    shown = end.sums.weight > 0.0
+    gradients = jackknife_gradients(end.sums.gradients[shown], end.sums.matrices[shown])
+    inverse = np.linalg.pinv(matrix)
+    covariance = (inverse @ gradients.T @ gradients @ inverse)[NUM_OF_POSE:, NUM_OF_POSE:]
+    motion = -np.linalg.pinv(matrix[:NUM_OF_POSE, :NUM_OF_POSE]) @ matrix[:NUM_OF_POSE, NUM_OF_POSE:]
+    motion[3:] = end.pose.R_cam_from_world.T @ motion[3:]
+    information = np.asarray(np.linalg.pinv(covariance, hermitian=True), np.float64)
+    return Estimate(end.values, information, np.asarray(motion))

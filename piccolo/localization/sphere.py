@@ -1,0 +1,187 @@
+"""What a panorama says of its own geometry, compared with the scan: how much of the sphere it shows, and where.
+
+A picture twice as wide as high claims to show 360 by 180 degrees with the horizon in the middle. If rows were
+cut off before it was resized, it does not: walls, floor and ceiling then look nearer or farther together, and a
+pose a few decimetres off fits best. So width, height and horizon descend with the pose. They are taken as
+claimed as long as the photo agrees; else as found, from several starts, and the photo is projected again.
+"""
+
+import itertools
+import math
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..camera import Camera, Mount
+from ..camera.corrections import Corrections
+from ..camera.model import whole_sphere
+from ..confidence.claim import Claim
+from ..confidence.localization import SphereGeometry
+from ..geometry.pose import Pose
+from ..panorama import Panorama
+from .comparison import compare, mask_occluders, score_pose
+from .ladder import Limits
+from .last_descent import refine_best
+from .query import Query, prepare_query
+from .selection import Selection
+from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, estimate_corrections
+
+NO_CORRECTION = np.zeros(3)
+CLAIM = Claim(
+    NO_CORRECTION,
+    deviations=np.array([0.005, 0.005, math.radians(0.3)]),  # chosen: of what stitched panoramas claim
+    wrong_deviations=np.array([0.05, 0.1, 0.1]),  # chosen
+    wrong_shares=np.array([0.005, 0.005, 0.005]),  # chosen
+)
+MOST = np.array([0.2, 0.6, 0.4])  # corrections that are searched
+ANY = np.full(3, np.inf)
+SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
+CONTRADICTED = 3.0  # from which one that explains more is taken
+MIN_GAIN = 1.1  # times the score, by another geometry
+HEIGHTS = -np.log([1.0, 0.9, 0.8, 0.72])  # corrections of the height from which descents begin
+LEAST_CUT = 0.1  # of the height, for which the horizons of starts are spread
+HORIZONS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # where all, three quarters or half is cut off at one end
+NUM_ENDS = 3  # of the descents on coarse cells, that go on
+CHECK = Limits(1.0, 8, 1e-3)
+COARSE = Limits(1.2, 10, 5e-3)
+MIDDLE = Limits(1.2, 12, 1e-3)
+FINE = Limits(1.0, 15, 1e-3)
+NEAR = Limits(0.7, 2, 1e-4)  # on points, where the claim holds
+FULL = Limits(0.7, 15, 1e-4)  # on points, where it does not
+MOST_ROUNDS = 3
+
+
+class SphereFit(NamedTuple):
+    """How a panorama shows the sphere."""
+
+    camera: Camera  # as found, or as claimed
+    estimate: Estimate  # corrections of that by the photo and the scan alone
+    is_claimed: bool  # the camera is as the picture claims
+    conflict: float = 0.0  # deviations between claim and picture, where what is claimed is used
+    doubt: float = 0.0  # probability that the claim is wrong and has pulled the pose along
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance (3, 3) of the corrections: also by the claim, where that is used."""
+        precision = np.diag(CLAIM.precision) if self.is_claimed else 1e-6 * np.eye(3)
+        return np.asarray(np.linalg.inv(self.estimate.information + precision))
+
+    @property
+    def pose_covariance(self) -> Array:
+        """Covariance (6, 6) that the geometry adds to a pose: rotation, then centre in the map."""
+        covariance = self.covariance
+        off = covariance @ self.estimate.information @ self.estimate.values  # which is not applied
+        motion = self.estimate.motion
+        return np.asarray(motion @ (covariance + np.outer(off, off)) @ motion.T)
+
+    def describe(self) -> SphereGeometry:
+        """Return what the panorama shows of the sphere."""
+        across, down = self.camera.focal
+        width, height, horizon = np.sqrt(np.diag(self.covariance))
+        shown = self.camera.width / across, self.camera.height / down
+        return SphereGeometry(
+            width_deg=math.degrees(shown[0]),
+            height_deg=math.degrees(shown[1]),
+            horizon_deg=math.degrees((self.camera.center[1] - 0.5 * self.camera.height) / down),
+            std_deg=(
+                math.degrees(shown[0] * width),
+                math.degrees(shown[1] * height),
+                math.degrees(horizon),
+            ),
+        )
+
+
+def make_freedom(camera: Camera) -> Freedom:
+    """Free all corrections of a panorama."""
+    return Freedom(Corrections(Mount(camera)), ANY, MOST)
+
+
+def count_deviations(estimate: Estimate) -> float:
+    """Return how many deviations the most contradicted correction is from what is claimed."""
+    variances = np.diag(np.linalg.pinv(estimate.information, hermitian=True))
+    return float((np.abs(estimate.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
+
+
+def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, SphereFit]:
+    """Compare what a panorama claims with the scan, at the best pose; refine the poses if it shows otherwise."""
+    camera = whole_sphere(*query.given.rgb.shape[1::-1])
+    freedom = make_freedom(camera)
+    pose = found.best.pose
+    shown = mask_occluders(query, compare(query, pose))
+    ways = (
+        partial(descend_on_cells, query, pose, freedom, NO_CORRECTION, CHECK),
+        partial(descend_on_points, shown, pose, freedom, NEAR),
+    )
+    coarse, near = query.workers.map(lambda way: estimate_corrections(way()), ways, "fit the panorama")
+    is_suspect = count_deviations(coarse) > SUSPECT
+    other = retake_as_found(query, found, camera) if is_suspect else None
+    if other is not None:
+        return other
+    told = coarse.values, coarse.information
+    return query, found, SphereFit(camera, near, True, CLAIM.conflict(*told), CLAIM.doubt(*told))
+
+
+def retake_as_found(
+    query: Query, found: Selection, claimed: Camera
+) -> tuple[Query, Selection, SphereFit] | None:
+    """Search other geometries; return the query with the one that explains clearly more, refined, or None."""
+    end = search_geometry(query, found.best.pose, claimed)
+    if count_deviations(estimate_corrections(end)) < CONTRADICTED:
+        return None
+    given = query.given
+    camera = claimed
+    best = found
+    for _ in range(MOST_ROUNDS):
+        camera = Corrections(Mount(camera)).apply(end.values)
+        query = retake(query, given, camera)
+        others = [h.pose for h in best.alternatives]
+        scored = query.workers.map(partial(score_pose, query), [end.pose, *others], "compare")
+        best = refine_best(query, scored)
+        end = descend_on_points(query, best.best.pose, make_freedom(camera), FULL)
+        if np.all(np.abs(end.values) < CLAIM.deviations):
+            break
+    if best.best.score < MIN_GAIN * found.best.score:
+        return None
+    return query, best, SphereFit(camera, estimate_corrections(end), is_claimed=False)
+
+
+def descend_on_cells(query: Query, pose: Pose, freedom: Freedom, values: Array, limits: Limits) -> FreeEnd:
+    """Descend on the fine cells that are seen from a pose."""
+    cells = query.view_at(pose, "fine")
+    return descend_freely(cells, query.photo.image("fine"), freedom, pose, values, limits)
+
+
+def descend_on_points(query: Query, pose: Pose, freedom: Freedom, limits: Limits) -> FreeEnd:
+    """Descend on the points that are seen from a pose, in the finest image."""
+    points = query.view_at(pose, "points")
+    return descend_freely(points, query.photo.image("full"), freedom, pose, NO_CORRECTION, limits)
+
+
+def search_geometry(query: Query, pose: Pose, claimed: Camera) -> FreeEnd:
+    """Search the corrections of a panorama from several starts, on coarse cells, then on finer ones."""
+    freedom = make_freedom(claimed)
+    cells = query.view_at(pose, "middle")
+
+    def begin(start: tuple[float, float]) -> FreeEnd:
+        height, share = start
+        horizon = share * max(1.0 - math.exp(-height), LEAST_CUT) * 0.5 * math.pi
+        values = np.array([0.0, height, horizon])
+        return descend_freely(cells, query.photo.image("search"), freedom, pose, values, COARSE)
+
+    def go_on(end: FreeEnd) -> FreeEnd:
+        middle = query.view_at(end.pose, "middle")
+        image = query.photo.image("middle")
+        end = descend_freely(middle, image, freedom, end.pose, end.values, MIDDLE)
+        return descend_on_cells(query, end.pose, freedom, end.values, FINE)
+
+    starts = list(itertools.product(HEIGHTS, HORIZONS))
+    ends = sorted(query.workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)
+    return min(query.workers.map(go_on, ends[:NUM_ENDS], "fit the panorama"), key=lambda end: end.loss)
+
+
+def retake(query: Query, given: Panorama, camera: Camera) -> Query:
+    """Prepare the query again with a panorama as it shows the sphere."""
+    fresh = prepare_query(given.retake(camera), query.scan_map, query.settings, query.workers)
+    return fresh if query.uses_matches else fresh.by_views()
