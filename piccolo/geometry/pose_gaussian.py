@@ -14,6 +14,10 @@ from ..arrays import Array, Floats
 from .pose import MAX_DISTANCE, Pose, exp_so3, log_so3, orthonormal, rotate_points, skew
 
 LIKELY = 12.6  # chi square of 6 at 95 %: poses that differ by more contradict each other
+LEAST_VARIANCE = 1e-18  # [m^2]
+FARTHEST = 8.0  # deviations that an integral goes to
+NODES, NODE_WEIGHTS = np.polynomial.legendre.leggauss(64)
+COSINES = np.cos((np.arange(32) + 0.5) * math.pi / 32.0)  # of directions in half a turn
 LOOSE = 1e-6  # [1/rad^2, 1/m^2] information that makes matrices invertible
 
 
@@ -77,14 +81,26 @@ def largest_std(covariance: Array) -> float:
     return math.sqrt(max(float(np.linalg.eigvalsh(covariance[3:, 3:])[-1]), 0.0))
 
 
-def std_of(found: PoseGaussian | None) -> float | None:
-    """Return `largest_std` of a pose; None of none."""
-    return None if found is None else found.largest_std
+def probability_within(found: PoseGaussian | None) -> float:
+    """Return the probability that a position is within MAX_DISTANCE of that of a pose; 1 for None."""
+    return 1.0 if found is None else probability_of_ball(found.covariance[3:, 3:], MAX_DISTANCE)
 
 
-def probability_within(std: float | None) -> float:
-    """Return the probability that an error is within MAX_DISTANCE, by its deviation [m]; 1 for None."""
-    return 1.0 if std is None else math.erf(MAX_DISTANCE / (max(std, 1e-9) * math.sqrt(2.0)))
+def probability_of_ball(covariance: Array, radius: float) -> float:
+    """Return the probability that an error (3,) of mean zero with a covariance (3, 3) is within a radius [m].
+
+    Across the axis of the greatest variance it is the mean over the directions of two standard normal numbers,
+    each of which has 1 - exp(-r^2 / 2 v); along that axis it is integrated by Gauss and Legendre.
+    """
+    variances = np.maximum(np.linalg.eigvalsh(covariance), LEAST_VARIANCE)
+    std = math.sqrt(variances[2])
+    reach = min(radius, FARTHEST * std)
+    along = reach * NODES
+    density = np.exp(-0.5 * (along / std) ** 2) / (std * math.sqrt(math.tau))
+    across = variances[0] * COSINES**2 + variances[1] * (1.0 - COSINES**2)
+    left = np.maximum(radius**2 - along**2, 0.0)
+    inside = 1.0 - np.exp(-0.5 * left[:, None] / across).mean(axis=1)
+    return min(float(reach * NODE_WEIGHTS @ (density * inside)), 1.0)
 
 
 def probability_near(offset: Array, covariance: Array) -> float:

@@ -99,8 +99,8 @@ def localize_beside(
         factor = max(other.picture.confidence for other in kept)
         fused = fuse(judged, kept[0], ended)
         if fused is not None and judged.gaussian is not None:
-            before = probability_within(judged.gaussian.largest_std)
-            factor *= probability_within(fused.largest_std) / before
+            before = probability_within(judged.gaussian)
+            factor *= probability_within(fused) / before
             judged = take_pose(judged, fused, scan_map)
     return reconsider(judged, factor, settings.min_confidence), tuple(other.name for other in kept)
 

@@ -275,12 +275,12 @@ def judge_member(
         within = missed * probability_near(offset, expected.covariance[3:, 3:])
     if gaussian is None:
         return judge_apart(member, NOT_FOUND)
-    of_own = probability_within(gaussian.largest_std)
+    of_own = probability_within(gaussian)
     confidence = (within + right * of_own) * probabilities[0]
     before = member.alone.gaussian
     if member.alone.status == LOCALIZED and own and before:
         # that others show nothing says nothing against a photo that is sure
-        gain = of_own / probability_within(before.largest_std)
+        gain = of_own / probability_within(before)
         focal = member.alone.focal_length
         doubt = focal.doubt if focal else 0.0  # which the judge takes off again
         confidence = max(confidence, member.alone.confidence / (1.0 - doubt) * min(gain, 1.0))

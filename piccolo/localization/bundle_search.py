@@ -15,7 +15,7 @@ from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
-from ..geometry.pose_gaussian import PoseGaussian, std_of
+from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .comparison import score_pose
 from .covariance import Errors, estimate_errors
@@ -187,7 +187,8 @@ def find_support(member: Member, query: Query, bundle: Bundle, exchanged: Sequen
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
         errors = estimate_errors(query, found.pose)
         errors = errors.widen(member.fit.pose_covariance) if member.fit else errors
-    p = posterior(assess_poses(query, poses[0], poses[1:]), std_of(errors.gaussian), errors.std_of_fit)
+    within = probability_within(errors.gaussian)
+    p = posterior(assess_poses(query, poses[0], poses[1:]), errors.std_of_fit, within)
     k = next(k for k, h in enumerate(poses) if h is found)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none

@@ -44,7 +44,7 @@ FITTED = [FOCAL, LENS.index("radial")]  # corrections that the camera takes; the
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
 NOT_CALIBRATED = (0.002, 0.01, 0.01, 0.02)
 OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: if they are wrong
-OTHERS_SHARES = (0.005, 0.005, 0.005, 0.005)  # chosen: of those that are wrong
+OTHERS_SHARES = (0.02, 0.02, 0.02, 0.02)  # chosen: of those that are wrong
 MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
@@ -60,9 +60,9 @@ DISAGREE = 2.0  # deviations between picture and what was given, by which chance
 CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal lengths lie within two deviations
-# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 a right calibration
-# was called wrong in the real corridor of tests/data
-EDGE_ERROR = 0.6
+# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length a
+# right calibration was called wrong in the real corridor of tests/data
+EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
 MAX_CALIBRATIONS = 4  # fits of a focal length
@@ -80,6 +80,8 @@ class FocalFit(NamedTuple):
     conflict: float  # deviations between that and what was given; 0 if it says nothing
     doubt: float = 0.0  # as of FocalLength
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
+    # (6, 6) what all corrections would add if nothing that was given holds; None if the focal length is a guess
+    of_picture: Array | None = None
 
     @property
     def deviation(self) -> float:
@@ -163,7 +165,15 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         conflict,
         claim.doubt(values, information),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
+        None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(estimate, claim),
     )
+
+
+def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:
+    """Return what the corrections would add to a pose's covariance (6, 6) if nothing of the claim holds."""
+    covariance = np.linalg.inv(estimate.information + np.diag(claim.wrong_deviations**-2.0))
+    off = covariance @ estimate.information @ (estimate.values - claim.expected)
+    return np.asarray(estimate.motion @ (covariance + np.outer(off, off)) @ estimate.motion.T)
 
 
 def fits_radial(prior: FocalPrior, camera: Camera) -> bool:
@@ -224,7 +234,7 @@ def widen_by_edges(query: Query, estimate: Estimate) -> Estimate:
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
     covariance = np.linalg.pinv(estimate.information, hermitian=True)
     is_known = estimate.information.any(axis=1)
-    errors = np.diag(is_known * (EDGE_ERROR * per_px) ** 2)
+    errors = np.diag(is_known * (np.array(EDGE_ERRORS) * per_px) ** 2)
     return estimate._replace(information=np.linalg.pinv(covariance + errors, hermitian=True))
 
 

@@ -33,7 +33,7 @@ from ..confidence.localization import Alternative, Evidence, FocalLength, Locali
 from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws
-from ..geometry.pose_gaussian import PoseGaussian, std_of
+from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
@@ -65,6 +65,7 @@ NOT_AS_CLAIMED = (
     "the panorama does not show 360 x 180 degrees with the horizon in the middle: give it as it was stitched, "
     "not cropped or stretched"
 )
+UNCONFIRMED = 0.25  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent
@@ -93,7 +94,8 @@ def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: b
         return Localization()
     reported, is_copy = list_reported(query, found)
     standings = credit_copies(assess_poses(query, found.best, reported), is_copy)
-    probabilities = posterior(standings, std_of(measured.errors.gaussian), measured.errors.std_of_fit)
+    within = probability_within(measured.errors.gaussian)
+    probabilities = posterior(standings, measured.errors.std_of_fit, within)
     likeliest = int(probabilities[:-1].argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         best = settle(query, reported[likeliest - 1])
@@ -102,7 +104,19 @@ def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: b
         found = Selection(best, others, max(ratios))
         fit = fit_focal(query, found.best.pose, is_first=False) if isinstance(fit, FocalFit) else fit
         return judge(query, found, fit, may_promote=False)
+    fit = doubt_alone(fit, measured.errors.gaussian)
     return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
+
+
+def doubt_alone(fit: Fit | None, gaussian: PoseGaussian | None) -> Fit | None:
+    """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
+
+    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
+    """
+    if not isinstance(fit, FocalFit) or fit.of_picture is None or gaussian is None:
+        return fit
+    missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
+    return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
 
 
 def judge_together(

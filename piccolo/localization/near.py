@@ -7,7 +7,7 @@ from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import Standing, posterior
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, std_of
+from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from .comparison import Comparison, compare, compare_from
 from .covariance import UNKNOWN_ERRORS, estimate_covariance
 from .ladder import FULL, NEARLY, climb_from_afar, refine, settle
@@ -42,7 +42,8 @@ def refine_near(query: Query, start: Pose) -> Near:
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
         errors = estimate_covariance(query, end.pose, seen, middle if sees_same else None)
-    probability = float(posterior([assess_end(query, end)], std_of(errors.gaussian), errors.std_of_fit)[0])
+    within = probability_within(errors.gaussian)
+    probability = float(posterior([assess_end(query, end)], errors.std_of_fit, within)[0])
     return Near(end.pose, seen, errors.gaussian, probability)
 
 

@@ -20,7 +20,7 @@ from ..confidence.localization import Localization
 from ..errors import InputError
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, probability_within, std_of
+from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from ..localization.comparison import Comparison
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
@@ -96,7 +96,7 @@ def log_odds_of_place(probability: float, total: float, gaussian: PoseGaussian |
 
     `total` is the probability that any of the frame's poses is.
     """
-    within = max(probability_within(std_of(gaussian)), 1e-9)
+    within = max(probability_within(gaussian), 1e-9)
     return log_ratio(probability / within, 1.0 - total / within)
 
 

@@ -21,7 +21,7 @@ from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Pose, carry
-from ..geometry.pose_gaussian import PoseGaussian, add, probability_within, std_of
+from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..jobs.threads import Progress, no_progress, one_blas_thread
 from ..localization.judge import decide, take_pose
 from ..localization.prior import contradictions
@@ -117,7 +117,7 @@ def make_localization(tracker: Tracker, frame: Frame, belief: Belief) -> Localiz
         return frame.alone or Localization()
     best, *others = belief.states
     scan_map = tracker.scan_map
-    within = probability_within(std_of(best.gaussian))
+    within = probability_within(best.gaussian)
     rest = within * belief.probabilities[1 : 1 + MAX_ALTERNATIVES]
     p = np.array([within * belief.probabilities[0], *rest, 0.0])
     p[-1] = max(1.0 - p.sum(), 0.0)

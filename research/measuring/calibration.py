@@ -18,7 +18,8 @@ from piccolo.confidence.confidence import AMBIGUOUS, LOCALIZED, ChoiceModel, Evi
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.nearness import RIGHT
-from piccolo.geometry.pose_gaussian import subtract
+from piccolo.geometry.pose import MAX_DISTANCE
+from piccolo.geometry.pose_gaussian import probability_of_ball, subtract
 
 from ..evaluation.tables import Table, reliability_table
 from ..scene import pose_of
@@ -62,7 +63,10 @@ class Outcome(NamedTuple):
         """Return the probability of each pose, and of none (K + 1,); by default with the model in use."""
         if self.is_refused:
             return np.append(np.zeros(len(self.standings)), 1.0)
-        return confidence.posterior(self.standings, self.std, self.std_of_fit, model)
+        within = 1.0
+        if self.covariance is not None:
+            within = probability_of_ball(self.covariance.matrix[3:, 3:], MAX_DISTANCE)
+        return confidence.posterior(self.standings, self.std_of_fit, within, model)
 
 
 def read_outcome(line: str) -> Outcome | None:
@@ -87,9 +91,7 @@ def read_outcome(line: str) -> Outcome | None:
 def fit(outcomes: Sequence[Outcome]) -> ChoiceModel:
     """Return the weights of the greatest penalised likelihood."""
     poses = [np.array([confidence.pose_features(s) for s in o.standings]) for o in outcomes]
-    nones = np.array(
-        [confidence.none_features(o.std if o.std_of_fit is None else o.std_of_fit) for o in outcomes]
-    )
+    nones = np.array([confidence.none_features(o.std_of_fit) for o in outcomes])
     deviations = np.concatenate([np.concatenate(poses).std(axis=0), [1.0, max(nones[:, 1].std(), 1e-9)]])
 
     def loss(w: Array) -> tuple[float, Array]:
