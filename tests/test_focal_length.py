@@ -14,13 +14,14 @@ from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
-from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
+from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import bundle, focal_length as focal, localize as module
 from piccolo.localization.comparison import score_pose
 from piccolo.localization.localize import select_likeliest
 from piccolo.localization.selection import Selection
+from piccolo.localization.self_calibration import Estimate
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
@@ -42,34 +43,6 @@ def _fit(rgb, pose, **options):
     panorama = _panorama(rgb, **options)
     query = rooms.ask(panorama, rooms.scan_map(SEED))
     return panorama, focal.fit_focal(query, scan().from_world(pose))
-
-
-@pytest.mark.parametrize("num", [1, 2])
-def test_the_minimum_is_that_of_a_quadratic_loss_and_blocks_that_pull_widen_it(num):
-    true, curvature = np.array([0.01, -0.02])[:num], np.array([[4.0, 1.0], [1.0, 3.0]])[:num, :num]
-    changes = focal.make_design(num, 0.04)
-    pulls = np.tile([[0.3, -0.3], [-0.3, 0.3], [0.1, 0.2], [-0.1, -0.2]], (2, 1))[:, :num]
-    off = changes - true
-    whole = 0.5 * np.einsum("ki,ij,kj->k", off, curvature, off)
-    losses = whole[:, None] / 8.0 + off @ pulls.T
-    turn = np.array([0.0, 0.0, 0.5])
-    poses = [Pose(exp_so3(turn * c[0]), np.array([3.0 * c[0], 0.0, 0.0])) for c in changes]
-    minimum = focal.fit_minimum(changes, losses, poses, Pose(np.eye(3), np.zeros(3)))
-    np.testing.assert_allclose(minimum.change, true, atol=1e-9)
-    np.testing.assert_allclose(minimum.motion[:, 0], [0.0, 0.0, 0.5, 3.0, 0.0, 0.0], atol=1e-9)
-    inverse = np.linalg.inv(curvature)
-    slopes = pulls / (1.0 - 1.0 / 8.0)  # each block has an eighth of what fixes the minimum
-    expected = focal.INFLATION * inverse @ slopes.T @ slopes @ inverse
-    np.testing.assert_allclose(np.linalg.inv(minimum.information), expected, rtol=1e-6)
-
-
-def test_a_loss_of_few_blocks_or_without_a_minimum_tells_nothing():
-    changes = focal.make_design(1, 0.04)
-    poses = [Pose(np.eye(3), np.zeros(3))] * len(changes)
-    minimum = focal.fit_minimum(changes, -np.repeat(changes**2, 9, axis=1), poses, poses[0])
-    assert not minimum.information.any()
-    few = focal.fit_minimum(changes, np.repeat(changes**2, 3, axis=1), poses, poses[0])
-    assert not few.information.any()
 
 
 def test_the_picture_tells_the_focal_length_within_its_deviation():
@@ -153,43 +126,6 @@ def test_each_source_of_a_focal_length_has_its_deviation():
     assert _panorama(np.zeros((64, 128, 3), np.uint8)).focal_prior is None
 
 
-def _fake_profile(true, noise=0.0):
-    """A profile whose blocks' losses are least at a change of the camera, in place of descents."""
-
-    def take(query, pose, changes):
-        pulls = np.tile([0.3, -0.3, 0.1, -0.1], 4)
-        off = changes[:, 0] - true
-        losses = np.abs(off)[:, None] / 16.0 + 1e-2 * off[:, None] * pulls + noise * np.sin(977.0 * changes)
-        return losses, [Pose(np.eye(3), np.array([c[0], 0.0, 0.0])) for c in changes]
-
-    return take
-
-
-@pytest.mark.parametrize("true", [0.0, 0.23, -0.31])
-def test_a_profile_without_a_minimum_is_followed_downhill(monkeypatch, true):
-    monkeypatch.setattr(focal, "take_profile", _fake_profile(true))
-    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.LAST_REACH)
-    assert minimum.change[0] == pytest.approx(true, abs=0.01)
-    assert minimum.variance < 0.01
-
-
-def test_a_loss_that_falls_beyond_the_range_contradicts_and_one_that_does_not_fall_tells_nothing(monkeypatch):
-    monkeypatch.setattr(focal, "take_profile", _fake_profile(0.8))
-    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
-    assert minimum.change[0] > focal.LIMIT
-    assert minimum.variance == pytest.approx(focal.END_DEVIATION**2)
-    changes = focal.make_design(1, 0.1)
-    assert not focal.fit_end(changes, changes * np.tile([1.0, -0.9], 8) + 1.0).any()
-
-
-def test_a_minimum_is_that_of_the_design_that_tells_most(monkeypatch):
-    """Among neighbouring focal lengths noise may hide it."""
-    monkeypatch.setattr(focal, "take_profile", _fake_profile(0.03, noise=5e-4))
-    minimum = focal.find_minimum(None, Pose(np.eye(3), np.zeros(3)), 1, focal.FIRST_REACH)
-    assert minimum.change[0] == pytest.approx(0.03, abs=0.02)
-    assert minimum.information.any()
-
-
 @pytest.mark.parametrize(
     ("minimum", "share", "std"), [(0.01, 0.5, 0.0071), (0.03, 0.88, 0.0096), (0.065, 0.97, 0.0101)]
 )
@@ -197,17 +133,18 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
     """Beyond two deviations the picture says where to look next."""
     rgb, pose = _photo(pinhole(320, 240, TRUE))
     query = rooms.ask(_panorama(rgb, focal_px=TRUE), rooms.scan_map(SEED))
-    in_common = focal.EDGE_ERROR * math.tau * TRUE / (0.5 * 320 * query.photo.panorama.rgb.shape[1])
-    information = np.array([[1.0 / (0.01**2 - in_common**2)]])
-    found = focal.Minimum(np.array([minimum]), information, np.ones((6, 1)))
-    monkeypatch.setattr(focal, "find_minimum", lambda *args: found)
-    monkeypatch.setattr(focal, "fit_matches", lambda query, pose: (0.0, 0.0, pose))
+    in_common = focal.EDGE_ERRORS[0] * math.tau * TRUE / (0.5 * 320 * query.photo.panorama.rgb.shape[1])
+    information = np.diag([1.0 / (0.01**2 - in_common**2), 0.0, 0.0, 0.0, 0.0])
+    found = Estimate(np.array([minimum, 0.0, 0.0, 0.0, 0.0]), information, np.ones((6, 5)))
+    monkeypatch.setattr(focal, "descend_lens", lambda *args: (None, None))
+    monkeypatch.setattr(focal, "estimate_corrections", lambda end: found)
+    monkeypatch.setattr(focal, "fit_matches", lambda query, pose: focal.MatchFit(np.zeros(5), 0.0, pose))
     fit = focal.fit_focal(query, scan().from_world(pose))
     assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
     assert fit.deviation == pytest.approx(std, rel=0.03)
-    nothing = found._replace(information=np.zeros((1, 1)))
-    monkeypatch.setattr(focal, "find_minimum", lambda *args: nothing)
+    nothing = found._replace(information=np.zeros((5, 5)))
+    monkeypatch.setattr(focal, "estimate_corrections", lambda end: nothing)
     open_fit = focal.fit_focal(query, scan().from_world(pose))
     assert (open_fit.change[0], open_fit.deviation, open_fit.conflict) == (0.0, pytest.approx(0.01), 0.0)
 
@@ -219,8 +156,8 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     query, found = focal.follow_matches(query, found)
     assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert found.best.pose.distance(scan().from_world(pose)) < 0.15
-    change, information, _ = focal.fit_matches(query, found.best.pose)
-    assert abs(change) < 2.5 / math.sqrt(information)
+    by_matches = focal.fit_matches(query, found.best.pose)
+    assert abs(by_matches.values[0]) < 2.5 / math.sqrt(by_matches.information)
     assert focal.follow_matches(query, found) == (query, found)
 
 

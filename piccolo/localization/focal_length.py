@@ -7,13 +7,15 @@ covariance of the pose is marginal: it includes the errors of all.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 
-from ..arrays import Array, Array32
+from ..arrays import Array, Array32, Mask
 from ..camera import Camera, Mount
 from ..camera.corrections import LENS, Corrections
 from ..camera.model import MODELS, RADIAL
@@ -22,18 +24,27 @@ from ..confidence.focal_length import WRONG_DEVIATION, WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
+from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
 from ..local_features.matching import NO_MATCHES
 from ..optimize.self_calibration import NUM_OF_POSE
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior
+from ..views.view import Cells
 from .comparison import compare, mask_occluders, score_pose
 from .covariance import UNCALIBRATED
 from .ladder import Limits
 from .last_descent import refine_best
 from .query import Features, Query, prepare_query
 from .selection import Selection
-from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, estimate_corrections
+from .self_calibration import (
+    Estimate,
+    Freedom,
+    FreeEnd,
+    descend_freely,
+    estimate_corrections,
+    invert,
+)
 from .verification import LEAST_ERROR, SURE_MATCHES, matches_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
@@ -42,11 +53,12 @@ FOCAL = LENS.index("log_focal")
 FITTED = [FOCAL, LENS.index("radial")]  # corrections that the camera takes; the others widen the covariance
 # deviations of the other corrections: of a calibration, and of a focal length alone
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
-NOT_CALIBRATED = (0.002, 0.01, 0.01, 0.02)
+NOT_CALIBRATED = (0.002, 0.005, 0.005, 0.008)
 OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: if they are wrong
 OTHERS_SHARES = (0.02, 0.02, 0.02, 0.02)  # chosen: of those that are wrong
 MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
+BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
 LIMIT = 0.4  # of the change by matches
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
@@ -65,7 +77,8 @@ INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal leng
 EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
-MAX_CALIBRATIONS = 4  # fits of a focal length
+MAX_CALIBRATIONS = 4  # fits of a focal length after the first
+EDGE = 17  # [px] of the sphere, around a point that shows nothing beyond the picture
 NEAR = Limits(1.0, 8, 1e-3)  # on fine cells, from another focal length
 CLOSE = Limits(0.7, 15, 1e-4)
 
@@ -135,14 +148,16 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     camera = query.given.cameras[0].camera
     assert prior is not None
     claim = make_claim(prior, camera)
-    by_matches = fit_matches(query, pose)
-    found = estimate_corrections(descend_lens(query, pose, claim, is_first))
-    estimate = add_matches(widen_by_edges(query, found), by_matches)
+    near, far = descend_lens(query, pose, claim, is_first)
+    estimate = add_matches(widen_by_edges(query, estimate_corrections(near)), fit_matches(query, pose))
+    free = widen_by_edges(query, estimate_corrections(far))
     values, information, motion = estimate
-    conflict = claim.conflict(values, information)
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
+    conflicts = [claim.conflict(*told[:2]) for told in (estimate, free)]
+    doubts = [claim.doubt(*told[:2]) for told in (estimate, free)]
+    conflict = max(conflicts)
     precision = claim.precision
     wide = precision.copy()
     if opinion is not None:
@@ -163,9 +178,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         motion[:, fitted],
         opinion,
         conflict,
-        claim.doubt(values, information),
+        max(doubts),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
-        None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(estimate, claim),
+        None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
     )
 
 
@@ -198,44 +213,61 @@ def make_claim(prior: FocalPrior, camera: Camera) -> Claim:
     return Claim(expected, deviations, np.array([WRONG_DEVIATION, *OTHERS_WRONG]), shares)
 
 
-def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> FreeEnd:
-    """Descend with all corrections of the lens free, and return the lowest end.
+def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tuple[FreeEnd, FreeEnd]:
+    """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
-    The descents begin as the photo was taken last, and as matches have it; at first, also with other focal
-    lengths.
+    The first descents begin as the photo was taken last and, at first, with other focal lengths; the others at
+    their end, and as matches have it.
     """
     shown = mask_occluders(query, compare(query, pose))
+    corrections = Corrections(query.given.cameras[0])
     wide = np.maximum(claim.wrong_deviations, claim.deviations)
-    freedom = Freedom(Corrections(query.given.cameras[0]), wide, MOST)
+    of_focal = Freedom(corrections, np.where(np.arange(len(wide)) == FOCAL, wide, claim.deviations), MOST)
+    of_all = Freedom(corrections, wide, MOST)
     cells = shown.view_at(pose, "fine")
-    points = shown.view_at(pose, "points")
+    points = mask_edge(shown.view_at(pose, "points"), pose, query.photo.panorama.is_valid)
 
     def begin(change: float) -> tuple[Pose, Array]:
         values = np.zeros(len(LENS))
         values[FOCAL] = change
-        near = descend_freely(cells, shown.photo.image("fine"), freedom, pose, values, NEAR)
+        near = descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR)
         return near.pose, near.values
 
-    def go_on(start: tuple[Pose, Array]) -> FreeEnd:
+    def go_on(freedom: Freedom, start: tuple[Pose, Array]) -> FreeEnd:
         return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
 
-    starts = [(pose, np.zeros(len(LENS)))]
+    def find_lowest(freedom: Freedom, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
+        ends = query.workers.map(partial(go_on, freedom), starts, "fit the focal length")
+        return min(ends, key=lambda end: end.loss)
+
+    others = query.workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
+    first = find_lowest(of_focal, [(pose, np.zeros(len(LENS))), *others])
+    motion = estimate_corrections(first).motion[:, FOCAL]
+    unit = np.eye(len(LENS))[FOCAL]
+    beside = [(add(first.pose, motion * change), first.values + unit * change) for change in BESIDE]
+    near = min(first, find_lowest(of_focal, beside), key=lambda end: end.loss)
     by_matches = fit_matches(query, pose, ALL_WIDTHS)
-    if by_matches.values.any():
-        starts.append((by_matches.pose, by_matches.values))
-    if is_first:
-        starts += query.workers.map(begin, FIRST_CHANGES, "fit the focal length")
-    return min(query.workers.map(go_on, starts, "fit the focal length"), key=lambda end: end.loss)
+    starts = [(near.pose, near.values), (by_matches.pose, by_matches.values)]
+    return near, find_lowest(of_all, starts[: 1 + int(by_matches.values.any())])
+
+
+def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
+    """Remove the points near the edge of what a photo (H, W) shows, which corrections move across it."""
+    inner = cv2.erode(is_valid.view(np.uint8), np.ones((EDGE, EDGE), np.uint8))
+    offsets = points.around(pose.center_world).offsets.T.astype(np.float64)
+    rays = rotate_points(offsets / np.linalg.norm(offsets, axis=1, keepdims=True), pose.R_cam_from_world)
+    is_kept = inner[compute_indices(rays, is_valid.shape[1])] > 0
+    return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
 def widen_by_edges(query: Query, estimate: Estimate) -> Estimate:
     """Add errors of the picture's edge that all blocks may have in common."""
     camera = query.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
-    covariance = np.linalg.pinv(estimate.information, hermitian=True)
+    covariance = invert(estimate.information)
     is_known = estimate.information.any(axis=1)
     errors = np.diag(is_known * (np.array(EDGE_ERRORS) * per_px) ** 2)
-    return estimate._replace(information=np.linalg.pinv(covariance + errors, hermitian=True))
+    return estimate._replace(information=invert(covariance + errors))
 
 
 def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
@@ -244,22 +276,23 @@ def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
     of_matches[FOCAL, FOCAL] = by_matches.information
     both = estimate.information + of_matches
     goal = estimate.information @ estimate.values + of_matches @ by_matches.values
-    return estimate._replace(values=np.linalg.pinv(both, hermitian=True) @ goal, information=both)
+    return estimate._replace(values=invert(both) @ goal, information=both)
 
 
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
-    The last fit to which the picture contributed counts.
+    The last change is applied too, so that what is found lies between what was given and what the picture says.
     """
     query, found = follow_matches(query, found)
     fit = fit_focal(query, found.best.pose)
-    for _ in range(MAX_CALIBRATIONS):
+    for num_left in range(MAX_CALIBRATIONS, -1, -1):
         if fit.is_at_rest:
             break
         query, found = refine_with(query, found, fit.change, fit.move(found.best.pose))
-        after = fit_focal(query, found.best.pose, is_first=False)
-        fit = after if after.conflict else fit._replace(change=np.zeros_like(fit.change))
+        if num_left == 0:
+            return query, found, fit._replace(change=np.zeros_like(fit.change))
+        fit = fit_focal(query, found.best.pose, is_first=False)
     return query, found, fit
 
 

@@ -26,7 +26,7 @@ from .ladder import Limits
 from .last_descent import refine_best
 from .query import Query, prepare_query
 from .selection import Selection
-from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, estimate_corrections
+from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, estimate_corrections, invert
 
 NO_CORRECTION = np.zeros(3)
 CLAIM = Claim(
@@ -100,7 +100,7 @@ def make_freedom(camera: Camera) -> Freedom:
 
 def count_deviations(estimate: Estimate) -> float:
     """Return how many deviations the most contradicted correction is from what is claimed."""
-    variances = np.diag(np.linalg.pinv(estimate.information, hermitian=True))
+    variances = np.diag(invert(estimate.information))
     return float((np.abs(estimate.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
