@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
+from ..cloud.layers import gap_variance
 from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
@@ -319,10 +320,20 @@ def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
     return covariance
 
 
+def layer_covariance(query: Query, pose: Pose) -> Array:
+    """Return the covariance (6, 6) [rad, m] of a pose in the map by two layers of the scan's surfaces."""
+    motion = query.scan_map.layers
+    if not motion.any():
+        return np.zeros((6, 6))
+    median_range = compute_median_range(query.view_at(pose, "points"))
+    variance = gap_variance(motion, pose.center_world, median_range)
+    return np.diag(np.repeat([variance / median_range**2, variance], 3))
+
+
 def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
     median_range = compute_median_range(query.view_at(pose, "points"))
-    common = scan_covariance(query.scan_map, median_range)
+    common = scan_covariance(query.scan_map, median_range) + layer_covariance(query, pose)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
@@ -338,7 +349,9 @@ def estimate_errors(query: Query, pose: Pose) -> Errors:
     if errors.gaussian is None or by_matches is None:
         return errors
     fused = fuse_allowed(query, errors.gaussian, PoseGaussian(*by_matches, errors.gaussian.common))
-    return errors if fused is None else Errors(fused, fused.largest_std)
+    if fused is None:
+        return errors
+    return Errors(fused, largest_std(fused.covariance - layer_covariance(query, pose)))
 
 
 def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
@@ -379,4 +392,4 @@ def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: P
     std_of_fit = largest_std(own + common)
     if not (is_partial or query.scan_map.has_shape):
         own = own + turn_positions(disagreement(shown, points, pose, covariance), turned)
-    return Errors(PoseGaussian(pose, own, common), std_of_fit)
+    return Errors(PoseGaussian(pose, own, common + layer_covariance(query, pose)), std_of_fit)

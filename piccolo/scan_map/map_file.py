@@ -48,6 +48,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "R_map_from_world": ("<f8", (3, 3)),
     "origin_world": ("<f8", (3,)),
     "surface_variance": ("<f8", (3, 3)),
+    "layers": ("<f8", (3, 3)),
     "centers": ("<f8", ("candidates", 3)),
     "scan_of_candidate": ("<u2", ("candidates",)),
     "sparse": ("<i8", ("sparse",)),
@@ -76,10 +77,11 @@ FARTHEST_ORIGIN = 1e12  # [m] of the world
 MARGIN = 10.0  # [m] around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
+FARTHEST_LAYERS = 0.2, 1.0  # [rad] turn and [m] move between two layers of surfaces
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS = 1000  # lines
 MAX_WARNING = 5000  # characters of a line
-FORMAT = "piccolo-map/8"
+FORMAT = "piccolo-map/9"
 NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
@@ -163,6 +165,10 @@ def _check_frame(path: Path, arrays: Arrays) -> None:
     is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROUNDING)
     if not (is_one and -ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
         _refuse(path, f"a surface_variance of {T.tolist()}")
+    middle, turn, move = arrays["layers"]
+    is_near = np.abs(middle).max() <= _reach(arrays) and np.linalg.norm(turn) <= FARTHEST_LAYERS[0]
+    if not (is_near and np.linalg.norm(move) <= FARTHEST_LAYERS[1]):
+        _refuse(path, f"layers of {arrays['layers'].tolist()}")
 
 
 def _check_octree(path: Path, arrays: Arrays) -> None:
