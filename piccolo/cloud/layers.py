@@ -86,8 +86,8 @@ def describe_layers(layers: Layers, place_world: Array) -> str:
     apart = f"about {100.0 * layers.distance:.0f} cm and {turn:.1f} deg apart"
     where = "({:.1f}, {:.1f}, {:.1f})".format(*place_world)
     return (
-        f"the scan has two layers of the same surfaces, {apart}, in {100.0 * layers.share:.0f} % of those "
-        f"that tell, most near {where}: register its stations again; poses are uncertain by half of that"
+        f"the scan has two layers of the same surfaces, {apart}, in {100.0 * layers.share:.0f} % of the "
+        f"surfaces that can show it, most near {where}: register its stations again; poses are uncertain by half of that"
     )
 
 
@@ -160,7 +160,6 @@ def see_second_sheets(profiles: Profiles, middle: Array) -> Patches:
         shared = np.maximum(shared, np.where(is_second, both, 0.0))
         is_told[:, NOT_TOLD:] &= is_beyond[:, :-NOT_TOLD]
         is_told[:, :NOT_TOLD] = False
-    shared[:, int(LARGEST_GAP / BIN) + 1 :] = 0.0
     patch, bins, gap = find_peaks(shared)
     is_near = np.zeros(shared.shape, np.bool_)
     for step in (-1, 0, 1):
@@ -172,12 +171,14 @@ def see_second_sheets(profiles: Profiles, middle: Array) -> Patches:
 
 
 def find_peaks(values: Array) -> tuple[Int64s, Int64s, Array]:
-    """Return row, column and exact place [m] of the positive local maxima in the rows of values (N, B)."""
+    """Return row, column and gap [m] of positive local maxima, to LARGEST_GAP, in rows of values (N, B)."""
     inner = values[:, 1:-1]
     rows, columns = np.nonzero((inner > 0.0) & (inner >= values[:, :-2]) & (inner > values[:, 2:]))
     columns += 1
     around = np.stack([values[rows, columns + step] for step in (-1, 0, 1)])
-    return rows, columns, (columns + (around[2] - around[0]) / around.sum(axis=0)) * BIN
+    gaps = (columns + (around[2] - around[0]) / around.sum(axis=0)) * BIN
+    is_small = gaps <= LARGEST_GAP
+    return rows[is_small], columns[is_small], gaps[is_small]
 
 
 def vote(patches: Patches, by_motion: Array, motions: Array, some: Int64s | slice = slice(None)) -> Int8s:

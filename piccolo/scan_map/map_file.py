@@ -77,7 +77,7 @@ FARTHEST_ORIGIN = 1e12  # [m] of the world
 MARGIN = 10.0  # [m] around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
-FARTHEST_LAYERS = 0.2, 1.0  # [rad] turn and [m] move between two layers of surfaces
+FARTHEST_LAYERS = 0.2, 1.0  # [rad] and [m] about and along any axis
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS = 1000  # lines
 MAX_WARNING = 5000  # characters of a line
@@ -165,14 +165,13 @@ def _check_frame(path: Path, arrays: Arrays) -> None:
     is_one = np.isfinite(T).all() and np.allclose(T, T.T, rtol=0.0, atol=ROUNDING)
     if not (is_one and -ROUNDING <= np.linalg.eigvalsh(T)[0] <= np.trace(T) <= LARGEST_DEVIATION**2):
         _refuse(path, f"a surface_variance of {T.tolist()}")
-    middle, turn, move = arrays["layers"]
-    is_near = np.abs(middle).max() <= _reach(arrays) and np.linalg.norm(turn) <= FARTHEST_LAYERS[0]
-    if not (is_near and np.linalg.norm(move) <= FARTHEST_LAYERS[1]):
-        _refuse(path, f"layers of {arrays['layers'].tolist()}")
 
 
 def _check_octree(path: Path, arrays: Arrays) -> None:
-    """Check that the children of each level are the next level, one to eight a node, within its voxel."""
+    """Check that the children of each level are the next level, one to eight a node, within its voxel.
+
+    And that the layers of surfaces are not far apart.
+    """
     nodes = arrays["octree_nodes"]
     first_child = arrays["octree_first_child"]
     start = arrays["octree_level_start"]
@@ -191,6 +190,9 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
     misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, _reach(arrays))
     if misplaced >= 0:
         _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
+    middle, turn, move = np.abs(arrays["layers"]).max(axis=1)
+    if not (middle <= _reach(arrays) and turn <= FARTHEST_LAYERS[0] and move <= FARTHEST_LAYERS[1]):
+        _refuse(path, f"layers of {arrays['layers'].tolist()}")
 
 
 def _check_views(path: Path, arrays: Arrays) -> None:
