@@ -85,10 +85,9 @@ def describe_layers(layers: Layers, place_world: Array) -> str:
     turn = np.degrees(np.linalg.norm(layers.motion[1]))
     apart = f"about {100.0 * layers.distance:.0f} cm and {turn:.1f} deg apart"
     where = "({:.1f}, {:.1f}, {:.1f})".format(*place_world)
-    return (
-        f"the scan has two layers of the same surfaces, {apart}, in {100.0 * layers.share:.0f} % of the "
-        f"surfaces that can show it, most near {where}: register its stations again; poses are uncertain by half of that"
-    )
+    seen = f"in {100.0 * layers.share:.0f} % of the surfaces that can show it, most near {where}"
+    advice = "register its stations again; poses are uncertain by half of that"
+    return f"the scan has two layers of the same surfaces, {apart}, {seen}: {advice}"
 
 
 @one_blas_thread()
