@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
-from ..cloud.layers import gap_variance
 from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
@@ -17,12 +16,12 @@ from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_c
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
-from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
 from .comparison import Comparison, compare, mask_occluders
 from .ladder import LAST, to_levels
 from .prior import contradictions
 from .query import Query
+from .scan_errors import layer_covariance, scan_covariance
 from .settings import ImageName
 from .verification import place_by_matches
 
@@ -35,8 +34,6 @@ UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 LEAST_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
-SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
-SHAPE_MOVE = 0.01  # [m]
 TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
 ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common with other photos
 SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
@@ -45,6 +42,7 @@ NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.
 MOST_SCORE = (
     3.0  # of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
 )
+SURE_SCORE = 5.0  # no photo of 54 in single scans has more
 NUM_TRIED = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
@@ -236,6 +234,12 @@ def score_halves(sums: Array, is_ahead: Mask) -> Array:
     return np.asarray(np.maximum(scores, 0.0) / np.trace(inverse @ left_out.T @ left_out))
 
 
+def average_directions(covariance: Array) -> Array:
+    """Return a covariance (6, 6) with the same mean variances in all directions."""
+    turn, move = np.trace(covariance[:3, :3]) / 3.0, np.trace(covariance[3:, 3:]) / 3.0
+    return np.diag(np.repeat([turn, move], 3))
+
+
 def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
     """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
 
@@ -256,7 +260,9 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     """Return what halves that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
-    both. Added are the covariance and the mean square of the steps to theirs, less for scores near chance.
+    both. Added are the covariance and the mean square of the steps to theirs, less for scores near chance;
+    where the score is never chance, the mean square in all directions too, as parts of a scan that is two
+    mix in other ways than halves.
     """
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
@@ -273,7 +279,9 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     if not tried:
         return np.zeros((6, 6))
     steps = min(shown.workers.map(separate, tried, "covariance"), key=lambda end: end[0])[1]
-    return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps))
+    apart = 0.5 * steps.T @ steps
+    mixed = max(1.0 - (SURE_SCORE / scores[tried[0]]) ** 2, 0.0) * average_directions(apart)
+    return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + apart) + mixed)
 
 
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
@@ -305,35 +313,11 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
 
 
-def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
-    """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
-
-    These are correlated over many blocks: its noise and doubled surfaces (`surface_variance`); of shape alone
-    its edges too.
-    """
-    surface = scan_map.surface_variance
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * np.trace(surface) / 3.0 / median_range**2
-    covariance[3:, 3:] = surface
-    if scan_map.has_shape:
-        covariance += np.diag(np.repeat([SHAPE_TURN**2, SHAPE_MOVE**2], 3))
-    return covariance
-
-
-def layer_covariance(query: Query, pose: Pose) -> Array:
-    """Return the covariance (6, 6) [rad, m] of a pose in the map by two layers of the scan's surfaces."""
-    motion = query.scan_map.layers
-    if not motion.any():
-        return np.zeros((6, 6))
-    median_range = compute_median_range(query.view_at(pose, "points"))
-    variance = gap_variance(motion, pose.center_world, median_range)
-    return np.diag(np.repeat([variance / median_range**2, variance], 3))
-
-
 def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
     median_range = compute_median_range(query.view_at(pose, "points"))
-    common = scan_covariance(query.scan_map, median_range) + layer_covariance(query, pose)
+    common = scan_covariance(query.scan_map, median_range)
+    common += layer_covariance(query.scan_map, pose, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
@@ -351,7 +335,9 @@ def estimate_errors(query: Query, pose: Pose) -> Errors:
     fused = fuse_allowed(query, errors.gaussian, PoseGaussian(*by_matches, errors.gaussian.common))
     if fused is None:
         return errors
-    return Errors(fused, largest_std(fused.covariance - layer_covariance(query, pose)))
+    median_range = compute_median_range(query.view_at(pose, "points"))
+    of_layers = layer_covariance(query.scan_map, pose, median_range)
+    return Errors(fused, largest_std(fused.covariance - of_layers))
 
 
 def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
@@ -392,4 +378,5 @@ def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: P
     std_of_fit = largest_std(own + common)
     if not (is_partial or query.scan_map.has_shape):
         own = own + turn_positions(disagreement(shown, points, pose, covariance), turned)
-    return Errors(PoseGaussian(pose, own, common + layer_covariance(query, pose)), std_of_fit)
+    common = common + layer_covariance(query.scan_map, pose, median_range)
+    return Errors(PoseGaussian(pose, own, common), std_of_fit)
