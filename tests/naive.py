@@ -277,7 +277,7 @@ def profile(leaves, place, radius):
 
     near = offsets[np.linalg.norm(offsets, axis=1) < radius]
     normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
-    for _ in range(3):
+    for _ in range(2):
         heights, is_over = in_disc(normal)
         bins = np.floor(heights[is_over] / 0.005 + 0.5)
         totals = [np.count_nonzero(np.abs(bins - k) <= 1) for k in range(-4, 5)]

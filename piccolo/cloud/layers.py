@@ -15,7 +15,8 @@ from ..jobs.threads import Workers, one_blas_thread
 from .octree import Octree
 from .profiles import BIN, NUM_BINS, Profiles, measure_profiles
 
-NUM_PATCHES = 4000
+NUM_PATCHES = 3000
+NUM_SAMPLED = 100  # of these, by which their radius is chosen
 RADII = (0.2, 0.4)  # [m] of patches, and of those of thin scans
 THICK = 60  # leaves in the median patch
 CELL_LEVELS = 2  # above the leaves: patches begin in cells of 8 cm
@@ -121,11 +122,10 @@ def find_layers(octree: Octree, workers: Workers) -> Layers | None:
 def measure_sheets(octree: Octree, workers: Workers) -> Profiles:
     """Return the profiles of patches that one sheet fills, in all its quarters."""
     leaves = choose_leaves(octree)
-    for radius in RADII:
-        profiles = measure_profiles(octree, leaves, radius, workers)
-        total = profiles.counts.sum(axis=(1, 2))
-        if len(total) and np.median(total) >= THICK:
-            break
+    sample = measure_profiles(octree, leaves[:: 1 + len(leaves) // NUM_SAMPLED], RADII[0], workers)
+    median = np.median(sample.counts.sum(axis=(1, 2))) if len(sample.counts) else 0.0
+    profiles = measure_profiles(octree, leaves, RADII[int(median < THICK)], workers)
+    total = profiles.counts.sum(axis=(1, 2))
     main = profiles.counts[:, :, NUM_BINS - 2 : NUM_BINS + 3].sum(axis=2)
     least = np.maximum(LEAST_LEAVES, LEAST_MAIN * total)
     is_full = (main.sum(axis=1) >= least) & (main.min(axis=1) >= LEAST_QUARTER)
