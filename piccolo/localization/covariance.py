@@ -42,7 +42,8 @@ NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.
 MOST_SCORE = (
     3.0  # of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
 )
-SURE_SCORE = 5.0  # no photo of 54 in single scans has more
+SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts of the scan
+SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
 NUM_TRIED = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
@@ -234,12 +235,6 @@ def score_halves(sums: Array, is_ahead: Mask) -> Array:
     return np.asarray(np.maximum(scores, 0.0) / np.trace(inverse @ left_out.T @ left_out))
 
 
-def average_directions(covariance: Array) -> Array:
-    """Return a covariance (6, 6) with the same mean variances in all directions."""
-    turn, move = np.trace(covariance[:3, :3]) / 3.0, np.trace(covariance[3:, 3:]) / 3.0
-    return np.diag(np.repeat([turn, move], 3))
-
-
 def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[float, Array]:
     """Descend from a pose on points of one half; return the loss, and the step (6,) as of `pose.step`.
 
@@ -256,32 +251,48 @@ def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[f
     return min(ends, key=lambda end: end[0])
 
 
+def split_by_planes(points: Cells, begins: Int64s) -> Mask:
+    """Return masks (S, B) of the blocks beyond upright planes that have a quarter to three of all points."""
+    ends = np.concatenate([np.zeros((1, 3)), np.cumsum(points.offsets.T, axis=0, dtype=np.float64)])[begins]
+    middles = np.diff(ends, axis=0) / np.maximum(np.diff(begins), 1)[:, None]
+    limits = np.quantile(NORMALS[:-1] @ points.offsets, SEAMS, axis=1)
+    return np.asarray((NORMALS[:-1] @ middles.T > limits[..., None]).reshape(-1, len(middles)))
+
+
 def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> Array:
-    """Return what halves that disagree about the pose of a whole photo add to its `covariance` (6, 6).
+    """Return what parts that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
-    both. Added are the covariance and the mean square of the steps to theirs, less for scores near chance;
-    where the score is never chance, the mean square in all directions too, as parts of a scan that is two
-    mix in other ways than halves.
+    both. Added are the covariance and the mean square of the steps to theirs. Parts of a scan that were moved
+    against each other may lie beyond any plane, and a pose is right by one of them: the product of the steps
+    is added in all directions. Both are less for scores near chance.
     """
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
     is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
     images = shown.photo.image("fine"), shown.photo.image("full")
-    scores = score_halves(sum_by_block(make_problem(points, images[-1]), pose, begins), is_ahead)
+    sums = sum_by_block(make_problem(points, images[-1]), pose, begins)
 
-    def separate(k: int) -> tuple[float, Array]:
-        is_half = np.repeat(is_ahead[k], np.diff(begins))
-        ends = [descend_half(take(points, half), images, pose) for half in (is_half, ~is_half)]
+    def separate(is_part: Mask) -> tuple[float, Array]:
+        is_in_part = np.repeat(is_part, np.diff(begins))
+        ends = [descend_half(take(points, part), images, pose) for part in (is_in_part, ~is_in_part)]
         return ends[0][0] + ends[1][0], np.array([delta for _, delta in ends])
 
+    added = np.zeros((6, 6))
+    scores = score_halves(sums, is_ahead)
     tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
-    if not tried:
-        return np.zeros((6, 6))
-    steps = min(shown.workers.map(separate, tried, "covariance"), key=lambda end: end[0])[1]
-    apart = 0.5 * steps.T @ steps
-    mixed = max(1.0 - (SURE_SCORE / scores[tried[0]]) ** 2, 0.0) * average_directions(apart)
-    return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + apart) + mixed)
+    if tried:
+        steps = min(shown.workers.map(separate, list(is_ahead[tried]), "covariance"), key=lambda end: end[0])[
+            1
+        ]
+        added += (1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
+    is_beyond = split_by_planes(points, begins)
+    scores = score_halves(sums, is_beyond)
+    seam = int(scores.argmax())
+    if scores[seam] > SEAM_SCORE:
+        one, other = np.linalg.norm(separate(is_beyond[seam])[1].reshape(2, 2, 3), axis=2)
+        added += (1.0 - (SEAM_SCORE / scores[seam]) ** 2) * np.diag(np.repeat(one * other, 3)) / 3.0
+    return added
 
 
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
