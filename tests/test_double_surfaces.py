@@ -17,6 +17,7 @@ from piccolo.localization import covariance
 from piccolo.localization.comparison import compare
 from piccolo.localization.query import prepare_query
 from piccolo.scan_map.scan_map import prepare_map
+from piccolo.views.view import Cells
 
 SIZE = np.array([6.0, 5.0, 2.6])  # [m] of a room turned by 20 degrees, so that no wall is along an axis
 TURN = exp_so3(np.array([0.0, 0.0, 0.35]))
@@ -171,3 +172,37 @@ def test_layers_are_an_error_that_photos_have_in_common():
     assert found.std_of_fit == single.std_of_fit
     split = covariance.split_errors(double, pose, found.gaussian.covariance)
     np.testing.assert_allclose(split.common, found.gaussian.common, rtol=0.05, atol=1e-9)
+
+
+def test_planes_split_a_place_into_parts_of_a_quarter_and_more():
+    points = Cells(rng_offsets(), rng_offsets(), np.ones(3000, np.float32), np.zeros(3))
+    points, begins = covariance.sort_by_block(points)
+    is_beyond = covariance.split_by_planes(points, begins)
+    assert is_beyond.shape == (24, len(begins) - 1)
+    shares = (is_beyond @ np.diff(begins) / 3000).reshape(3, 8)
+    np.testing.assert_allclose(shares, np.repeat([[0.75], [0.5], [0.25]], 8, axis=1), atol=0.08)
+    ahead = np.add.reduceat(points.offsets[0], begins[:-1]) / np.diff(begins)
+    assert ahead[is_beyond[8]].min() > ahead[~is_beyond[8]].max()
+
+
+def rng_offsets():
+    return np.random.default_rng(8).normal(0.0, 2.0, (3, 3000)).astype(np.float32)
+
+
+def test_a_scan_whose_end_was_moved_widens_the_covariance_in_all_directions(monkeypatch):
+    """Between its parts the surfaces are single: what tells are blocks beyond a plane."""
+    taken = rooms.query(1)
+    cloud = rooms.room(1)[1]
+    points = cloud.points.copy()
+    points[points[:, 0] > np.quantile(points[:, 0], 0.6)] += np.float32([0.02, -0.05, 0.01])
+    moved = rooms.Cloud(points, cloud.colors, cloud.origin_world)
+    scan_map = prepare_map(rooms.stream(moved), WORKERS, has_features=False)
+    assert not scan_map.layers.any()
+    asked = rooms.as_panorama(taken.rgb)
+    found = rooms.locate(asked, scan_map, rooms.KNOWN)
+    monkeypatch.setattr(covariance, "SEAM_SCORE", np.inf)
+    without = rooms.locate(asked, scan_map, rooms.KNOWN)
+    added = found.covariance.matrix - without.covariance.matrix
+    assert np.ptp(np.diag(added)[3:]) < 1e-9
+    assert 0.002**2 < added[3, 3] < 0.03**2
+    np.testing.assert_array_equal(found.pose.center_world, without.pose.center_world)
