@@ -109,6 +109,15 @@ def test_boards_and_doors_are_no_layers():
     assert layers.find_layers(_octree(np.concatenate([_room(), boards])), WORKERS) is None
 
 
+def test_ground_without_walls_has_layers_where_it_is_tilted():
+    points = _room()
+    points = points[points[:, 2] < 0.05 - SIZE[2] / 2.0] + np.array([0.0, 0.0, SIZE[2] / 2.0])
+    assert layers.find_layers(_octree(points), WORKERS) is None
+    points[::2] = _moved(points[::2], (0.004, 0.0, 0.0), (0.0, 0.0, 0.035))
+    found = layers.find_layers(_octree(points), WORKERS)
+    assert found.distance == pytest.approx(0.035, abs=0.004)
+
+
 def test_few_points_have_no_layers():
     assert layers.find_layers(_octree(_room(300)), WORKERS) is None
 

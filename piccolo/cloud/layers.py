@@ -32,10 +32,9 @@ MOST_TURN = np.radians(2.0)
 MOST_MOVE = 0.3  # [m] in the middle of the scan
 NUM_DRAWS = 3000
 SINGLE_SHARE = 0.3  # of the draws' patches beyond the first are taken for single
-SPREAD = 5.0  # [m] makes a turn comparable to a move
-LEAST_SPREAD = 0.5  # [m] determinant of three patches of walls
+LEAST_SPREAD = 0.5  # [m] determinant of three walls, by which a turn and a move differ
 NUM_SCORED = 300  # patches, by which draws are compared
-NUM_BEST = 10
+NUM_BEST = 10  # motions of walls that are refined
 IS_WALL = 0.5  # most of a normal's vertical part
 TELLING = 0.0125  # [m] gaps below this are not seen
 CHANCE = 0.12  # charged for each patch that tells, double or not: some are double by chance
@@ -151,7 +150,7 @@ def see_second_sheets(profiles: Profiles, middle: Array) -> Patches:
     is_told = np.ones(shared.shape, np.bool_)
     for over in (counts[..., NUM_BINS:-1], counts[..., NUM_BINS:0:-1]):
         first = over[..., :1]
-        total = first.sum(axis=1)
+        total = np.maximum(first.sum(axis=1), 1.0)
         both = np.minimum(over, first).sum(axis=1) / total
         least = np.minimum.accumulate(over.sum(axis=1) / total, axis=1)
         is_beyond = least < EDGE
@@ -192,7 +191,7 @@ def score(patches: Patches, by_motion: Array, motions: Array, some: Int64s | sli
     """Return scores (M,) of motions (M, K): double patches less those that there are by chance."""
     votes = vote(patches, by_motion, motions, some)
     charged = np.where(votes == -2, BEYOND, np.where(votes >= 0, CHANCE, 0.0))
-    return np.asarray(((votes == 1) - charged).sum(axis=0) / len(votes))
+    return np.asarray(((votes == 1) - charged).sum(axis=0) / max(len(votes), 1))
 
 
 def find_motion(patches: Patches) -> Array:

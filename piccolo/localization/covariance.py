@@ -282,9 +282,8 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     scores = score_halves(sums, is_ahead)
     tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
     if tried:
-        steps = min(shown.workers.map(separate, list(is_ahead[tried]), "covariance"), key=lambda end: end[0])[
-            1
-        ]
+        ends = shown.workers.map(separate, list(is_ahead[tried]), "covariance")
+        steps = min(ends, key=lambda end: end[0])[1]
         added += (1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
     is_beyond = split_by_planes(points, begins)
     scores = score_halves(sums, is_beyond)
