@@ -268,7 +268,7 @@ def votes(matches, R_cam_from_map, center_map):
 
 
 def profile(leaves, place, radius):
-    """Normal (3,) and place of a patch of leaves (N, 3), and their counts (4, 39) by quarter and height."""
+    """Normal (3,) and place of a patch of leaves (N, 3), and their counts (39,) by height."""
     offsets = leaves.astype(np.float64) - place
 
     def in_disc(normal):

@@ -3,14 +3,12 @@
 import re
 from dataclasses import replace
 
-import naive
 import numpy as np
 import pytest
 import rooms
 
 from piccolo.cloud import layers
 from piccolo.cloud.octree import build_octree
-from piccolo.cloud.profiles import measure_profiles
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
 from piccolo.localization import covariance
@@ -120,22 +118,6 @@ def test_ground_without_walls_has_layers_where_it_is_tilted():
 
 def test_few_points_have_no_layers():
     assert layers.find_layers(_octree(_room(300)), WORKERS) is None
-
-
-def test_profiles_are_those_of_numpy():
-    octree = _octree(np.concatenate([_room(200_000), _room(200_000, 1) + 0.03]))
-    leaves = octree.nodes[octree.level_start[-2] :, :3]
-    chosen = layers.choose_leaves(octree)[::400]
-    found = measure_profiles(octree, chosen, 0.2, WORKERS)
-    places = octree.nodes[chosen, :3].astype(float)
-    for place, normal, counts in zip(found.places, found.normals, found.counts, strict=True):
-        start = places[np.linalg.norm(places - place, axis=1).argmin()]
-        own, own_place, totals = naive.profile(leaves, start, 0.2)
-        sign = np.sign(own @ normal)
-        assert own @ normal * sign == pytest.approx(1.0, abs=1e-6)
-        np.testing.assert_allclose(place, own_place, atol=1e-6)
-        assert np.abs(counts.sum(axis=0) - totals[:: int(sign)]).sum() <= 4  # on the edges of bins
-        assert counts.sum(axis=1).min() > 0
 
 
 def test_a_position_between_two_layers_is_within_their_deviation():
