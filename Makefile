@@ -30,7 +30,7 @@ test: $(VENV)/ready
 	$(BIN)/python -m pytest -n auto --dist loadfile --no-loadscope-reorder --max-worker-restart 0
 
 # of the tests of kernels, those that need seconds in plain Python
-KERNELS := channel_loss cone cloud_morton cloud_octree p3p pose sampling_loss sphere zbuffer
+KERNELS := channel_loss cone cloud_morton cloud_octree cloud_profiles p3p pose sampling_loss sphere zbuffer
 
 test-kernels: $(VENV)/ready
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)

@@ -265,3 +265,26 @@ def votes(matches, R_cam_from_map, center_map):
         if off < math.radians(20.0) and abs(ratio) < math.log(1.7) and turn < math.radians(40.0):
             best[matches.query[k]] = max(best.get(matches.query[k], 0.0), float(matches.weights[k]))
     return sum(best.values())
+
+
+def profile(leaves, place, radius):
+    """Normal (3,) and place of a patch of leaves (N, 3), and their counts (39,) by height."""
+    offsets = leaves.astype(np.float64) - place
+
+    def in_disc(normal):
+        heights = offsets @ normal
+        return heights, np.linalg.norm(offsets - heights[:, None] * normal, axis=1) < radius
+
+    near = offsets[np.linalg.norm(offsets, axis=1) < radius]
+    normal = np.linalg.eigh(np.cov(near.T))[1][:, 0]
+    for _ in range(2):
+        heights, is_over = in_disc(normal)
+        bins = np.floor(heights[is_over] / 0.005 + 0.5)
+        totals = [np.count_nonzero(np.abs(bins - k) <= 1) for k in range(-4, 5)]
+        is_sheet = is_over & (np.abs(heights - 0.005 * (np.argmax(totals) - 4)) < 0.0125)
+        normal = np.linalg.eigh(np.cov(offsets[is_sheet].T))[1][:, 0]
+    heights, is_over = in_disc(normal)
+    sheet = offsets[is_sheet].mean(axis=0) @ normal
+    is_over &= np.abs(heights - sheet) < 0.0975
+    bins = np.floor((heights[is_over] - sheet) / 0.005 + 0.5).astype(int) + 19
+    return normal, place + sheet * normal, np.bincount(bins, minlength=39)

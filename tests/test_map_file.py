@@ -101,6 +101,8 @@ DAMAGE = {  # member, what is done to it, the words of the refusal
     "off metres": ("origin_world", lambda a: a + 0.25, "an origin_world of"),
     "no variance": ("surface_variance", _changed((2, 2), -0.01), "a surface_variance of"),
     "variance of no number": ("surface_variance", _changed((0, 0), np.nan), "a surface_variance of"),
+    "layers of no number": ("layers", _changed((1, 2), np.nan), "layers of "),
+    "layers far apart": ("layers", _changed((2, 0), 5.0), "layers of "),
     "flat": ("wide_features", lambda a: a.reshape(-1), "wide_features of type int8 and shape"),
     "a node more": ("octree_nodes", lambda a: np.concatenate([a, a[-1:]]), "levels that begin at"),
     "a link less": ("octree_first_child", lambda a: a[:-1], "invalid child links"),

@@ -16,12 +16,12 @@ from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_c
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
-from ..scan_map.scan_map import ScanMap
 from ..views.view import Cells
 from .comparison import Comparison, compare, mask_occluders
 from .ladder import LAST, to_levels
 from .prior import contradictions
 from .query import Query
+from .scan_errors import layer_covariance, scan_covariance
 from .settings import ImageName
 from .verification import place_by_matches
 
@@ -34,8 +34,6 @@ UNCALIBRATED = 0.005  # deviation of the focal length's logarithm: a calibration
 UNCALIBRATED_SHARE = 0.15  # PIXEL_SHARE of a photo with unknown principal point and distortion
 LEAST_RANGE = 0.005 / math.radians(0.1)  # [m] for moves of differences: shorter ones are lost in noise
 POLE_DEG = 2.0  # around the photo's poles pixels are so narrow that one point's errors outweigh all others
-SHAPE_TURN = 0.003  # [rad] by which edges of a photo are not where the scan's are, in all blocks alike
-SHAPE_MOVE = 0.01  # [m]
 TINY = 1e-12  # [rad^2, m^2] least variance of errors of one photo alone
 ALONE = 0.05  # chosen: of the variance by edges, the part that is not in common with other photos
 SCALE = LAST.limits.loss_scale * LEVELS_PER_UNIT
@@ -44,6 +42,8 @@ NORMALS = np.array([*(yaw_rotation(k * math.pi / 8.0)[0] for k in range(8)), (0.
 MOST_SCORE = (
     3.0  # of `score_halves`, by chance 1 in the mean; the best of nine planes has more in a quarter of photos
 )
+SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts of the scan
+SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
 NUM_TRIED = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
 
@@ -252,28 +252,47 @@ def descend_half(points: Cells, images: Sequence[Texels], pose: Pose) -> tuple[f
     return min(ends, key=lambda end: end[0])
 
 
+def split_by_planes(points: Cells, begins: Int64s) -> Mask:
+    """Return masks (S, B) of the blocks beyond upright planes that have a quarter to three of all points."""
+    ends = np.concatenate([np.zeros((1, 3)), np.cumsum(points.offsets.T, axis=0, dtype=np.float64)])[begins]
+    middles = np.diff(ends, axis=0) / np.maximum(np.diff(begins), 1)[:, None]
+    limits = np.quantile(NORMALS[:-1] @ points.offsets, SEAMS, axis=1)
+    return np.asarray((NORMALS[:-1] @ middles.T > limits[..., None]).reshape(-1, len(middles)))
+
+
 def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> Array:
-    """Return what halves that disagree about the pose of a whole photo add to its `covariance` (6, 6).
+    """Return what parts that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
-    both. Added are the covariance and the mean square of the steps to theirs, less for scores near chance.
+    both. Added are the covariance and the mean square of the steps to theirs. Parts of a scan that were moved
+    against each other may lie beyond any plane, and a pose is right by one of them: the product of the steps
+    is added in all directions. Both are less for scores near chance.
     """
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
     is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
     images = shown.photo.image("fine"), shown.photo.image("full")
-    scores = score_halves(sum_by_block(make_problem(points, images[-1]), pose, begins), is_ahead)
+    sums = sum_by_block(make_problem(points, images[-1]), pose, begins)
 
-    def separate(k: int) -> tuple[float, Array]:
-        is_half = np.repeat(is_ahead[k], np.diff(begins))
-        ends = [descend_half(take(points, half), images, pose) for half in (is_half, ~is_half)]
+    def separate(is_part: Mask) -> tuple[float, Array]:
+        is_in_part = np.repeat(is_part, np.diff(begins))
+        ends = [descend_half(take(points, part), images, pose) for part in (is_in_part, ~is_in_part)]
         return ends[0][0] + ends[1][0], np.array([delta for _, delta in ends])
 
+    added = np.zeros((6, 6))
+    scores = score_halves(sums, is_ahead)
     tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
-    if not tried:
-        return np.zeros((6, 6))
-    steps = min(shown.workers.map(separate, tried, "covariance"), key=lambda end: end[0])[1]
-    return np.asarray((1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps))
+    if tried:
+        ends = shown.workers.map(separate, list(is_ahead[tried]), "covariance")
+        steps = min(ends, key=lambda end: end[0])[1]
+        added += (1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
+    is_beyond = split_by_planes(points, begins)
+    scores = score_halves(sums, is_beyond)
+    seam = int(scores.argmax())
+    if scores[seam] > SEAM_SCORE:
+        one, other = np.linalg.norm(separate(is_beyond[seam])[1].reshape(2, 2, 3), axis=2)
+        added += (1.0 - (SEAM_SCORE / scores[seam]) ** 2) * np.diag(np.repeat(one * other, 3)) / 3.0
+    return added
 
 
 def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
@@ -305,25 +324,11 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
 
 
-def scan_covariance(scan_map: ScanMap, median_range: float) -> Array:
-    """Return the covariance (6, 6) [rad, m], in the map's axes, of errors of the scan.
-
-    These are correlated over many blocks: its noise and doubled surfaces (`surface_variance`); of shape alone
-    its edges too.
-    """
-    surface = scan_map.surface_variance
-    covariance = np.zeros((6, 6))
-    covariance[:3, :3] = np.eye(3) * np.trace(surface) / 3.0 / median_range**2
-    covariance[3:, 3:] = surface
-    if scan_map.has_shape:
-        covariance += np.diag(np.repeat([SHAPE_TURN**2, SHAPE_MOVE**2], 3))
-    return covariance
-
-
 def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
     median_range = compute_median_range(query.view_at(pose, "points"))
     common = scan_covariance(query.scan_map, median_range)
+    common += layer_covariance(query.scan_map, pose, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
@@ -339,7 +344,11 @@ def estimate_errors(query: Query, pose: Pose) -> Errors:
     if errors.gaussian is None or by_matches is None:
         return errors
     fused = fuse_allowed(query, errors.gaussian, PoseGaussian(*by_matches, errors.gaussian.common))
-    return errors if fused is None else Errors(fused, fused.largest_std)
+    if fused is None:
+        return errors
+    median_range = compute_median_range(query.view_at(pose, "points"))
+    of_layers = layer_covariance(query.scan_map, pose, median_range)
+    return Errors(fused, largest_std(fused.covariance - of_layers))
 
 
 def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
@@ -380,4 +389,5 @@ def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: P
     std_of_fit = largest_std(own + common)
     if not (is_partial or query.scan_map.has_shape):
         own = own + turn_positions(disagreement(shown, points, pose, covariance), turned)
+    common = common + layer_covariance(query.scan_map, pose, median_range)
     return Errors(PoseGaussian(pose, own, common), std_of_fit)

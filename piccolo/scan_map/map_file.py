@@ -48,6 +48,7 @@ LAYOUT: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "R_map_from_world": ("<f8", (3, 3)),
     "origin_world": ("<f8", (3,)),
     "surface_variance": ("<f8", (3, 3)),
+    "layers": ("<f8", (3, 3)),
     "centers": ("<f8", ("candidates", 3)),
     "scan_of_candidate": ("<u2", ("candidates",)),
     "sparse": ("<i8", ("sparse",)),
@@ -76,10 +77,11 @@ FARTHEST_ORIGIN = 1e12  # [m] of the world
 MARGIN = 10.0  # [m] around the voxels that are kept
 BRIGHTEST = np.float32(1.0 + 1e-6)
 LARGEST_DEVIATION = 1.0  # [m] of points from their surfaces
+FARTHEST_LAYERS = 0.2, 1.0  # [rad] and [m] about and along any axis
 MAX_CRS = 4 * 20_000  # [byte]
 MAX_WARNINGS = 1000  # lines
 MAX_WARNING = 5000  # characters of a line
-FORMAT = "piccolo-map/8"
+FORMAT = "piccolo-map/9"
 NAME = own_names("piccolo-map")  # in a cache
 OTHERS = ("octree", "local_features", "scan_names", "warnings", "crs", "is_partial", "views", "late")
 ARRAYS = [f.name for f in fields(ScanMap) if f.name not in OTHERS]
@@ -166,7 +168,10 @@ def _check_frame(path: Path, arrays: Arrays) -> None:
 
 
 def _check_octree(path: Path, arrays: Arrays) -> None:
-    """Check that the children of each level are the next level, one to eight a node, within its voxel."""
+    """Check that the children of each level are the next level, one to eight a node, within its voxel.
+
+    And that the layers of surfaces are not far apart.
+    """
     nodes = arrays["octree_nodes"]
     first_child = arrays["octree_first_child"]
     start = arrays["octree_level_start"]
@@ -185,6 +190,9 @@ def _check_octree(path: Path, arrays: Arrays) -> None:
     misplaced = first_misplaced(nodes, first_child, start, origin, leaf_size, _reach(arrays))
     if misplaced >= 0:
         _refuse(path, f"an octree whose node {misplaced} is {nodes[misplaced].tolist()}")
+    middle, turn, move = np.abs(arrays["layers"]).max(axis=1)
+    if not (middle <= _reach(arrays) and turn <= FARTHEST_LAYERS[0] and move <= FARTHEST_LAYERS[1]):
+        _refuse(path, f"layers of {arrays['layers'].tolist()}")
 
 
 def _check_views(path: Path, arrays: Arrays) -> None:

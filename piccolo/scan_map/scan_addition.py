@@ -21,7 +21,7 @@ from ..local_features.feature_map import MOST_VIEWS, FeatureMap, extend_feature_
 from ..views.candidate_views import SEARCH_VIEW, CandidateViews, WideViews, render_wide
 from ..views.view import BLOCK, ranges_around
 from .camera_positions import CLEARANCE_VOXEL, MIN_CLEARANCE, Box, candidate_centers
-from .scan_map import ScanMap, check_name, make_range_lookup, sparse_candidates
+from .scan_map import ScanMap, check_name, look_for_layers, make_range_lookup, sparse_candidates
 
 REACH = 3.0  # [m] beside the new scan there may be new places for a camera
 NEARER = 0.9  # of two scans the one in front is nearer by this
@@ -57,6 +57,7 @@ def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watc
     with watch.stage("prepare"):
         own, added = (o.level(LEAF_SIZE) for o in (old.octree, new))
         octree = build_octree(join_voxels(own, added, old.R_map_from_world @ old.origin_world))
+        layers, notes = look_for_layers(octree, old.R_map_from_world, old.origin_world, workers)
         found = join_candidates(old, new, octree, workers)
         sparse, _ = sparse_candidates(found.centers)
         wide = join_views(old, octree, found, sparse, workers)
@@ -64,6 +65,7 @@ def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watc
             old,
             octree=octree,
             surface_variance=surface_variance(octree),
+            layers=layers,
             centers=found.centers,
             scan_of_candidate=assign_scans(old, found),
             sparse=sparse,
@@ -72,7 +74,7 @@ def add_scan(old: ScanMap, cloud: CloudStream, name: str, workers: Workers, watc
             views=CandidateViews(octree, found.centers),
             local_features=join_features(old, octree, found, workers),
             scan_names=(*old.scan_names, name),
-            warnings=tuple(dict.fromkeys(old.warnings + warnings)),
+            warnings=tuple(dict.fromkeys(old.warnings + warnings + notes)),
         )
 
 

@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..arrays import Array, Bytes, Int8s, Int64s, Mask, Uint16s
+from ..cloud.layers import NO_LAYERS, describe_layers, find_layers
 from ..cloud.octree import Octree, build_octree
 from ..cloud.settings import R_z_from_axis, UpAxis
 from ..cloud.soa import MapFrame, PackedPoints, pack_points
@@ -39,6 +40,7 @@ class ScanMap(MapFrame):
 
     octree: Octree
     surface_variance: Array  # (3, 3) [m^2] that the scan's noise and doubled surfaces give to a position
+    layers: Array  # (3, 3) motion between two layers of the surfaces, see `Layers`; zero if there is one
     centers: Array  # (candidates, 3) [m]
     scan_of_candidate: Uint16s  # (candidates,) index of its name in scan_names
     sparse: Int64s  # candidates that are searched: no two share a cell of the coarse grid
@@ -172,6 +174,7 @@ def prepare_map(
     with watch.stage("prepare"):
         if has_shape:
             octree = paint_shape(octree, workers)
+        layers, found = look_for_layers(octree, R_map_from_world, origin_world, workers)
         centers, notes = find_candidates(octree, R_map_from_world, origin_world, prior, workers)
         sparse, _ = sparse_candidates(centers)
         wide = render_wide(octree, centers[sparse], SEARCH_VIEW, workers)
@@ -180,6 +183,7 @@ def prepare_map(
             R_map_from_world=R_map_from_world,
             origin_world=origin_world,
             surface_variance=surface_variance(octree),
+            layers=layers,
             centers=centers,
             scan_of_candidate=np.zeros(len(centers), np.uint16),
             sparse=sparse,
@@ -187,7 +191,7 @@ def prepare_map(
             wide_seen=wide.seen,
             views=CandidateViews(octree, centers),
             local_features=make_feature_map(octree, centers[:0], Workers()),
-            warnings=warnings + notes,
+            warnings=warnings + found + notes,
             is_partial=bool(notes),
             has_shape=has_shape,
         )
@@ -195,6 +199,18 @@ def prepare_map(
             return scan_map
         scan_map = defer_features(scan_map)
         return add_features(scan_map, workers) if has_features else scan_map
+
+
+def look_for_layers(
+    octree: Octree, R_map_from_world: Array, origin_world: Array, workers: Workers
+) -> tuple[Array, tuple[str, ...]]:
+    """Return the motion (3, 3) between two layers of a scan, with a warning; zero and none if it has one."""
+    found = find_layers(octree, workers)
+    if found is None:
+        return NO_LAYERS, ()
+    text = describe_layers(found, R_map_from_world.T @ found.place + origin_world)
+    workers.warn(text)
+    return found.motion, (text,)
 
 
 def change_colors(scan_map: ScanMap, octree: Octree, workers: Workers) -> ScanMap:
