@@ -100,9 +100,10 @@ def query(seed, variant="clean", index=0, width=WIDTH):
 
 
 @functools.lru_cache
-def scan(seed, num_threads=2):
+def scan(seed, num_threads=2, num_points=NUM_POINTS):
     """A room as it is after it was opened."""
-    return Scan(OpenedScan(scan_map(seed), "room", CloudSettings(), AUTO, Workers(num_threads), {}))
+    prepared = scan_map(seed, num_points)
+    return Scan(OpenedScan(prepared, "room", CloudSettings(), AUTO, Workers(num_threads), {}))
 
 
 def as_panorama(rgb):

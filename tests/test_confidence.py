@@ -25,11 +25,10 @@ MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
 def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
     standings = [Standing(*values, "drawn scan") for values in ((1.0, 0.5, 12), (0.5, 0.1, 2))]
-    p = posterior(standings, 0.01, model=MODEL)
+    p = posterior(standings, 0.01, 0.8, MODEL)
     e = math.exp
     odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
-    doubt = math.erf(0.1 / (0.01 * math.sqrt(2.0)))
-    expected = [doubt * odds[0] / sum(odds), doubt * odds[1] / sum(odds)]
+    expected = [0.8 * odds[0] / sum(odds), 0.8 * odds[1] / sum(odds)]
     np.testing.assert_allclose(p, [*expected, 1.0 - sum(expected)], rtol=1e-12)
 
 
@@ -84,11 +83,10 @@ def test_more_evidence_is_more_probability(name, more):
     assert pair[1] < pair[0] < posterior([middling], SURE)[0]
 
 
-@pytest.mark.parametrize(("std", "most"), [(0.05, 0.954), (0.1, 0.683), (0.3, 0.261)])
-def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(std, most):
-    """The part of a normal distribution within 0.1 m."""
-    p = posterior([RIGHT._replace(num_matches=10**7)], std)
-    assert p[0] == pytest.approx(most, abs=0.002)
+@pytest.mark.parametrize("within", [0.954, 0.5])
+def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(within):
+    p = posterior([RIGHT._replace(num_matches=10**7)], SURE, within)
+    assert p[0] == pytest.approx(within, abs=0.002)
     assert p.sum() == pytest.approx(1.0)
 
 

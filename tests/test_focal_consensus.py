@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import rooms
 from pictures import encoded, write
-from test_focal_length import TRUE
+from test_focal_length import DENSE, TRUE
 from test_localize_cameras import SEED, place
 
 from piccolo.batch.localizer import list_changed_by_consensus, list_looks_by_focal
@@ -125,11 +125,12 @@ def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
         poses.append(Pose(turned, pose.center_world + np.array([0.05 * k, 0.03, 0.0])))
         picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, poses[k], Workers(2))
         write(photos / f"{k}.png", encoded(picture, ".png"))
-    words = ["--cloud", str(rooms.map_path(SEED)), "--pano", str(photos), "--focal", str(1.03 * TRUE)]
+    words = ["--cloud", str(rooms.map_path(SEED, DENSE)), "--pano", str(photos), "--focal", str(1.03 * TRUE)]
     out = tmp_path / "poses.jsonl"
     main([*words, "--gravity", "known", "--quiet", "--threads", "2", "--out", str(out)])
     results = read_results([out])
-    told = [r.focal_length.others_px for r in results if r.focal_length.others_px]
+    fitted = [r.focal_length for r in results if r.focal_length]
+    told = [focal.others_px for focal in fitted if focal.others_px]
     assert told
     assert told == pytest.approx([TRUE] * len(told), rel=0.01)
     for result, true in zip(results, poses, strict=True):

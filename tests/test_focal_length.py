@@ -27,6 +27,7 @@ from piccolo.photo import Photo
 from research.synthetic.world import render_picture
 
 TRUE = 160.0  # [px] of the photos here, 320 x 240
+DENSE = 400_000  # points of a room whose photos tell their focal length to a per cent
 
 
 def _photo(camera, yaw=0.0):
@@ -90,7 +91,8 @@ def test_the_focal_length_of_a_bare_part_of_a_wall_stays_open():
 
 def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found():
     rgb, pose = _photo(pinhole(320, 240, TRUE))
-    result = scan().localize(Photo(rgb, focal_px=145.0, refine_focal=True), gravity="known")
+    dense = rooms.scan(SEED, num_points=DENSE)
+    result = dense.localize(Photo(rgb, focal_px=145.0, refine_focal=True), gravity="known")
     assert result.status == "localized"
     found = result.focal_length
     assert abs(found.px - TRUE) < 3.0 * found.std_px
@@ -103,14 +105,15 @@ def test_a_photo_with_a_guessed_focal_length_is_localized_and_says_what_it_found
 
 def test_a_focal_length_that_contradicts_what_was_given_makes_no_sure_pose(monkeypatch):
     """Nor does a bundle of one photo, which keeps what that rules out; the photo is searched for once."""
-    rgb, pose = _photo(pinhole(320, 240, TRUE), 1.0)
+    rgb, pose = _photo(pinhole(320, 240, TRUE))
     photo = Photo(rgb, focal_px=145.0)
     find = module.find
     found = []
     monkeypatch.setattr(module, "find", lambda *given: found.append(find(*given)) or found[0])
     monkeypatch.setattr(bundle, "find", lambda *_: found[0])
-    alone = scan().localize(photo, gravity="known")
-    (together,) = scan().localize_bundle([photo], [pose], gravity="known")
+    dense = rooms.scan(SEED, num_points=DENSE)
+    alone = dense.localize(photo, gravity="known")
+    (together,) = dense.localize_bundle([photo], [pose], gravity="known")
     for result in (alone, together):
         assert result.status == "not_localized"
         assert any(line.endswith(" px, not 145: check `focal_px`") for line in result.warnings)
