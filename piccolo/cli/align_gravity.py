@@ -9,7 +9,7 @@ from ..arrays import Array
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
-from ..cloud.writers import write_transformed
+from ..cloud.writers import describe_unit, write_transformed
 from ..confidence.confidence import LOCALIZED
 from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
@@ -139,6 +139,7 @@ def main(arguments: Arguments) -> int:
 
     if out and not doubt:
         arguments.warn(write_transformed(cloud, T, out, write_transform))
+        arguments.warn(describe_unit(cloud, out))
     report |= {"cloud": list(map(str, arguments.cloud)), "out": str(out) if out and not doubt else None}
     report |= {"T_aligned_from_scan": T.tolist(), "metres_per_unit": cloud.scale}
     arguments.report(outputs, report)
