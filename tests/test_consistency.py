@@ -49,7 +49,7 @@ BROKEN = {
     "the poses 0 and 1 are one": {"alternatives": (Alternative(POSE, 0.2, 7, 0.008),)},
     "not symmetric": {"covariance": _covariance(0, 1, 1e-9)},
     "wanted above 0": {"covariance": _covariance(2, 2, 0.0)},
-    "not positive": {"covariance": PoseCovariance(COVARIANCE - 1e-6, "up and down")},
+    "not positive": {"covariance": PoseCovariance(COVARIANCE + 2e-6 * np.eye(6)[[1, 0, 2, 3, 4, 5]], "")},
     "2908.0 +- 9.0 px, where": {"focal_length": dataclasses.replace(FOCAL, px=2908.0)},
     "alone without its deviation": {"focal_length": dataclasses.replace(FOCAL, picture_std_px=None)},
     "of others without": {"focal_length": dataclasses.replace(FOCAL, others_px=2770.0)},
