@@ -33,10 +33,10 @@ examples:
 The dominant planes give the vertical; of its two directions, the one closer to the file's up axis (z, in glTF
 y) or to --up is up. The axis may be up to 15 degrees off. If the scan may have any orientation,
 --assume-nothing decides by furniture and free space, and --pano by a photo. If up remains unknown, nothing is
-written. Otherwise the cloud is written as binary PLY in the unit of the scan (of several, in metres), with the
-transform next to it: aligned.txt, four rows of four numbers, as CloudCompare reads them
-(docs/CONVENTIONS.md). A single PLY file keeps its other properties and faces. Prints one JSON object to stdout;
-without --out, this is all.
+written. Otherwise the cloud is written as binary PLY in the unit of the scan (of several, in metres), with
+the transform next to it: aligned.txt, four rows of four numbers, as CloudCompare reads them
+(docs/CONVENTIONS.md). A single PLY file keeps its other properties and faces. Prints one JSON object to
+stdout; without --out, this is all.
 """
 
 
