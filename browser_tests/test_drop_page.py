@@ -151,6 +151,18 @@ def test_panorama_phone_photo_and_photo_of_another_place(visit, elsewhere, shoot
     assert _names(page) == ["living_room", "phone", "bedroom"]
 
 
+def test_the_export_keeps_names(visit, tmp_path):
+    page = visit()
+    names = ["Tom & Jerry's <1> 😀.jpg", 'the "Hall".jpg', "50 %22.jpg"]
+    for name in names:
+        (tmp_path / name).write_bytes((FLAT / "images" / "living_room.jpg").read_bytes())
+    _choose(page, *(tmp_path / name for name in names))
+    _wait(page, *["localized"] * len(names))
+    with page.expect_download() as saved:
+        page.click('button[aria-label^="Download the results"]')
+    assert [result.pano for result in read_results([saved.value.path()])] == names
+
+
 def test_what_is_refused_says_why(visit, tmp_path, shoot):
     page = visit()
     asked = []

@@ -232,9 +232,8 @@ class OpenedScan:
         place = from_wgs84(crs, gps.latitude_deg, gps.longitude_deg)
         if place is None:
             return None
-        scale = self.cloud_settings.scale
         radius = 3.0 * max(gps.accuracy or 10.0, 5.0)  # [m] three sigmas; 10 m where the file does not say
-        return GpsPrior((place[0] * scale, place[1] * scale), radius)
+        return GpsPrior(place, radius)
 
 
 def settings_json(settings: Settings, cloud_settings: CloudSettings, photo: Photo) -> dict[str, object]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from .arguments import check_fields, check_kind
 from .arrays import Floats, Values
-from .cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
+from .cloud.settings import BY_FILE, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
@@ -40,7 +40,8 @@ class Cloud:
     colors
         RGB of the points (N, 3). Only with an array of points.
     units
-        Unit of the coordinates in files. Arrays and all poses are in metres.
+        Unit of the coordinates in files, by default the one that a LAS or LAZ file names, else the metre.
+        Arrays and all poses are in metres.
     up
         Axis of the scan that points up; "auto" is z, in glTF files y.
     ignore_colors
@@ -67,7 +68,7 @@ class Cloud:
     source: File | Sequence[File] | Floats
     _: KW_ONLY
     colors: Values | None = None
-    units: Units = "m"
+    units: Units | None = None
     up: UpAxis = "auto"
     ignore_colors: bool = False
     labels: bool = False
@@ -86,7 +87,7 @@ class Cloud:
                 raise InputError("`colors`: found files, wanted an array of points")
             if not self.paths:
                 raise InputError("`source`: found no file, wanted a scan's path")
-        elif self.units != "m":
+        elif self.units not in (None, "m"):
             raise InputError(f"`units`: found {self.units!r} for arrays, wanted points in metres")
         self.settings  # noqa: B018  refuses what does not go together
 
@@ -100,12 +101,11 @@ class Cloud:
     @property
     def settings(self) -> CloudSettings:
         """Settings with which the scan is read."""
-        channels = WITHOUT_COLORS if self.ignore_colors else IN_METRES.channels
+        channels = WITHOUT_COLORS if self.ignore_colors else BY_FILE.channels
         labels = Labels(tuple(sorted(set(self.ignore_labels)))) if self.labels else None
         columns = tuple(self.columns)
-        return CloudSettings(
-            METRES[self.units], self.up, channels, labels, self.crs, self.color_range, columns
-        )
+        scale = METRES[self.units] if self.units else None
+        return CloudSettings(scale, self.up, channels, labels, self.crs, self.color_range, columns)
 
 
 def open_scan(

@@ -1,18 +1,14 @@
-"""Every result that a test makes is checked by the schema that users have."""
+"""Every result that a test makes, or that a command writes for it, is checked (consistency.py)."""
 
-import json
 import os
 import signal
-from pathlib import Path
+import threading
 
-import jsonschema
 import pytest
 import rooms
+from consistency import contradictions_of_line, find_contradictions, lines_of_results
 
 from piccolo.result import Result
-
-SCHEMA = json.loads((Path(__file__).resolve().parents[1] / "docs" / "result.schema.json").read_text())
-VALIDATOR = jsonschema.Draft202012Validator(SCHEMA)
 
 # A shell starts what runs in the background with Ctrl-C ignored, as then would be what a test starts.
 signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -36,19 +32,41 @@ def pytest_collection_modifyitems(items):
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _checked_results():
-    """Result.to_json as ever, but for a text that the schema does not know."""
-    to_json = Result.to_json
+def contradictions():
+    """What contradicts itself in results that are made or written, since it was last taken out."""
+    found = []
+    make, write = Result.__post_init__, Result.to_json
+    is_checking = threading.local()
 
-    def checked(result):
-        text = to_json(result)
-        VALIDATOR.validate(json.loads(text))
+    def make_and_check(result):
+        make(result)
+        found.extend(f"{result.pano}: {words}" for words in find_contradictions(result))
+
+    def write_and_check(result):
+        text = write(result)
+        if not vars(is_checking):  # which reads and writes too
+            is_checking.now = True
+            found.extend(f"{result.pano}: {words}" for words in contradictions_of_line(text))
+            del is_checking.now
         return text
 
     patch = pytest.MonkeyPatch()
-    patch.setattr(Result, "to_json", checked)
-    yield
+    patch.setattr(Result, "__post_init__", make_and_check)
+    patch.setattr(Result, "to_json", write_and_check)
+    yield found
     patch.undo()
+
+
+@pytest.fixture(autouse=True)
+def _consistent(request, contradictions):
+    """Fail a test whose results contradict themselves, also those in files, maybe of other processes."""
+    yield
+    folder = request.node.funcargs.get("tmp_path")
+    for line in lines_of_results(folder) if folder else ():
+        contradictions.extend(contradictions_of_line(line))
+    found = list(dict.fromkeys(contradictions))
+    contradictions.clear()
+    assert not found, "\n".join(found)
 
 
 @pytest.fixture(autouse=True, scope="session")

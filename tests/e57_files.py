@@ -33,12 +33,14 @@ class ImageToWrite:
     name: str = "an image"
 
 
-def write(path, scans=(), images=()):
+def write(path, scans=(), images=(), crs=""):
     file = libe57.ImageFile(str(path), "w")
     file.extensionsAdd("", libe57.E57_V1_0_URI)
     file.extensionsAdd(*NORMALS)
     root = file.root()
     root.set("formatName", libe57.StringNode(file, "ASTM E57 3D Imaging Data File"))
+    if crs:
+        root.set("coordinateMetadata", libe57.StringNode(file, crs))
     for name in ("data3D", "images2D"):
         root.set(name, libe57.VectorNode(file, True))
     for scan in scans:

@@ -33,6 +33,18 @@ def las_bytes(raw, point_format=3, colors=None, withheld=None, extra_bytes=0, in
     return content.getvalue()
 
 
+def with_records(las, *records):
+    """A LAS file with the records of a coordinate system, each (id, content), in place of its own."""
+    (header_size,) = struct.unpack_from("<H", las, 94)
+    (points,) = struct.unpack_from("<I", las, 96)
+    head = bytearray(las[:header_size])
+    content = b""
+    for record_id, data in records:
+        content += struct.pack("<H16sHH32s", 0, b"LASF_Projection", record_id, len(data), b"") + data
+    struct.pack_into("<II", head, 96, header_size + len(content), len(records))
+    return bytes(head) + content + las[points:]
+
+
 def laz_bytes(las, chunk=None, cuts=()):
     """A LAS file compressed in chunks of `chunk` points, or between the points in `cuts`."""
     header_size, offset, num_vlrs, point_format, size, count = struct.unpack_from("<HIIBHI", las, 94)

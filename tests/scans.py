@@ -6,11 +6,11 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from rooms import room
 
-from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.settings import BY_FILE
 from piccolo.cloud.stream import open_cloud
 
 
-def read_cloud(path, settings=IN_METRES):
+def read_cloud(path, settings=BY_FILE):
     """The points of one file."""
     return open_cloud([path], settings).read()
 

@@ -139,6 +139,11 @@ class Looked(NamedTuple):
     firsts: dict
 
 
+def _sure_by(confidence):
+    """The fields of a result whose best pose is the only one that is likely."""
+    return {"confidence": confidence, "probability_none": 1.0 - confidence, "alternatives": ()}
+
+
 @pytest.fixture
 def looked(monkeypatch):
     """What is looked at again; b and d are not sure before, and d is not after."""
@@ -151,7 +156,7 @@ def looked(monkeypatch):
         found = replace(known[content], pano=photo.name)
         is_sure = photo.path.name not in ("b.jpg", "d.jpg")
         status = found.status if is_sure else "ambiguous"
-        found = replace(found, cameras=PHONE, confidence=0.95, status=status)
+        found = replace(found, cameras=PHONE, status=status, **_sure_by(0.95))
         looked.firsts[photo.path.name] = found.to_json()
         return found
 
@@ -297,13 +302,13 @@ def test_what_is_looked_at(scene, monkeypatch):
     """No photo whose focal length is a guess, none that is another by now; and with all that was found."""
     scan = open_scan(scene / "cloud.ply", cache=False)
     photo = scene / "images" / "clean_0.jpg"
-    first = replace(scan.localize(str(photo)), confidence=0.5, status="ambiguous")
+    first = replace(scan.localize(str(photo)), status="ambiguous", **_sure_by(0.5))
     opened, asked = scan._opened, []
     other = replace(first, source=replace(first.source, pano_sha256="0"))
 
     def localize_beside(_prepared, _picture, poses, pictures, *_):
         asked.append([pose.key for pose in poses[:1]])
-        return Localization("localized", 0.7, 0.3, first.best_pose), tuple(pictures)
+        return Localization("localized", 0.93, 0.07, first.best_pose), tuple(pictures)
 
     monkeypatch.setattr(opened_scan, "localize_beside", localize_beside)
 
@@ -311,9 +316,9 @@ def test_what_is_looked_at(scene, monkeypatch):
         return opened.localize_again(Photo(photo), before, lambda: pictures, opened.settings)
 
     found, names = look(first, {"x": None})
-    assert (found.status, found.confidence, names) == ("localized", 0.7, ("x",))
+    assert (found.status, found.confidence, names) == ("localized", 0.93, ("x",))
     assert found.source == first.source
-    assert look(replace(first, confidence=0.8), {"x": None})[1] == (), "it is no surer"
+    assert look(replace(first, **_sure_by(0.95)), {"x": None})[1] == (), "it is no surer"
     del asked[1:]
     assert asked == [[opened.prepared.from_world(first.best_pose).key]]
     assert look(first, {}) == (first, ())

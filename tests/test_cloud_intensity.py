@@ -17,7 +17,7 @@ from piccolo.cloud.readers.pcd import open_pcd
 from piccolo.cloud.readers.ply import open_ply
 from piccolo.cloud.readers.reader import MissingChannelError, RawCloud, as_gray, make_source
 from piccolo.cloud.readers.text import open_ptx, open_text
-from piccolo.cloud.settings import IN_COLORS, IN_METRES, WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.settings import BY_FILE, IN_COLORS, WITHOUT_COLORS, CloudSettings
 from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.geometry.pose import exp_so3
 
@@ -43,7 +43,7 @@ def _in_gray(intensity, points=POINTS, chunk=701):
 
 
 def assert_gray(open_file, path, intensity, points_world=POINTS, atol=1e-9):
-    read = whole(open_file, path, IN_METRES, "intensity")
+    read = whole(open_file, path, BY_FILE, "intensity")
     np.testing.assert_array_equal(read.colors, _in_gray(intensity))
     np.testing.assert_allclose(read.points_world, points_world, atol=atol)
     source = open_source(path)
@@ -114,7 +114,7 @@ def test_text(tmp_path, name):
 def test_colours_come_first_and_the_map_is_gray(tmp_path):
     lines = ["x y z intensity r g b", *(f"{x} {y} {z} 5 10 20 30" for x, y, z in POINTS.tolist())]
     (tmp_path / "a.txt").write_text("\n".join(lines))
-    assert (whole(open_source, tmp_path / "a.txt", IN_METRES).colors == [10, 20, 30]).all()
+    assert (whole(open_source, tmp_path / "a.txt", BY_FILE).colors == [10, 20, 30]).all()
     in_gray = whole(open_source, tmp_path / "a.txt", CloudSettings(channels=WITHOUT_COLORS))
     assert (in_gray.colors == 128).all()
     nodes = open_cloud([_ply(tmp_path / "b.ply", "intensity")]).voxels(np.eye(3)).nodes
@@ -157,7 +157,7 @@ def test_e57_scans_have_one_gray_for_all(tmp_path):
     assert_gray(open_e57, path, intensity, POINTS * [-1, -1, 1] + [1.0, 2.0, 3.0])
     bare = write_e57(tmp_path / "b.e57", [_e57_scan(POINTS)])
     assert_refused("has no colours, wanted scans with", open_e57, bare)
-    assert_refused("has no intensity, wanted scans with", open_e57, bare, IN_METRES, "intensity")
+    assert_refused("has no intensity, wanted scans with", open_e57, bare, BY_FILE, "intensity")
 
 
 def test_e57_scans_without_intensity_are_named(tmp_path):
@@ -174,7 +174,7 @@ def test_ptx_scans_without_colors_are_left_out_beside_others(tmp_path):
     header = ["1", "1", "0 0 0", "1 0 0", "0 1 0", "0 0 1", "1 0 0 0", "0 1 0 0", "0 0 1 0", "0 0 0 1"]
     path = tmp_path / "a.ptx"
     path.write_text("\n".join([*header, "1 2 3 0.5", *header, "1 2 3 0.5 10 20 30"]) + "\n")
-    read = whole(open_source, path, IN_METRES)
+    read = whole(open_source, path, BY_FILE)
     np.testing.assert_array_equal(read.points_world, [[1.0, 2.0, 3.0]])
     np.testing.assert_array_equal(read.colors, [[10, 20, 30]])
     assert "1 of 2 scans without colours left out" in open_source(path).warnings[0]

@@ -24,7 +24,7 @@ def seeded_cloud(seed, num_points=1500, size=(6.0, 5.0, 2.5), step=0.0):
 
 def clean(path, raw, scale):
     """The cloud of points in memory as if they had been read from a file."""
-    return CloudStream([PointSource(path, lambda: iter([raw]))], scale).read()
+    return CloudStream([PointSource(path, lambda: iter([raw]), units=(scale,) * 3)]).read()
 
 
 def whole(open_file, path, options=IN_COLORS, *channel):

@@ -40,9 +40,9 @@ def stream(*raws, chunk=10**9, scale=1.0):
 
     def source(k, raw):
         chunks = [part(raw, slice(lo, lo + chunk)) for lo in range(0, len(raw.colors), chunk)]
-        return PointSource(Path(f"{k}.ply"), lambda: iter(chunks), len(raw.colors))
+        return PointSource(Path(f"{k}.ply"), lambda: iter(chunks), len(raw.colors), units=(scale,) * 3)
 
-    return CloudStream([source(k, raw) for k, raw in enumerate(raws)], scale)
+    return CloudStream([source(k, raw) for k, raw in enumerate(raws)])
 
 
 FAR = np.array([500_000.0, 5_400_000.0, 100.0])  # UTM
@@ -144,8 +144,8 @@ def test_both_ways_refuse_the_same(what, message):
 def test_both_ways_warn_of_the_same(scale):
     raw = seeded_cloud(11, size=(6000.0, 5000.0, 2500.0))
     raw.points_world[:4] = np.inf
-    (source,) = stream(raw).sources
-    cloud = CloudStream([source._replace(warnings=("a word",))], scale)
+    (source,) = stream(raw, scale=scale).sources
+    cloud = CloudStream([source._replace(warnings=("a word",))])
     warnings = cloud.read().warnings
     assert cloud.voxels(LEVEL).warnings == warnings
     assert warnings[:2] == ("a word", "0.ply: 4 points with NaN or infinite coordinates left out")

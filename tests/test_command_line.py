@@ -21,7 +21,7 @@ from piccolo.cli.command import UsageError, checking_options, command, new_parse
 from piccolo.cli.options import add_arguments
 from piccolo.cli.settings import cloud_settings_from
 from piccolo.cli.start import COMMANDS
-from piccolo.cloud.settings import IN_METRES, WITHOUT_COLORS, CloudSettings
+from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from piccolo.errors import InputError
 from piccolo.result import Result
 
@@ -55,7 +55,7 @@ def _cloud(scene, *order):
 
 def test_options_of_a_cloud(capsys):
     for options, expected in (
-        ("", IN_METRES),
+        ("", BY_FILE),
         ("--units mm", CloudSettings(scale=0.001)),
         ("--units 0.5 --up x", CloudSettings(scale=0.5, up="x")),
         ("--up -z --ignore-colors", CloudSettings(up="-z", channels=WITHOUT_COLORS)),

@@ -14,7 +14,7 @@ import rooms
 from refusals import assert_input_error, fill_disk
 from rooms import scan_map
 
-from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.settings import BY_FILE
 from piccolo.files import cache
 from piccolo.jobs.threads import Once, Stopwatch, Workers
 from piccolo.localization.attempts import match_poses
@@ -41,7 +41,7 @@ def _open(cloud, folder, monkeypatch, num_made=1):
 
     monkeypatch.setattr(open_map, "prepare_map", prepare)
     workers = Workers(1, warn=heard.append)
-    found = open_map.open_map([cloud], IN_METRES, CachePolicy(True, folder), workers, Stopwatch())
+    found = open_map.open_map([cloud], BY_FILE, CachePolicy(True, folder), workers, Stopwatch())
     np.testing.assert_array_equal(found.centers, scan_map(1).centers)
     assert found.scan_sha256 == hashlib.sha256(cloud.read_bytes()).hexdigest()
     assert len(made) == num_made
@@ -238,7 +238,7 @@ def finding(monkeypatch):
 @pytest.fixture
 def opened(tmp_path):
     cache, cloud = CachePolicy(folder=tmp_path / "cache"), rooms.write_cloud(tmp_path / "cloud.ply", 1)
-    return lambda: open_map.open_map([Path(cloud)], IN_METRES, cache, WORKERS, Stopwatch())
+    return lambda: open_map.open_map([Path(cloud)], BY_FILE, cache, WORKERS, Stopwatch())
 
 
 def test_they_are_made_once_and_threads_wait_for_them():

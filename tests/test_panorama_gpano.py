@@ -186,3 +186,12 @@ def test_a_strip_with_its_own_height_as_that_of_the_sphere_lies_on_the_horizon(t
     assert panorama.is_valid[50:150].all()
     assert panorama.is_valid.sum() == 100 * 400
     np.testing.assert_array_equal(panorama.rgb[50:150], RGB[50:150])
+    words = "the metadata call the crop's height the sphere's: its horizon is assumed to be in the middle"
+    assert panorama.warnings == (words,)
+    part = read_panorama(
+        write(tmp_path / "b", file_of(RGB[20:120, :300], crop_fields(0, 0, 300, 100, (400, 100))))
+    )
+    assert part.is_valid[50:150, :300].all()
+    assert part.warnings == (words,)
+    whole = file_of(RGB, crop_fields(0, 0, 400, 200))
+    assert read_panorama(write(tmp_path / "c", whole)).warnings == ()

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
-from las_files import las_bytes
+from las_files import las_bytes, with_records
 from PIL import Image
 from PIL.ExifTags import GPS, IFD, Base
 from pyproj import Transformer
@@ -118,17 +118,6 @@ def test_a_photo_says_what_it_is_and_when_and_where_it_was_taken(tmp_path):
     assert read_photo_facts(write_photo(tmp_path / "c.jpg", rgb, (0.0, 0.0))).gps is None
 
 
-def las_with_record(record_id, content):
-    """A LAS file with one record of a coordinate system behind its header."""
-    plain = las_bytes(RAW)
-    (header_size,) = struct.unpack_from("<H", plain, 94)
-    (points,) = struct.unpack_from("<I", plain, 96)
-    record = struct.pack("<H16sHH32s", 0, b"LASF_Projection", record_id, len(content), b"") + content
-    head = bytearray(plain[:header_size])
-    struct.pack_into("<II", head, 96, header_size + len(record), 1)
-    return bytes(head) + record + plain[points:]
-
-
 def test_las_names_its_system(tmp_path):
     path = tmp_path / "a.las"
     for record_id, content, expected in (
@@ -138,7 +127,7 @@ def test_las_names_its_system(tmp_path):
         (34735, b"\1", ""),
         (7, b"else", ""),
     ):
-        path.write_bytes(las_with_record(record_id, content))
+        path.write_bytes(with_records(las_bytes(RAW), (record_id, content)))
         assert read_crs([path]) == expected
     other = tmp_path / "a.xyz"
     other.write_text("0 0 0 1 2 3\n")
@@ -159,6 +148,8 @@ def test_a_position_becomes_a_prior_of_any_height():
     near = prior.apply_to(Prior(height=(1.0, 2.0)))
     assert near.near == (*prior.center_world, None)
     assert near.height == (1.0, 2.0)
+    feet = "+proj=utm +zone=32 +datum=WGS84 +units=us-ft"  # the result is in metres in any case
+    assert from_wgs84(feet, latitude, longitude) == pytest.approx((x, y), abs=1e-3)
     assert from_wgs84("EPSG:4326", latitude, longitude) is None
     assert_input_error("`crs`: found 'EPSG:0'", from_wgs84, "EPSG:0", latitude, longitude)
     assert_input_error("`crs`: found 'EPSG:0'", piccolo.Cloud, "no_such_scan.ply", crs="EPSG:0")

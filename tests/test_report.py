@@ -178,6 +178,62 @@ def test_a_moved_folder_of_photos_and_one_that_is_gone(house, tmp_path, capsys):
     assert report.main([*words, "--out", str(tmp_path / "r"), "--images", str(tmp_path / "no")]) == 3
 
 
+@pytest.fixture
+def twins(house, tmp_path):
+    """Two photos of one name in two folders, one with signs in its name; their results, and the scan."""
+    scene = house[0]
+    results = []
+    for name, k in (("a/IMG.jpg", 0), ("b/IMG.jpg", 1), ("c/Tom & <J>'s 😀.jpg", 2)):
+        path = tmp_path / "photos" / name
+        path.parent.mkdir(parents=True)
+        shutil.copy(scene.results[k].pano, path)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        source = replace(scene.results[k].source, pano_sha256=digest)
+        results.append(replace(scene.results[k], pano=name, source=source))
+    return tmp_path / "photos", results, ["--cloud", str(scene.cloud), "--jobs", "1", "--quiet"]
+
+
+def _shown(twins, out, panos, *more):
+    """The spheres that a report shows of the results under other paths, None for none."""
+    _, results, words = twins
+    write_results(
+        out.with_suffix(".jsonl"), [replace(r, pano=p) for r, p in zip(results, panos, strict=True)]
+    )
+    words = ["--results", str(out.with_suffix(".jsonl")), *words, "--out", str(out), *more]
+    assert report.main(words) == 0
+    photos = _document(out)["photos"]
+    return [_pictures(out, photo)["sphere"] if photo["hasPictures"] else None for photo in photos]
+
+
+def test_photos_are_found_by_path_and_digest(twins, tmp_path):
+    folder, results, _ = twins
+    images = "--images", str(folder)
+    whole = _shown(twins, tmp_path / "whole", [str(folder / r.pano) for r in results])
+    assert len({*whole}) == 3
+    assert None not in whole
+    below = _shown(twins, tmp_path / "below", [f"/elsewhere/{r.pano}" for r in results], *images)
+    bare = _shown(twins, tmp_path / "bare", [r.pano.partition("/")[2] for r in results], *images)
+    out_of_it = _shown(twins, tmp_path / "up", [f"../b/../{r.pano}" for r in results], *images)
+    assert whole == below == bare == out_of_it
+    crossed = [f"gone/{k}/IMG.jpg" for k in "ba"]  # each with the other's folder
+    assert _shown(twins, tmp_path / "crossed", [*crossed, results[2].pano], *images) == whole
+
+
+def test_another_picture_is_not_shown(twins, tmp_path, capsys):
+    folder, results, words = twins
+    (folder / "a" / "IMG.jpg").unlink()
+    words = [word for word in words if word != "--quiet"]
+    shown = _shown(
+        (folder, results, words), tmp_path / "r", [r.pano for r in results], "--images", str(folder)
+    )
+    assert [sphere is None for sphere in shown] == [True, False, False]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "no pictures" in line]
+    wanted = (
+        f"{folder / 'b' / 'IMG.jpg'}: no pictures of it, as it is not the photo of this result (its SHA-256)"
+    )
+    assert lines == [f"report.py: warning: {wanted}"]
+
+
 def test_the_page_and_its_policy_come_with_it(made):
     page = (made / "index.html").read_text()
     policy = re.search(r'Content-Security-Policy" content="([^"]*)"', page)[1]

@@ -132,12 +132,13 @@ def test_options_count(service, photo):
 
 
 def test_the_page_gets_a_photo_in_two_lines(service, photo, expected):
-    status, headers, body = service.post("/show", "über dem Haus.jpg", photo)
+    name = "über dem <Haus> & Tom's 😀.jpg"
+    status, headers, body = service.post("/show", name, photo)
     assert status == 200
     assert headers["content-type"].startswith("application/x-ndjson")
     first, second = map(json.loads, body.decode().splitlines())
     assert _same(first["result"], expected)
-    assert first["photo"]["name"] == "über dem Haus.jpg"
+    assert first["photo"]["name"] == first["result"]["pano"] == name
     assert first["photo"]["pose"]["world"] == pytest.approx(expected["center_world"], abs=1e-5)
     assert second["thumb"].startswith("data:image/jpeg;base64,/9j/")
     assert second["pictures"]["sphere"]
@@ -250,11 +251,12 @@ def test_the_description_has_every_address(service):
         ("a.jpg", "a.jpg"),
         ("../../etc/passwd", "passwd"),
         ("C:\\x\\b.png", "b.png"),
-        (".hidden", "hidden"),
-        ("-rf", "rf"),
+        ("Tom & Jerry's <1> 😀 50 %.jpg", "Tom & Jerry's <1> 😀 50 %.jpg"),
+        (".hidden.jpg", ".hidden.jpg"),
+        ("..", "photo"),
         ("", "photo"),
-        ("a\0/b\r\n.jpg", "b_r_n.jpg"),
-        ("x" * 300 + ".jpg", "x" * 76 + ".jpg"),
+        ("a\0/b\r\n.jpg", "b__.jpg"),
+        ("x" * 300 + ".jpg", "x" * 236 + ".jpg"),
     ],
 )
 def test_names_are_no_paths(given, name):

@@ -254,10 +254,10 @@ export class Drop {
     return advice ? section(words.remedy, h("p", {}, advice), buttons) : h("section", {}, buttons);
   }
 
-  /** Save the results as localize.py writes them, of which tools/report.py makes a report. */
+  /** Save the results as localize.py writes them, of which tools/report.py makes a report; a form changes quotes in names. */
   private export(): void {
-    const results = this.jobs.flatMap(({ result }) => (result ? [`${JSON.stringify(result)}\n`] : []));
-    save("results.jsonl", results.join(""), "application/x-ndjson");
+    const lines = this.jobs.filter(({ result }) => result).map(({ file, result }) => JSON.stringify({ ...result, pano: file.name }));
+    save("results.jsonl", lines.map((line) => `${line}\n`).join(""), "application/x-ndjson");
   }
 }
 

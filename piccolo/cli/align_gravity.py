@@ -9,7 +9,7 @@ from ..arrays import Array
 from ..cloud.octree import build_octree
 from ..cloud.settings import CloudSettings, R_z_from_axis
 from ..cloud.stream import CloudStream, open_cloud
-from ..cloud.writers import write_transformed
+from ..cloud.writers import describe_unit, write_transformed
 from ..confidence.confidence import LOCALIZED
 from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
@@ -33,9 +33,10 @@ examples:
 The dominant planes give the vertical; of its two directions, the one closer to the file's up axis (z, in glTF
 y) or to --up is up. The axis may be up to 15 degrees off. If the scan may have any orientation,
 --assume-nothing decides by furniture and free space, and --pano by a photo. If up remains unknown, nothing is
-written. Otherwise the cloud is written as binary PLY in the unit of the scan, with the transform next to it:
-aligned.txt, four rows of four numbers, as CloudCompare reads them (docs/CONVENTIONS.md). A single PLY file
-keeps its other properties and faces. Prints one JSON object to stdout; without --out, this is all.
+written. Otherwise the cloud is written as binary PLY in the unit of the scan (of several, in metres), with
+the transform next to it: aligned.txt, four rows of four numbers, as CloudCompare reads them
+(docs/CONVENTIONS.md). A single PLY file keeps its other properties and faces. Prints one JSON object to
+stdout; without --out, this is all.
 """
 
 
@@ -139,6 +140,7 @@ def main(arguments: Arguments) -> int:
 
     if out and not doubt:
         arguments.warn(write_transformed(cloud, T, out, write_transform))
+        arguments.warn(describe_unit(cloud, out))
     report |= {"cloud": list(map(str, arguments.cloud)), "out": str(out) if out and not doubt else None}
     report |= {"T_aligned_from_scan": T.tolist(), "metres_per_unit": cloud.scale}
     arguments.report(outputs, report)

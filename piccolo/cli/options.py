@@ -74,8 +74,8 @@ def add_cloud_options(parser: argparse.ArgumentParser, text: str) -> None:
 
 def add_cloud_reading_options(group: argparse._ArgumentGroup) -> None:
     """Add the options of reading a cloud's files."""
-    text = f"unit of the cloud's coordinates: {', '.join(METRES)}, or its length in metres (default m)"
-    option(group, "--units UNIT", text, type=_metres_of, default=None)
+    text = f"unit of the cloud's coordinates: {', '.join(METRES)}, or its length in metres "
+    option(group, "--units UNIT", f"{text}(default: as LAS names it, else m)", type=_metres_of, default=None)
     text = "axis of the cloud that points up; auto: z, or y in glTF (default auto; with preset default only)"
     group.add_argument("--up", choices=get_args(UpAxis), default="auto", help=text)
     option(group, "--ignore-colors", "localize by the shape and intensity of the scan even if it has colours")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from ..batch.localizer import Localizer
-from ..cloud.settings import IN_METRES, METRES, WITHOUT_COLORS, CloudSettings
+from ..cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from ..errors import InputError
 from ..geometry.colors import Labels
 from ..localization.settings import CoarseToFineSettings
@@ -24,13 +24,14 @@ ONLY_DEFAULT = ("near", "height", "heading", "within", "gravity_vector", "refine
 
 def cloud_settings_from(arguments: Arguments) -> CloudSettings:
     """Return the options of add_cloud_reading_options."""
-    scale = METRES["m"] if arguments.units is None else arguments.units
     crs = vars(arguments).get("crs")  # not of commands without photos
     crs = None if crs == NONE else crs
-    channels = WITHOUT_COLORS if arguments.ignore_colors else IN_METRES.channels
+    channels = WITHOUT_COLORS if arguments.ignore_colors else BY_FILE.channels
     labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
     color_range = None if arguments.color_range == "auto" else float(arguments.color_range)
-    return CloudSettings(scale, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns))
+    return CloudSettings(
+        arguments.units, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns)
+    )
 
 
 def cache_from(arguments: Arguments) -> CachePolicy:

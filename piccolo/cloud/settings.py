@@ -25,7 +25,7 @@ METRES = {"mm": 0.001, "cm": 0.01, "m": 1.0, "ft": 0.3048, "us-ft": 1200 / 3937}
 class CloudSettings:
     """Unit, axes, channels and coordinate system of a cloud's files."""
 
-    scale: float = 1.0  # metres per unit of the files
+    scale: float | None = None  # metres per unit of the files; None: by the file, else 1
     up: UpAxis = "auto"  # the axis that points up; auto: the one of the file, z or in glTF y
     channels: tuple[Channel, ...] = get_args(Channel)  # the first one that the files have is taken
     labels: Labels | None = None  # the points' labels are taken for their colours
@@ -38,7 +38,7 @@ class CloudSettings:
             raise InputError("`ignore_colors`, `labels`: found both, wanted one of them")
         if self.up not in get_args(UpAxis):
             raise InputError(f"`up`: found {self.up!r}, wanted one of {', '.join(get_args(UpAxis))}")
-        if not (math.isfinite(self.scale) and self.scale > 0.0):
+        if self.scale is not None and not (math.isfinite(self.scale) and self.scale > 0.0):
             raise InputError(f"`units`: found {self.scale}, wanted a number above 0 (metres a unit)")
         if self.color_range not in (None, *RANGES):
             raise InputError(f"`color_range`: found {self.color_range}, wanted 1, 255 or 65535")
@@ -60,17 +60,18 @@ def check_crs(crs: str, what: str = "GPS in photos") -> Any:
 
 
 def from_wgs84(crs: str, latitude_deg: float, longitude_deg: float) -> tuple[float, float] | None:
-    """Return x and y of a place in a projected system, in its unit; None if there are none."""
+    """Return x and y [m] of a place in a projected system, whatever its unit; None if there are none."""
     system = check_crs(crs)
     pyproj = import_optional("GPS in photos", "pyproj", "gps")
     if not system.is_projected:
         return None
     transformer = pyproj.Transformer.from_crs("EPSG:4326", system, always_xy=True)
     x, y = transformer.transform(longitude_deg, latitude_deg)
-    return (float(x), float(y)) if math.isfinite(x) and math.isfinite(y) else None
+    metres = float(system.axis_info[0].unit_conversion_factor)
+    return (x * metres, y * metres) if math.isfinite(x) and math.isfinite(y) else None
 
 
-IN_METRES = CloudSettings()
+BY_FILE = CloudSettings()  # all follows from the files
 IN_COLORS = CloudSettings(channels=("colors",))  # of files that must have colours
 
 

@@ -13,101 +13,29 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Bytes, Floats, Mask, Values
+from ..arrays import Array, Array32, Bytes, Floats, Values
 from ..errors import InputError
 from ..files.cache import sha256_of_arrays
-from ..geometry.pose import MAX_COORDINATE, rotate_points
+from ..geometry.pose import rotate_points
 from ..jobs.memory import check_address_space
 from ..jobs.threads import Progress, Workers, no_progress
-from .readers import e57, e57_file, las, mesh, mesh_files, npz, pcd, ply, reader, text
-from .settings import IN_METRES, Channel, CloudSettings, UpAxis
+from .point_validator import Chunk, PointValidator, find_box
+from .readers import e57, e57_file, las, las_file, mesh, mesh_files, npz, pcd, ply, reader, text
+from .settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .voxels import Voxels, VoxelTable, morton_order
 
-MIN_POINTS = 1000
-MIN_BRIGHTEST = 2  # of 255; 16-bit fields that hold 8-bit values come out at 1
 METRES_LIMIT = 2000.0  # [m], a scan wider than this along two axes is more likely in millimetres
 FAR = 16_384.0  # [m] from the origin, where float32 steps by 2 mm
-COARSE = 0.01  # [m] steps between float32 numbers that are reported, from 131 km on
 MAX_SAMPLES = 100_000  # points that the estimate of the extent looks at
 
-Chunk = tuple[Array, Bytes]  # finite points (N, 3) [m], colours (N, 3)
 MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description; a longer one is ignored
 ALONE = Workers()
 ARRAYS = Path("arrays")  # the name of a scan that is no file, in messages and results
 
 
-def find_box(points: Array) -> Array:
-    """Return the least and the greatest coordinates (2, 3) of points (N, 3); NaN where one is NaN."""
-    columns = points.T  # faster one by one
-    return np.array([[a.min(initial=np.inf) for a in columns], [a.max(initial=-np.inf) for a in columns]])
-
-
-@dataclass
-class PointValidator:
-    """Checks of a file's points, and their counts so far."""
-
-    path: Path
-    scale: float  # metres per unit of the file
-    is_colored: bool = True
-    num_finite: int = 0
-    num_dropped: int = 0  # with NaN or infinite coordinates
-    brightest: int = 0
-    color: Bytes | None = None  # (3,) of the first point
-    is_varied: bool = False  # another point has another colour
-    step: float = 0.0  # [m] between numbers at the farthest point that is stored in float32
-    # (2, 3) least and greatest coordinates so far [m]
-    box: Array = field(default_factory=lambda: find_box(np.empty((0, 3))))
-
-    def filter(self, raw: reader.RawCloud) -> Chunk:
-        """Count the points of a chunk; return the finite ones in metres."""
-        colors = raw.colors
-        with np.errstate(invalid="ignore"):  # a NaN of the kind that signals
-            points: Array = raw.points_world.astype(np.float64, copy=False)
-        box = find_box(points)
-        if not np.isfinite(box).all():
-            is_finite: Mask = np.all(np.isfinite(points), axis=1)
-            points = points[is_finite]
-            colors = colors[is_finite]
-            box = find_box(points)
-        self.num_finite += len(points)
-        self.num_dropped += len(raw.colors) - len(points)
-        if len(points):
-            points = points if self.scale == 1.0 else points * self.scale
-            box *= self.scale
-            self.box[0] = np.minimum(self.box[0], box[0])
-            self.box[1] = np.maximum(self.box[1], box[1])
-            self.brightest = max(self.brightest, int(colors.max()))
-            self.color = colors[0] if self.color is None else self.color
-            self.is_varied = self.is_varied or bool((colors != self.color).any())
-            farthest = float(np.abs(box).max())
-            if farthest > MAX_COORDINATE:
-                found = f"a coordinate of {farthest:.3g} m, wanted all within {MAX_COORDINATE:.0e} m"
-                raise InputError(f"{self.path}: {found}; remove broken points or set `units`")
-            if raw.points_world.dtype == np.float32:
-                self.step = max(self.step, float(np.spacing(np.float32(farthest / self.scale))) * self.scale)
-        return points, colors
-
-    def check(self) -> None:
-        """Refuse a file without enough points or colours, after its last chunk."""
-        if self.num_finite < MIN_POINTS:
-            found = f"found {self.num_finite} finite points ({self.num_dropped} with NaN or infinity)"
-            raise InputError(f"{self.path}: {found}, wanted at least {MIN_POINTS}")
-        if self.is_colored and self.brightest < MIN_BRIGHTEST:
-            found = f"all points are black (brightest value {self.brightest} of 255)"
-            raise InputError(f"{self.path}: {found}, wanted their colours; `color_range` sets their range")
-
-    def warnings(self) -> tuple[str, ...]:
-        """Return warnings if points were left out, or are stored with too few digits."""
-        found = []
-        if self.num_dropped:
-            found.append(f"{self.num_dropped} points with NaN or infinite coordinates left out")
-        if self.is_colored and not self.is_varied and self.color is not None:
-            color = " ".join(map(str, self.color.tolist()))
-            found.append(f"all points have one colour ({color}), which shows nothing: wanted their colours")
-        if self.step >= COARSE:
-            what = f"its float32 coordinates, far from the origin, are rounded to {self.step:.2g} m"
-            found.append(f"{what}: export it in float64, or nearer to its origin")
-        return tuple(f"{self.path}: {text}" for text in found)
+def _name(paths: Sequence[Path]) -> str:
+    """Return the name of files together in messages."""
+    return f"{paths[0]} and {len(paths) - 1} more" if len(paths) > 1 else str(paths[0])
 
 
 def unit_warnings(label: str, points: Array32) -> tuple[str, ...]:
@@ -144,7 +72,6 @@ class CloudStream:
     """One cloud in one or several files. Each reading begins at the start and ends with all checks."""
 
     sources: Sequence[reader.PointSource]  # in an order of their own: the user's changes nothing
-    scale: float = 1.0  # metres per unit of the files
     show: Progress = no_progress
     sha256: str = ""  # of what is read, if that is known
     # (2, 3) least and greatest of all points read so far [m]
@@ -153,9 +80,18 @@ class CloudStream:
     @property
     def label(self) -> str:
         """The name of all files together in messages."""
-        first = self.sources[0].path
-        num_more = len(self.sources) - 1
-        return f"{first} and {num_more} more" if num_more else str(first)
+        return _name([source.path for source in self.sources])
+
+    @property
+    def scale(self) -> float:
+        """Metres per unit of all files and axes; 1 if they differ: what is written then is in metres."""
+        units = self.units
+        return units.pop() if len(units) == 1 else 1.0
+
+    @property
+    def units(self) -> set[float]:
+        """The different units [m] of files and axes."""
+        return {unit for source in self.sources for unit in source.units}
 
     @property
     def station_axes(self) -> Array:
@@ -176,7 +112,9 @@ class CloudStream:
     def chunks(self, validators: list[PointValidator]) -> Iterator[Chunk]:
         """Yield the finite points in metres; append each file's validator once it is read."""
         for source in self.sources:
-            validator = PointValidator(source.path, self.scale, source.channel == "colors", box=self.box)
+            validator = PointValidator(
+                source.path, np.array(source.units), source.channel == "colors", box=self.box
+            )
             total = None if source.num_points is None else math.ceil(source.num_points / reader.CHUNK)
             try:
                 for raw in self.show(source.read_chunks(), total, f"read {source.path.name}"):
@@ -189,8 +127,14 @@ class CloudStream:
             validators.append(validator)
 
     def _warnings(self, validators: list[PointValidator]) -> list[str]:
+        """Return the warnings of all files; what is said of the unit of several is said once."""
+        of_units: dict[str, list[Path]] = {}
+        for source in self.sources:
+            if source.unit_note:
+                of_units.setdefault(source.unit_note, []).append(source.path)
+        lines = [f"{_name(paths)}: {note}" for note, paths in of_units.items()]
         pairs = zip(self.sources, validators, strict=True)
-        return [line for source, validator in pairs for line in (*source.warnings, *validator.warnings())]
+        return lines + [line for source, found in pairs for line in (*source.warnings, *found.warnings())]
 
     def voxels(self, R_map_from_world: Array, workers: Workers = ALONE) -> Voxels:
         """Return the points averaged voxel by voxel, in axes turned by a rotation (3, 3).
@@ -245,7 +189,7 @@ def stream_of_arrays(points: Floats, colors: Values | None, color_range: float |
     given = np.full(points.shape, reader.GRAY, np.uint8) if colors is None else colors
     parts = [(reader.points_of([*points.T]), given)]
     usual = reader.USUAL.get(given.dtype.str[1:], reader.BYTE_RANGE)
-    settings = replace(IN_METRES, color_range=255.0 if given.dtype == np.uint8 else color_range)
+    settings = replace(BY_FILE, color_range=255.0 if given.dtype == np.uint8 else color_range)
     brightest, notes = reader.find_brightest(ARRAYS, parts, settings, usual)
     chunk = next(reader.color_chunks(parts, brightest, lambda row: f"{ARRAYS}, row {row}"))
     channel: Channel = "shape" if colors is None else "colors"
@@ -271,7 +215,7 @@ def _begins(*magic: bytes) -> Callable[[bytes], bool]:
 
 FORMATS = (
     CloudFormat("PLY", (".ply",), _begins(*ply.MAGIC), ply.open_ply, has_labels=True),
-    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las.MAGIC), las.open_las, has_labels=True),
+    CloudFormat("LAS, LAZ", (".las", ".laz"), _begins(las_file.MAGIC), las.open_las, has_labels=True),
     CloudFormat("E57", (".e57",), _begins(e57_file.MAGIC), e57.open_e57),
     CloudFormat("PCD", (".pcd",), pcd.FIRST_LINES.match, pcd.open_pcd, has_labels=True),
     CloudFormat("PTX", (".ptx",), text.has_ptx_magic, text.open_ptx),
@@ -293,7 +237,7 @@ WANTED = f"wanted a point cloud: {', '.join(f.name for f in FORMATS)}"
 
 
 def open_cloud(
-    paths: Sequence[Path], settings: CloudSettings = IN_METRES, show: Progress = no_progress
+    paths: Sequence[Path], settings: CloudSettings = BY_FILE, show: Progress = no_progress
 ) -> CloudStream:
     """Return the cloud in one or several files, before its points are read, in the first channel of all.
 
@@ -310,10 +254,10 @@ def open_cloud(
             raise InputError(f"{found}, wanted them in all files, or `ignore_colors`")
         only_shape = replace(settings, channels=("shape",))
         sources = [open_source(path, only_shape) for path in sorted(paths)]
-    return CloudStream(sources, settings.scale, show)
+    return CloudStream(sources, show)
 
 
-def open_source(path: Path, settings: CloudSettings = IN_METRES) -> reader.PointSource:
+def open_source(path: Path, settings: CloudSettings = BY_FILE) -> reader.PointSource:
     """Return the points of a file in any supported format, in the first of the channels that it has."""
     try:
         format_ = _format_of(path)
@@ -324,7 +268,8 @@ def open_source(path: Path, settings: CloudSettings = IN_METRES) -> reader.Point
             known = ", ".join(f.name for f in FORMATS if f.has_columns)
             raise InputError(f"{path}: {format_.name} names its columns; `columns` is for {known}")
         try:
-            return _open_channel(format_, path, settings)
+            source = _open_channel(format_, path, settings)
+            return source if settings.scale is None else source._replace(units=(settings.scale,) * 3)
         except reader.MissingChannelError:
             raise
         except InputError as error:
@@ -349,7 +294,7 @@ def _open_channel(format_: CloudFormat, path: Path, settings: CloudSettings) -> 
 
 def _hint(format_: CloudFormat, path: Path, settings: CloudSettings) -> str:
     """Return what to add to the refusal of a file that would be read without its colours."""
-    if settings.labels or settings.channels != IN_METRES.channels:
+    if settings.labels or settings.channels != BY_FILE.channels:
         return ""
     try:
         format_.open_source(path, settings, "shape")
@@ -384,8 +329,8 @@ def read_crs(paths: Sequence[Path]) -> str:
     with paths[0].open("rb") as file:
         head = file.read(reader.HEAD_SIZE)
     text = ""
-    if head.startswith(las.MAGIC):
-        text = las.read_crs(paths[0])
+    if head.startswith(las_file.MAGIC):
+        text = las_file.read_crs(paths[0])
     elif head.startswith(e57_file.MAGIC):
         text = e57_file.read_xml(paths[0]).findtext("coordinateMetadata", "")
     return " ".join(text.split()) if len(text) <= MAX_CRS_LENGTH else ""

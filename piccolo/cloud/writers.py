@@ -17,6 +17,7 @@ from ..geometry.pose import transform_points
 from ..jobs.memory import check_memory
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
 from .readers.reader import CHUNK
+from .settings import METRES
 from .stream import CloudStream
 
 TYPE_NAMES = {
@@ -107,7 +108,7 @@ def coordinate_type(box: Array, T_target_from_source: Array, scale: float) -> ty
 def write_transformed(
     cloud: CloudStream, T_target_from_source: Array, out: Path, finish: Callable[[], None]
 ) -> tuple[str, ...]:
-    """Write a cloud, read once before, as binary PLY under a transform (4, 4) in the files' unit.
+    """Write a cloud, read once before, as binary PLY under a transform (4, 4) in units of `cloud.scale`.
 
     One PLY file keeps its other properties and elements and its points with NaN, its normals are rotated; any
     other cloud is written with x y z and red green blue, or intensity, or neither. `finish` runs when all is
@@ -188,14 +189,30 @@ def _transform(columns: dict[str, Values], T_target_from_source: Array) -> dict[
     return target
 
 
+def describe_unit(cloud: CloudStream, out: Path, crs: str = "") -> tuple[str, ...]:
+    """Return a line on a written file that is in another unit than the metre and does not say so.
+
+    Only where the scan's files told the unit: a user who gave it knows it.
+    """
+    is_told = any(source.unit_note for source in cloud.sources)
+    says_it = bool(crs) and out.suffix.lower() in (".las", ".laz")
+    if not is_told or says_it or cloud.scale == 1.0:
+        return ()
+    names = [name for name, metres in METRES.items() if metres == cloud.scale]
+    unit = names[0] if names else repr(cloud.scale)
+    return (f"{out}: written in the unit of the scan, which it does not say; read it with `units` {unit}",)
+
+
 def write_colored(
     cloud: CloudStream, color: Callable[[Array], Colors], box_world: Array, out: Path, crs: str = ""
 ) -> tuple[int, int]:
     """Write a cloud within a box (2, 3) [m] in the colours of `color(points_world)`, by the suffix of `out`.
 
     Points (N, 3) [m] are coloured, and written in the files' unit and order with the number of photos that
-    gave the colour: PLY's `photos`, LAS's user data. Return the numbers of points, and of coloured ones.
+    gave the colour: PLY's `photos`, LAS's user data. Where units differ, it is in metres, without the
+    coordinate system. Return the numbers of points, and of coloured ones.
     """
+    crs = crs if len(cloud.units) == 1 else ""
     num_points = num_colored = 0
     writing = {".ply": writing_ply_rows, ".e57": writing_e57}.get(out.suffix.lower(), writing_las)
     with writing(out, box_world / cloud.scale, cloud.scale, crs) as add:

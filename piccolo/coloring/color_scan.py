@@ -13,7 +13,7 @@ import numpy as np
 from ..arrays import Array, Array32, Bytes, Int32s
 from ..cloud.octree import Octree, recolor
 from ..cloud.stream import open_cloud
-from ..cloud.writers import SUFFIXES, write_colored
+from ..cloud.writers import SUFFIXES, describe_unit, write_colored
 from ..errors import InputError
 from ..files.line_file import Journal
 from ..geometry.pose import Pose
@@ -252,6 +252,8 @@ def write_colored_scan(scan: OpenedScan, results: Sequence[Result], out: Path) -
     leaves_world = list_leaves(scan_map) @ scan_map.R_map_from_world + scan_map.origin_world
     box_world = np.stack([leaves_world.min(axis=0), leaves_world.max(axis=0)])
     counts = write_colored(cloud, color, box_world, out, scan_map.crs)
+    for line in describe_unit(cloud, out, scan_map.crs):
+        workers.warn(line)
     return Colored(len(brushes), *counts)
 
 

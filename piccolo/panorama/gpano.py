@@ -107,11 +107,11 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     """
     if not fields.keys() & set(CROP_FIELDS):
         return CropRegion()
-    numbers = [number for name in CROP_FIELDS if (number := _number(fields, name)) is not None]
-    if len(numbers) < len(CROP_FIELDS) or min(numbers[2:]) < 1.0:
+    numbers = _crop_numbers(fields)
+    if numbers is None:
         return None
     left, top, width, height, full_width, full_height = numbers
-    if full_height == height and full_width > MIN_STRIP * height:
+    if lacks_horizon(fields):
         full_height = full_width / 2.0
         top = (full_height - height) / 2.0
     is_inside = width <= full_width and -1.0 <= top <= full_height - height + 1.0 and abs(left) <= full_width
@@ -120,6 +120,21 @@ def crop_region(fields: dict[str, str], aspect: float) -> CropRegion | None:
     if not (is_inside and is_same_shape):
         return None
     return CropRegion(left / full_width, top / full_height, width / full_width, height / full_height)
+
+
+def _crop_numbers(fields: dict[str, str]) -> list[float] | None:
+    """Return the numbers of CROP_FIELDS; None if one is missing or makes no sense."""
+    numbers = [number for name in CROP_FIELDS if (number := _number(fields, name)) is not None]
+    return numbers if len(numbers) == len(CROP_FIELDS) and min(numbers[2:]) >= 1.0 else None
+
+
+def lacks_horizon(fields: dict[str, str]) -> bool:
+    """Return True if the sphere's height is said to be that of a crop, whose place is then unknown."""
+    numbers = _crop_numbers(fields)
+    if numbers is None:
+        return False
+    *_, height, full_width, full_height = numbers
+    return full_height == height and full_width > MIN_STRIP * height
 
 
 def rotation_to_level(gpano: GPano) -> Array | None:

@@ -36,6 +36,7 @@ LIKE_A_PHOTO = (
     "read as a part of a panorama, though it has the shape of a camera's photo: for a photo add `projection` "
     "pinhole, for a part of a panorama `projection` equirectangular"
 )
+NO_HORIZON = "the metadata call the crop's height the sphere's: its horizon is assumed to be in the middle"
 MIN_REPORTED = 0.001  # of the sphere: borders below this are masked without a warning
 
 
@@ -194,7 +195,7 @@ def _region_of(photo: Photo, picture: Picture, fields: dict[str, str]) -> tuple[
         raise InputError(f"{photo.path}: its metadata names the projection {name!r}, {wanted}")
     if width == height and shows_twice(picture.rgb, 0):
         raise InputError(f"{photo.path}: two panoramas above each other, one for each eye, wanted one")
-    notes = []
+    notes = [NO_HORIZON] if gpano.lacks_horizon(fields) else []
     region = gpano.crop_region(fields, width / height)
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
     missing = [name for name in gpano.CROP_FIELDS if fields and name not in fields]

@@ -17,8 +17,6 @@ from ..files.atomic import temporary_folder, write_atomically
 from ..files.cache import digest_of_sources
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
-from ..opened_scan import photo_of
-from ..panorama.photo import read_photo_facts
 from ..photo import File
 from ..result import FAILED, UNREADABLE, Result, check_scan
 from ..scan import Scan
@@ -26,6 +24,7 @@ from ..scan_map.scan_map import ScanMap
 from ..views.pictures import encode_image
 from ..views.surfels import MAX_SURFELS, Surfels, make_surfels
 from . import site
+from .photo_folder import PhotoFolder
 from .pictures import PlanImage, draw_plan, extract_frames, make_pictures, own_plan
 
 FORMAT = "piccolo-report/1"
@@ -46,7 +45,8 @@ class ReportSettings:
     storeys
         Names of the storeys, the lowest first, by default numbers.
     images
-        Folder of the photos, if they are no longer at the paths in the results.
+        Folder of the photos, if they are no longer at the paths in the results. A photo whose digest is
+        another than that in its result is not shown.
     full_size
         Keep the size of the photos. By default spheres are at most 2048 px wide.
     self_contained
@@ -97,6 +97,7 @@ class Task(NamedTuple):
     photo: Path
     key: str
     poses: list[Pose]  # the best and the alternatives, in the map's frame
+    problem: str = ""  # why its pictures can't be made
 
 
 def build_report(
@@ -113,7 +114,8 @@ def build_report(
         if not settings.self_contained:
             site.check_folder(out)
         site.begin_folder(folder)
-        tasks = [make_task(entry, scan_map, settings) for entry in entries]
+        photos = PhotoFolder(None if settings.images is None else Path(settings.images))
+        tasks = [make_task(entry, scan_map, settings, photos) for entry in entries]
         warnings = (*filter(None, [note]), *write_pictures(tasks, scan_map, folder, settings, workers))
         document = {**document_of(tasks, scan_map, folder, settings), "note": note}
         if not settings.self_contained:
@@ -136,19 +138,18 @@ def check_settings(settings: ReportSettings, scan_map: ScanMap, entries: Sequenc
     return check_scan(results, scan_map.scan_sha256, "that given", settings.force)
 
 
-def make_task(entry: site.Entry, scan_map: ScanMap, settings: ReportSettings) -> Task:
+def make_task(entry: site.Entry, scan_map: ScanMap, settings: ReportSettings, folder: PhotoFolder) -> Task:
     """Return what is to be done for a result; its key is of all that its pictures depend on."""
     result = entry.result
-    photo = Path(result.pano)
-    if settings.images is not None:
-        photo = Path(settings.images) / photo.name
+    photo = folder.guess(result.pano)
+    digest = problem = ""
     try:
-        digest = read_photo_facts(photo_of(result, photo)).sha256
-    except (OSError, InputError):
-        digest = ""
+        photo, digest = folder.find(result)
+    except InputError as error:
+        problem = str(error)
     parts = result.to_json(), digest, scan_map.scan_sha256, repr(settings.width), digest_of_sources(MAKERS)
     key = hashlib.sha256("\n".join(parts).encode()).hexdigest()[:32]
-    return Task(entry, photo, key, list_poses(result, scan_map.from_world))
+    return Task(entry, photo, key, list_poses(result, scan_map.from_world), problem)
 
 
 def list_poses(result: Result, from_world: Callable[[Pose], Pose]) -> list[Pose]:
@@ -172,6 +173,8 @@ def write_pictures(
     scan = (make_surfels(points, workers) if is_found else nothing), points
 
     def write(task: Task) -> str:
+        if task.problem:
+            return task.problem
         try:
             thumbnail, script = make_pictures(task.photo, task.entry.result, task.poses, scan, settings.width)
         except (OSError, InputError) as error:

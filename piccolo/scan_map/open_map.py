@@ -4,11 +4,12 @@ import hashlib
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 
-from ..cloud.settings import IN_COLORS, IN_METRES, CloudSettings, R_z_from_axis
+from ..cloud.settings import BY_FILE, IN_COLORS, CloudSettings, R_z_from_axis
 from ..cloud.soa import LocalCloud, pack_points
 from ..cloud.stream import open_cloud, read_crs
 from ..errors import InputError
@@ -50,7 +51,8 @@ def open_map(
     """
     map_path = find_prepared_map(paths)
     if map_path:
-        if len(paths) > 1 or replace(cloud_settings, labels=None, crs=None) != IN_METRES:
+        bare = replace(cloud_settings, labels=None, crs=None)
+        if len(paths) > 1 or bare not in (BY_FILE, replace(BY_FILE, scale=1.0)):
             raise InputError(f"{map_path}: found a prepared map, wanted it alone, without options for clouds")
         with watch.stage("read"):
             scan_map = load_map(map_path, cache.is_used)
@@ -141,8 +143,12 @@ def scan_sha256_of(paths: Sequence[Path], cache: CachePolicy) -> str:
 
 
 def content_key(scan_sha256: str, settings: CloudSettings) -> str:
-    """Return the cache's name for a map: it depends on the files' contents and the settings, not on paths."""
-    parts = [FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), scan_sha256]
+    """Return the cache's name for a map: it depends on the files' contents and the settings, not on paths.
+
+    And on whether pyproj is there, which knows the units of coordinate systems.
+    """
+    has_pyproj = str(find_spec("pyproj") is not None)
+    parts = [FORMAT, digest_of_sources(MAKERS), repr(replace(settings, crs=None)), has_pyproj, scan_sha256]
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:32]
 
 

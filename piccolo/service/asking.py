@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ..camera.calibration import calibration_of
-from ..errors import InputError, printable
+from ..errors import UNPRINTABLE, InputError, printable
 from ..files.json_file import DAMAGE
 from ..localization.settings import CoarseToFineSettings
 from ..photo import Photo, Prior
@@ -18,15 +18,16 @@ PARTS = ("photo", "prior", "gravity", "min_confidence", "time", "motion")  # of 
 # options of a photo that name no file
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}
-MAX_NAME = 80  # bytes of a photo's name that are kept
-NO_NAME = re.compile(r"[^\w.() +-]")  # of letters in any language, and numbers
+MAX_NAME = (
+    240  # bytes of a photo's name that are kept; a file's name has up to 255, with what is put before it
+)
 
 
 def clean_name(name: str) -> str:
-    """Return the name of a file that was sent, as one that is no path, no option and not hidden."""
-    own = NO_NAME.sub("_", printable(re.split(r"[/\\]", name)[-1])).lstrip(".-")
+    """Return the name of a file that was sent, without the folders above; it is no path."""
+    own = UNPRINTABLE.sub("_", re.split(r"[/\\]", name)[-1])
     kept = os.fsencode(own)[-MAX_NAME:].decode(errors="ignore")
-    return kept.lstrip(".- ") or "photo"
+    return kept if kept.strip(". ") else "photo"
 
 
 def parse_options(text: str) -> dict[str, Any]:

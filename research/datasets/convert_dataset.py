@@ -17,10 +17,11 @@ from scipy.spatial.transform import Rotation
 from piccolo.arrays import Array
 from piccolo.cli.command import Arguments, add_command, check_folder_name, command, option
 from piccolo.cloud.octree import build_octree
+from piccolo.cloud.point_validator import PointValidator
 from piccolo.cloud.readers.reader import CHUNK
 from piccolo.cloud.settings import IN_COLORS
 from piccolo.cloud.soa import pack_points
-from piccolo.cloud.stream import PointValidator, open_cloud, open_source
+from piccolo.cloud.stream import open_cloud, open_source
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.confidence.occlusion import VIEW_WIDTH, measure_agreement
 from piccolo.errors import InputError, unreadable
@@ -248,13 +249,14 @@ def write_scene(spec: SceneSpec, out: Path, copies: bool, show: Progress) -> Wri
 def _write_cloud(spec: SceneSpec, path: Path, show: Progress) -> tuple[int, list[str]]:
     """Stream the finite points of the cloud's files into one PLY; returns how many it has, and warnings."""
     T = spec.T_written_from_dataset
-    validator = PointValidator(spec.cloud[0].path, 1.0)  # one for all files, as an object may be small
+    validator = PointValidator(spec.cloud[0].path, np.ones(3))  # one for all files, as an object may be small
     warnings: list[str] = []
     with writing_ply(path) as writer:
         for part in spec.cloud:
             source = open_source(part.path, IN_COLORS)
             warnings += source.warnings
             validator.path = part.path
+            validator.units = np.array(source.units)
             total = None if source.num_points is None else math.ceil(source.num_points / CHUNK)
             try:
                 for raw in show(source.read_chunks(), total, f"{spec.name}: {part.path.name}"):

@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from piccolo.batch.inputs import read_priors
 from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.camera.calibration import read_cameras, read_rig
-from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.settings import BY_FILE
 from piccolo.cloud.stream import FORMATS
 from piccolo.errors import InputError
 from piccolo.panorama import read_panorama
@@ -45,7 +45,7 @@ def read(name, path):
         if name in OTHERS:
             OTHERS[name](path)
         else:
-            for _ in READERS[name](path, IN_METRES).read_chunks():
+            for _ in READERS[name](path, BY_FILE).read_chunks():
                 pass
     except (InputError, OSError, UnicodeDecodeError):  # what commands turn into one line
         return

@@ -15,7 +15,8 @@ import numpy as np
 from ...arrays import Array, Bytes
 from ...errors import InputError
 from ...geometry.pose import Pose, rotate_points
-from ..settings import IN_METRES, RANGES, Channel, CloudSettings
+from ..settings import BY_FILE, RANGES, Channel, CloudSettings
+from ..units import describe_foreign, units_of_wkt
 from . import e57_file, reader
 from .e57_file import E57File, open_file, parse_integer, read_number, refusing
 from .reader import CHUNK, MissingChannelError, PointSource
@@ -48,6 +49,7 @@ KINDS = {
 SUFFIX = {"jpeg": ".jpg", "png": ".png"}
 ENCODINGS = {"jpeg": b"\xff\xd8\xff", "png": b"\x89PNG\r\n\x1a\n"}
 MAX_SIDE = 1 << 20  # [px]
+MAX_CRS_LENGTH = 20_000  # characters of a coordinate system's description
 
 
 @dataclass(frozen=True)
@@ -68,7 +70,7 @@ class _UnusableError(Exception):
     """A scan is intact, but can't be used."""
 
 
-def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_e57(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of an E57 file that have colours, or another channel.
 
     Points with an invalid state (direction only, or nothing) or an invalid colour are left out. A colour's
@@ -79,6 +81,7 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     with open_file(path) as file:
         scans, left_out = _scans(file, CHANNELS[channel])
         notes = _set_ranges(file, scans, options)
+        crs = file.root.findtext("coordinateMetadata", "")[:MAX_CRS_LENGTH]
     if not scans:
         error = InputError if channel == "shape" else MissingChannelError
         raise error(f"{path}: {left_out[0] if left_out else 'no scans'}, {WANTED[channel]}")
@@ -90,6 +93,7 @@ def open_e57(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     return source._replace(
         warnings=(*(f"{path}: {what}; left out" for what in left_out), *notes),
         station_axes=tuple(pose.R_cam_from_world[2] for pose in placed),
+        unit_note=describe_foreign(units_of_wkt(crs)) if options.scale is None else "",
     )
 
 

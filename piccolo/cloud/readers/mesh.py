@@ -21,7 +21,7 @@ from ...arrays import Array, Bytes, Int64s, Mask
 from ...errors import InputError
 from ...geometry.colors import srgb_to_linear, to_bytes
 from ...geometry.pose import transform_points
-from ..settings import IN_METRES, Channel, CloudSettings, UpAxis
+from ..settings import BY_FILE, Channel, CloudSettings, UpAxis
 from .mesh_files import GLB_MAGIC, Texture
 from .mesh_loading import WANTED, Loaded, load_gltf, load_obj, load_ply
 from .reader import CHUNK, GRAY, USUAL, MissingChannelError, PointSource, RawCloud, find_brightest, in_chunks
@@ -131,7 +131,7 @@ def look_up(texels: Bytes, uv: Array) -> Bytes:
     return np.asarray(texels[rows, columns])
 
 
-def open_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_mesh(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return points on the triangles of an OBJ, GLB or glTF file, 10,000 per square metre.
 
     The options' scale is the file's unit in metres. A file that would give more than 30 million points is
@@ -145,7 +145,7 @@ def open_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel =
     return _source((load_gltf if is_gltf else load_obj)(path, content), options, channel)
 
 
-def open_ply_mesh(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_ply_mesh(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return points on the faces of a PLY file, like `open_mesh`; textured if a comment names a texture."""
     return _source(load_ply(path), options, channel)
 
@@ -164,7 +164,7 @@ def _source(loaded: Loaded, options: CloudSettings, channel: Channel) -> PointSo
 def _sample(loaded: Loaded, is_bare: bool) -> PointSource:
     """Return points on the triangles of a file."""
     path = loaded.path
-    scale = loaded.settings.scale
+    scale = loaded.settings.scale or 1.0
     surfaces, notes = _surfaces(loaded, is_bare)
     notes += loaded.notes
     num_triangles = sum(len(surface.triangles) for surface in surfaces)

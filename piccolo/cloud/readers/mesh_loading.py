@@ -13,7 +13,7 @@ import numpy as np
 
 from ...arrays import Array
 from ...errors import InputError, import_optional
-from ..settings import IN_METRES, CloudSettings
+from ..settings import BY_FILE, CloudSettings
 from . import mesh_files
 from .mesh_files import GLB_MAGIC, NO_MATERIAL, FolderResolver, Material, Texture
 
@@ -46,7 +46,7 @@ class Loaded:
     scene: Any  # trimesh.Scene
     materials: list[Material] | None = None  # of glTF, named by their rows
     textures: dict[int, Texture | None] = field(default_factory=dict)  # by their images' identity
-    settings: CloudSettings = IN_METRES
+    settings: CloudSettings = BY_FILE
     notes: dict[str, None] = field(default_factory=dict)  # for the user, in order
 
     @property

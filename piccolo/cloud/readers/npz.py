@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from ...errors import InputError
 from ...files.array_archive import MAX_HEAD_SIZE, read_header
-from ..settings import IN_METRES, Channel, CloudSettings
+from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text_columns import MAX_COLUMNS, drop_broken, name_columns, names_of_user, note_names
@@ -61,7 +61,7 @@ class ArrayInFile(NamedTuple):
             yield rows
 
 
-def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_npy(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of a .npy file: an array (N, 6) of x y z r g b, or others as in a text file."""
     array = _open_array(path, None, path.stat().st_size)
     num_columns = array.shape[-1] if len(array.shape) == 2 else 0
@@ -87,7 +87,7 @@ def open_npy(path: Path, options: CloudSettings = IN_METRES, channel: Channel = 
     return source._replace(warnings=(*filter(None, [note]), *source.warnings))
 
 
-def open_npz(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_npz(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of a .npz file: the arrays `points` (or `xyz`) and `colors` (or `rgb`), both (N, 3).
 
     An archive whose arrays promise more than 200 times the size of the file, or 16 GB, is refused.

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import InputError, import_optional
-from ..settings import IN_METRES, Channel, CloudSettings
+from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .reader import MissingChannelError, PointSource, quote_line
 from .text import LineLayout, NumberLines
@@ -122,7 +122,7 @@ def _count(text: str) -> int | None:
     return int(text) if text.isdecimal() and len(text) <= MAX_COUNT_DIGITS else None
 
 
-def open_pcd(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_pcd(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of a PCD file.
 
     Colours are `rgb` or `rgba`, three bytes in one integer or, if the field is declared a float, in its bits,

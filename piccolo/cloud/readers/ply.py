@@ -17,7 +17,7 @@ import numpy as np
 from plyfile import PlyData, PlyElement, PlyListProperty, PlyParseError
 
 from ...errors import InputError
-from ..settings import IN_METRES, Channel, CloudSettings
+from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader
 from .mesh import open_ply_mesh
 from .reader import MissingChannelError, PointSource, quote_line
@@ -58,7 +58,7 @@ class PlyHeader:
         return self.elements[self.index]
 
 
-def open_ply(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_ply(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the vertices of a PLY file, binary or ASCII; points on its faces if it has any.
 
     Other properties and elements are left out. The file's size is compared with the header's counts before

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ...arrays import Array, Bytes, Floats, Mask
 from ...errors import InputError
 from ...geometry.colors import Labels, label_colors
-from ..settings import IN_METRES, RANGES, Channel, CloudSettings, UpAxis
+from ..settings import BY_FILE, RANGES, Channel, CloudSettings, UpAxis
 
 HEAD_SIZE = 512  # [byte] from which a format is known
 CHUNK = 1 << 17  # points of a chunk, at most: they stay in the processor's cache
@@ -85,6 +85,8 @@ class PointSource(NamedTuple):
     station_axes: tuple[Array, ...] = ()  # (3,) unit, z of scanners with poses, file's axes
     up: UpAxis = "z"  # the axis that points up by the format's specification or by convention
     channel: Channel = "colors"  # what is read of the points
+    units: tuple[float, float, float] = (1.0, 1.0, 1.0)  # of x, y, z [m]
+    unit_note: str = ""  # what was decided about them, if it is to be told
 
 
 def quote_line(line: bytes) -> str:
@@ -217,7 +219,7 @@ def make_source(
     path: Path,
     read: PartReader,
     channel: Channel,
-    settings: CloudSettings = IN_METRES,
+    settings: CloudSettings = BY_FILE,
     num_points: int | None = None,
     types: Sequence[str] = (),
 ) -> PointSource:

@@ -19,7 +19,7 @@ import numpy as np
 from ...arrays import Array
 from ...errors import InputError
 from ...geometry.pose import transform_points
-from ..settings import IN_METRES, Channel, CloudSettings
+from ..settings import BY_FILE, Channel, CloudSettings
 from . import reader, text_columns
 from .reader import MissingChannelError, PointSource, find_brightest, quote_line
 from .text_columns import COMMENT_MARKS, Spelling, is_number, split, text_blocks
@@ -184,7 +184,7 @@ def _strip_blanks(lines: list[bytes], layout: LineLayout) -> list[bytes]:
 
 
 def open_text(
-    path: Path, settings: CloudSettings = IN_METRES, channel: Channel = "colors", has_counts: bool = False
+    path: Path, settings: CloudSettings = BY_FILE, channel: Channel = "colors", has_counts: bool = False
 ) -> PointSource:
     """Return the points of a text file: whitespace, comma or semicolon between numbers.
 
@@ -246,7 +246,7 @@ class PtxScan(NamedTuple):
     T_world_from_scanner: Array  # (4, 4)
 
 
-def open_ptx(path: Path, options: CloudSettings = IN_METRES, channel: Channel = "colors") -> PointSource:
+def open_ptx(path: Path, options: CloudSettings = BY_FILE, channel: Channel = "colors") -> PointSource:
     """Return the points of all scans of a PTX file, in the world.
 
     0 0 0 means that no beam came back, and is left out. A last scan with fewer lines than its header promises
