@@ -7,6 +7,7 @@ import numpy as np
 import pycolmap
 import pytest
 from poses import result, write_results
+from refusals import small_files
 
 from piccolo.cli import align_model
 from piccolo.confidence.covariance import PoseCovariance
@@ -61,8 +62,8 @@ def _write_colmap(folder, in_model, points):
     model.write(folder)
 
 
-def _run(tmp_path, scene, model, out, capsys):
-    results = write_results(tmp_path / "r.jsonl", scene[0])
+def _run(tmp_path, scene, model, out, capsys, is_written=False):
+    results = tmp_path / "r.jsonl" if is_written else write_results(tmp_path / "r.jsonl", scene[0])
     words = ["--model", str(model), "--results", str(results), "--out", str(out)]
     code = align_model.main(words)
     printed = capsys.readouterr()
@@ -84,6 +85,10 @@ def test_a_model_of_colmap_moves_with_its_points_and_photos(tmp_path, scene, cap
     code, report = _run(tmp_path, scene, tmp_path / "model", tmp_path / "aligned", capsys)
     assert code == 0
     _check(report)
+    with small_files(1000):
+        code, err = _run(tmp_path, scene, tmp_path / "model", tmp_path / "full", capsys, is_written=True)
+    assert (code, err) == (3, f"align_model.py: {tmp_path / 'full'}: cannot be used (File too large)\n")
+    assert not (tmp_path / "full").exists()
     model = pycolmap.Reconstruction(tmp_path / "aligned")
     before = pycolmap.Reconstruction(tmp_path / "model")
     assert model.cameras[1].params.tolist() == [500, 320, 240, 0.1]

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from ..batch.localizer import Answer, Localizer, Task
 from ..errors import InputError
-from ..files.atomic import temporary_folder
+from ..files.atomic import temporary_folder, write_temporary
 from ..files.json_file import DAMAGE
 from ..jobs.processes import Function, Processes
 from ..jobs.threads import Workers
@@ -192,7 +192,7 @@ def open_walk(localizer: Localizer, motion: Motion, max_pixels: float) -> Functi
         task, time = frame
         check_size(task, max_pixels)
         path = Path(folder.name) / f"{len(walk.photos)}{task.photo.path.suffix}"
-        path.write_bytes(content_of(task))
+        write_temporary(path, content_of(task))
         try:
             return walk.add(replace(task.photo, picture=path), time, task.photo.name).to_json()
         except DAMAGE as error:
