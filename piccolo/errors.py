@@ -2,9 +2,13 @@
 
 import errno
 import re
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import FrameType, ModuleType
 
 # of the system's errors those of the path itself, which come again however often it is tried
 LASTING = {
@@ -53,9 +57,40 @@ def printable(text: str) -> str:
 def import_optional(what: Path | str, module_name: str, extra: str = "formats") -> ModuleType:
     """Return the module that `what` needs, or a ResourceError that says how to install it."""
     try:
-        return import_module(module_name)
-    except ImportError as error:
+        with holding_signals():
+            return import_module(module_name)
+    except MemoryError:
+        raise
+    except Exception as error:  # libraries raise what they like of a part that can't be loaded
+        found = " ".join(str(error).split())
         raise ResourceError(
-            f"{what}: needs {module_name}, which can't be imported ({error}); "
+            f"{what}: needs {module_name}, which can't be imported ({found}); "
             f"pip install 'piccolo-localize[{extra}]', in a checkout: -r requirements-{extra}.txt"
         ) from error
+
+
+@contextmanager
+def holding_signals() -> Iterator[None]:
+    """Within this, in the main thread, SIGINT and SIGTERM wait: they come at its end.
+
+    A library that is interrupted while it is imported makes another error of it, or goes on without a part.
+    """
+    if threading.current_thread() is not threading.main_thread():  # where no handler is called
+        yield
+        return
+    came: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {number: handler for number, handler in handlers.items() if handler is not None}  # not of C's
+
+    def keep(number: int, _frame: FrameType | None) -> None:
+        came.append(number)
+
+    for number in before:
+        signal.signal(number, keep)
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+        if came:
+            signal.raise_signal(came[0])

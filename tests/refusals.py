@@ -2,6 +2,8 @@
 
 import errno
 import os
+import resource
+from contextlib import contextmanager
 
 import pytest
 
@@ -19,6 +21,17 @@ def assert_input_error(message, call, *arguments, **options):
 def fill_disk(*_):
     """Refuse to write, as on a full device."""
     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@contextmanager
+def small_files(limit):
+    """Within this no file grows beyond `limit` bytes, as on a full disk; Python has SIGXFSZ ignored."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def assert_refused(message, read, path, *arguments, **options):

@@ -1,12 +1,15 @@
 """Models of COLMAP and Metashape, moved onto the scan with scale."""
 
 import json
+import re
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
 import pycolmap
 import pytest
 from poses import result, write_results
+from refusals import small_files
 
 from piccolo.cli import align_model
 from piccolo.confidence.covariance import PoseCovariance
@@ -61,8 +64,8 @@ def _write_colmap(folder, in_model, points):
     model.write(folder)
 
 
-def _run(tmp_path, scene, model, out, capsys):
-    results = write_results(tmp_path / "r.jsonl", scene[0])
+def _run(tmp_path, scene, model, out, capsys, is_written=False):
+    results = tmp_path / "r.jsonl" if is_written else write_results(tmp_path / "r.jsonl", scene[0])
     words = ["--model", str(model), "--results", str(results), "--out", str(out)]
     code = align_model.main(words)
     printed = capsys.readouterr()
@@ -84,6 +87,10 @@ def test_a_model_of_colmap_moves_with_its_points_and_photos(tmp_path, scene, cap
     code, report = _run(tmp_path, scene, tmp_path / "model", tmp_path / "aligned", capsys)
     assert code == 0
     _check(report)
+    with small_files(1000):
+        code, err = _run(tmp_path, scene, tmp_path / "model", tmp_path / "full", capsys, is_written=True)
+    assert (code, err) == (3, f"align_model.py: {tmp_path / 'full'}: cannot be used (File too large)\n")
+    assert not (tmp_path / "full").exists()
     model = pycolmap.Reconstruction(tmp_path / "aligned")
     before = pycolmap.Reconstruction(tmp_path / "model")
     assert model.cameras[1].params.tolist() == [500, 320, 240, 0.1]
@@ -132,6 +139,49 @@ def test_a_chunk_of_metashape_gets_the_transform(tmp_path, scene, capsys):
     moved = scale * to_model(points) @ R.reshape(3, 3).T + t
     assert np.linalg.norm(moved - points, axis=1).max() < 0.01
     assert chunk.findtext("reference").startswith("LOCAL_CS")
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-4])  # of the model at one place, in its unit
+def test_a_model_of_one_place_has_no_scale(tmp_path, scene, capsys, noise):
+    results, in_model, points = scene
+    rng = np.random.default_rng(5)
+    turned = [Pose(pose.R_cam_from_world, in_model[0].center_world) for pose in in_model]
+    at_one = [Pose(p.R_cam_from_world, p.center_world + noise * rng.normal(size=3)) for p in turned]
+    _write_colmap(tmp_path / "model", at_one, points)
+    place = results[0].pose.center_world
+    found = [
+        replace(r, best_pose=add(Pose(r.pose.R_cam_from_world, place), PHOTO * rng.normal(size=6)))
+        for r in results
+    ]
+    code, err = _run(tmp_path, (found,), tmp_path / "model", tmp_path / "out", capsys)
+    assert code == 3
+    assert re.search(
+        r"model: found 20 localized photos within 0\.0\d+ m, which tell no scale \(.*\), wanted", err
+    )
+    assert err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_photos_that_were_localized_by_the_model_say_nothing_of_how_far_it_is_off(tmp_path, scene, capsys):
+    """As by --relative: each pose is where the model puts it, with the errors of the whole."""
+    results, in_model, points = scene
+    _write_colmap(tmp_path / "model", in_model, points)
+    apart = _run(tmp_path, scene, tmp_path / "model", tmp_path / "a", capsys)[1]
+    R = exp_so3(np.array([0.001, 0.0, 0.002])) @ R_MODEL_FROM_SCAN.T
+    placed = [
+        Pose(pose.R_cam_from_world @ R.T, R @ (pose.center_world - SHIFT) / SCALE + ORIGIN)
+        for pose in in_model
+    ]
+    made = [replace(r, best_pose=pose) for r, pose in zip(results, placed, strict=True)]
+    write_results(tmp_path / "r.jsonl", made)
+    words = ["--model", str(tmp_path / "model"), "--results", str(tmp_path / "r.jsonl")]
+    assert align_model.main([*words, "--out", str(tmp_path / "b")]) == 0
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert (report["off_m"], report["off_deg"], report["contradicting"]) == (None, None, [])
+    assert "the photos' poses are its own, as by --relative" in err
+    assert report["scale"] == pytest.approx(1.0 / SCALE, rel=1e-6)
+    assert report["std_scale"] > 2.0 * apart["std_scale"]  # 20 of them tell as much as one
 
 
 def test_what_can_not_be_aligned_is_refused(tmp_path, scene, capsys):

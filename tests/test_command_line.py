@@ -22,7 +22,7 @@ from piccolo.cli.options import add_arguments
 from piccolo.cli.settings import cloud_settings_from
 from piccolo.cli.start import COMMANDS
 from piccolo.cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
-from piccolo.errors import InputError
+from piccolo.errors import InputError, ResourceError, import_optional
 from piccolo.result import Result
 
 SCRIPTS = [ROOT / "localize.py", *sorted((ROOT / "tools").glob("[a-z]*.py"))]
@@ -160,6 +160,47 @@ def test_a_signal_during_a_callback_from_c_is_not_lost(capsys, number, code, tex
 
     assert command("report.py", "", "", lambda parser: None)(compiled)([]) == code
     assert capsys.readouterr().err == f"report.py: {text}\n"
+
+
+SLOW = """
+import signal, sys
+try:
+    signal.raise_signal(signal.{number})
+    done = True
+except BaseException as error:
+    raise {made}("no backend") from None
+"""
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "text"), [("SIGINT", 130, "interrupted"), ("SIGTERM", 143, "terminated")]
+)
+@pytest.mark.parametrize("made", ["RuntimeError", "ImportError"])
+@pytest.mark.parametrize("is_optional", [True, False])
+def test_a_signal_while_a_library_is_imported_is_no_error_of_it(
+    tmp_path, monkeypatch, capsys, number, code, text, made, is_optional
+):
+    """As pycolmap, whose compiled part can't be loaded then, and modules of C that ask for NumPy."""
+    (tmp_path / "slow_library.py").write_text(SLOW.format(number=number, made=made))
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "slow_library", raising=False)
+
+    def run(arguments):
+        import_optional("this", "slow_library") if is_optional else import_module("slow_library")
+        return 0
+
+    before = signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)
+    assert command("report.py", "", "", lambda parser: None)(run)([]) == code
+    assert capsys.readouterr().err == f"report.py: {text}\n"
+    assert (signal.getsignal(signal.SIGINT), signal.getsignal(signal.SIGTERM)) == before
+    assert ("slow_library" in sys.modules) == is_optional  # whole, where the signal has waited
+
+
+def test_a_library_that_can_not_be_imported_is_one_line_whatever_it_raises(tmp_path, monkeypatch):
+    (tmp_path / "broken_library.py").write_text("raise OSError('no such\\nsymbol')")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(ResourceError, match=r"^a: needs broken_library, .* imported \(no such symbol\)"):
+        import_optional("a", "broken_library")
 
 
 def _help(monkeypatch, capsys, program, start):

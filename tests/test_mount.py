@@ -1,6 +1,8 @@
 """Mounts: rotation, lever arm and clock offset of a camera, from photos and given poses."""
 
 import json
+import re
+from pathlib import Path
 
 import numpy as np
 import pye57
@@ -11,6 +13,7 @@ from refusals import assert_input_error
 
 from piccolo.batch.mount import Sighting, Trajectory, fit_mount
 from piccolo.batch.pose_table import read_pose_table
+from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.cli import calibrate_mount, e57_images
 from piccolo.cloud.readers.e57 import read_image
 from piccolo.confidence.covariance import PoseCovariance
@@ -195,7 +198,113 @@ def test_a_mount_on_a_base_with_x_ahead_has_the_axes_of_the_base(tmp_path, capsy
         assert pose_errors(pose, photo.pose) == pytest.approx((0.0, 0.0), abs=1e-5)
     given.write_text(_text_of("opk", ["a.jpg"], [0.0], bases[:1]))
     assert calibrate_mount.main([*words, "--axes", "piccolo"]) == 2
-    assert "--axes: only an option of trajectories" in capsys.readouterr().err
+    assert "--axes: only an option of quaternions" in capsys.readouterr().err
+
+
+NAVVIS_HEAD = "# pano poses v1.0: ID; filename; timestamp; " + "; ".join(
+    [*(f"pano_pos_{axis}" for axis in "xyz"), *(f"pano_ori_{axis}" for axis in "wxyz")]
+)
+AHEAD = np.eye(3)
+OPTICAL = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])  # right, down, ahead
+
+
+def _write_quaternions(path, head, mark, axes, names, bodies):
+    """A table of names and T_world_from_body, w first, in some axes of the body."""
+    lines = [head]
+    for k, (name, body) in enumerate(zip(names, bodies, strict=True)):
+        wxyz = Pose((axes @ body.R_cam_from_world).T, np.zeros(3)).quaternion_wxyz.tolist()
+        lines.append(
+            mark.join([str(k), name, repr(10.5 * k), *map(repr, [*body.center_world.tolist(), *wxyz])])
+        )
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def _calibrate(tmp_path, given, names, bodies, capsys, *words):
+    photos = [result(f"photos/{name}", MOUNT @ body) for name, body in zip(names, bodies, strict=True)]
+    results = write_results(tmp_path / "r.jsonl", photos)
+    words = ["--results", str(results), "--given", str(given), "--out", str(tmp_path / "out.csv"), *words]
+    assert calibrate_mount.main(words) == 0
+    out, err = capsys.readouterr()
+    return json.loads(out), err
+
+
+BODIES = [body_at(time) for time in np.linspace(0.0, 20.0, 6)]
+PHOTOS = [f"{k:02d}.jpg" for k in range(6)]
+
+
+def test_poses_of_navvis_have_x_ahead(tmp_path, capsys):
+    given = _write_quaternions(tmp_path / "pano-poses.csv", NAVVIS_HEAD, "; ", AHEAD, PHOTOS, BODIES)
+    report, err = _calibrate(tmp_path, given, PHOTOS, BODIES, capsys)
+    assert err == ""
+    assert report["rotation_deg"] == pytest.approx([1.2, -1.2, 1.1], abs=1e-4)
+    assert report["lever_arm_m"] == pytest.approx([0.06, -0.05, 0.06], abs=1e-6)
+    for body, read in zip(BODIES, read_pose_table(tmp_path / "out.csv").poses, strict=True):
+        assert pose_errors(read, MOUNT @ body) == pytest.approx((0.0, 0.0), abs=1e-6)
+    relative = read_relative_poses(given, [Path(name) for name in PHOTOS])
+    for body, read in zip(BODIES, relative, strict=True):
+        assert pose_errors(read, body) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("axes", "right", "wrong"), [(AHEAD, "piccolo", "optical"), (OPTICAL, "optical", "piccolo")]
+)
+def test_named_quaternions_in_other_axes_are_told_by_the_mount(tmp_path, capsys, axes, right, wrong):
+    head = "number,name,time,x,y,z,qw,qx,qy,qz"
+    given = _write_quaternions(tmp_path / "given.csv", head, ",", axes, PHOTOS, BODIES)
+    report, err = _calibrate(tmp_path, given, PHOTOS, BODIES, capsys, "--axes", wrong)
+    assert np.linalg.norm(report["rotation_deg"]) == pytest.approx(120.0, abs=2.5)
+    found = f"found a camera turned by 1[12][0-9] deg, as {right} axes are from {wrong} ones"
+    assert re.search(f": warning: {re.escape(str(given))}: {found}; .* add --axes {right}\n", err)
+    assert err.count("\n") == 1
+    if wrong == "optical":
+        assert _calibrate(tmp_path, given, PHOTOS, BODIES, capsys)[1] == err  # which is the default
+    report, err = _calibrate(tmp_path, given, PHOTOS, BODIES, capsys, "--axes", right)
+    assert err == ""
+    assert report["rotation_deg"] == pytest.approx([1.2, -1.2, 1.1], abs=1e-4)
+    poses = [row.split(",") for row in (tmp_path / "out.csv").read_text().splitlines()[1:]]
+    for words, body in zip(poses, BODIES, strict=True):  # in the axes that they were given in
+        R = axes.T @ rotation_from_quaternion_wxyz(np.array(words[6:], float)).T
+        wanted = MOUNT @ body
+        assert pose_errors(Pose(R, np.array(words[3:6], float)), wanted) == pytest.approx(
+            (0.0, 0.0), abs=1e-6
+        )
+
+
+def _write_tum(path, times, bodies):
+    lines = []
+    for time, body in zip(times, bodies, strict=True):
+        w, x, y, z = Pose((OPTICAL @ body.R_cam_from_world).T, np.zeros(3)).quaternion_wxyz.tolist()
+        lines.append(" ".join(map(repr, [float(time), *body.center_world.tolist(), x, y, z, w])))
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.mark.parametrize("step", [1.0, 7.0])  # seconds may rise as numbers of rows do
+@pytest.mark.parametrize("first", [0.0, 100.0])
+def test_a_sparse_trajectory_has_the_poses_of_photos_at_their_times(tmp_path, capsys, step, first):
+    times = first + step * np.arange(5)
+    names = [f"{time}.jpg" for time in times]
+    given = _write_tum(tmp_path / "five.txt", times, BODIES[:5])
+    report, err = _calibrate(tmp_path, given, names, BODIES[:5], capsys, "--times", "names")
+    assert err == ""
+    assert report["rotation_deg"] == pytest.approx([1.2, -1.2, 1.1], abs=1e-4)
+    assert report["lever_arm_m"] == pytest.approx([0.06, -0.05, 0.06], abs=1e-5)
+    assert report["clock_s"] == pytest.approx(0.0, abs=1e-6)
+
+
+def test_times_by_another_clock_and_times_that_do_not_rise_are_refused(tmp_path, capsys):
+    names = [f"{time}.jpg" for time in range(50, 55)]
+    photos = [result(name, MOUNT @ body) for name, body in zip(names, BODIES, strict=False)]
+    words = ["--results", str(write_results(tmp_path / "r.jsonl", photos)), "--times", "names", "--given"]
+    given = _write_tum(tmp_path / "five.txt", 100.0 + np.arange(5), BODIES[:5])
+    assert calibrate_mount.main([*words, str(given)]) == 3
+    text = "found photos at 50.000 to 54.000 s, wanted times within those of the given poses, 100.000 to"
+    assert text in capsys.readouterr().err
+    _write_tum(given, [50.0, 51.0, 51.0, 53.0, 54.0], BODIES[:5])
+    assert calibrate_mount.main([*words, str(given)]) == 3
+    text = f"{given}: found the time 51.000000 after 51.000000, wanted a trajectory in the order of time"
+    assert text in capsys.readouterr().err
 
 
 def test_what_is_no_table_and_too_few_photos_are_refused(tmp_path):

@@ -283,6 +283,47 @@ def test_a_walk_is_followed_frame_by_frame(service, scene):
     assert service.ask("DELETE", path)[0] == 404
 
 
+def _frames_on_disk(content):
+    """The files of this content in the folders of services."""
+    found = Path(tempfile.gettempdir()).glob("piccolo-temporary-*/**/*.jpg")
+    return [path for path in found if path.read_bytes() == content]
+
+
+@pytest.mark.parametrize("end", ["ended", "killed"])
+def test_the_frames_of_a_walk_that_is_over_are_not_on_the_disk(service, photo, end):
+    frame = photo + uuid.uuid4().bytes  # behind the JPEG's end
+    others = set(workers_of(service.process))
+    path = f"/walks/{json.loads(service.ask('POST', '/walks')[2])['walk']}"
+    for name in ("a.jpg", "b.jpg"):
+        assert service.post(path, name, frame)[0] == 200
+    assert len(_frames_on_disk(frame)) == 2
+    if end == "ended":
+        assert service.ask("DELETE", path)[0] == 200
+    else:
+        (worker,) = {*workers_of(service.process)} - others
+        os.kill(worker, signal.SIGKILL)
+        assert service.post(path, "c.jpg", frame)[0] == 500
+    assert _frames_on_disk(frame) == []
+    assert service.post(path, "c.jpg", frame)[0] == 404
+
+
+def test_a_walk_has_so_much_room_and_no_more(scene, folder, photo):
+    words = ["--jobs", "1", "--max-walk-megabytes", f"{1.5e-6 * len(photo):.4f}"]
+    frame = photo + uuid.uuid4().bytes
+    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
+        path = f"/walks/{json.loads(client.ask('POST', '/walks')[2])['walk']}"
+        assert client.post(path, "a.jpg", frame)[0] == 200
+        status, _, body = client.post(path, "b.jpg", frame)
+        assert status == 413
+        assert f"wanted it ended: DELETE {path}" in json.loads(body)["error"]
+        assert len(_frames_on_disk(frame)) == 1
+        status, _, body = client.ask("DELETE", path)
+        assert [json.loads(line)["pano"] for line in body.splitlines()] == ["a.jpg"]
+        path = f"/walks/{json.loads(client.ask('POST', '/walks')[2])['walk']}"
+        assert client.post(path, "a.jpg", frame)[0] == 200
+    assert _frames_on_disk(frame) == []  # of a walk that was not over when the service ended
+
+
 def test_a_walk_that_is_ended_while_a_frame_is_at_work_answers_all(service, photo):
     path = f"/walks/{json.loads(service.ask('POST', '/walks')[2])['walk']}"
     with ThreadPoolExecutor(4) as pool:

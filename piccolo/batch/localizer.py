@@ -21,7 +21,7 @@ from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..confidence.focal_length import Consensus
 from ..confidence.localization import FocalLength
 from ..errors import InputError, is_passing
-from ..files.atomic import temporary_folder
+from ..files.atomic import temporary_folder, write_temporary
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
@@ -190,7 +190,7 @@ class Task(NamedTuple):
             for name, content in self.files.items():
                 path = temporary / name
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_bytes(content)
+                write_temporary(path, content)
             yield replace(self.photo, picture=temporary / self.photo.path.name)
 
 

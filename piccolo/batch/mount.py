@@ -29,6 +29,7 @@ MOST_ALIKE = 0.9  # correlation of errors of neighbouring photos
 NUM_STEPS = 8  # of Gauss and Newton, at most
 SETTLED = 1e-6  # [rad, m, s] of a step, after which there is none
 NEAR_S = 0.01  # [s] on either side, over which a velocity is taken
+MARGIN_S = 1.0  # [s] chosen: by which clocks may differ where a photo is at an end of the trajectory
 MOST_ERRORS = RelativeErrors(math.radians(5.0), 0.5)  # chosen: such poses are in another frame, or of others
 
 
@@ -74,6 +75,8 @@ def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit
     if len(sightings) < LEAST_PHOTOS or len(trajectory.poses) < LEAST_PHOTOS:
         found = f"found {len(sightings)} localized photos with a given pose"
         raise InputError(f"{found}, wanted {LEAST_PHOTOS} or more")
+    if trajectory.has_clock:
+        _check_times(np.array([sighting.time for sighting in sightings]), trajectory.times)
     own = [sighting.covariance for sighting in sightings]
     errors = RelativeErrors()
     mount = _begin(sightings, trajectory, errors)
@@ -101,6 +104,18 @@ def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit
         raise InputError(f"found given poses that are off by {off}, {wanted}")
     is_odd = find_odd(own, steps, errors)
     return MountFit(mount, clock, covariance * _repeat(own, steps, errors, is_odd), errors, is_odd, steps)
+
+
+def _check_times(times: Array, clock: Array) -> None:
+    """Refuse photos of which most were not taken during the trajectory: their clock is another."""
+    begin, *_, end = clock
+    is_within = (times > begin - MARGIN_S) & (times < end + MARGIN_S)
+    if 2 * np.count_nonzero(is_within) < len(times):
+        found = f"found photos at {times.min():.3f} to {times.max():.3f} s"
+        wanted = (
+            f"wanted times within those of the given poses, {begin:.3f} to {end:.3f} s, but for an offset"
+        )
+        raise InputError(f"{found}, {wanted}")
 
 
 def _repeat(own: Sequence[Array], steps: Array, errors: RelativeErrors, is_odd: Sequence[bool]) -> float:

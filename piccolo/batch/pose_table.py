@@ -1,7 +1,8 @@
 """Tables of given poses as programs write them, which can be written again with other poses.
 
 These are Potree's coordinates.txt, tables with omega, phi, kappa (Metashape, Pix4D), Metashape's csv with
-yaw, pitch, roll, trajectories in TUM's form, E57 files with images. Positions are in the scan's frame.
+yaw, pitch, roll, quaternions by a header, NavVis' pano-poses.csv, trajectories in TUM's form, E57 files with
+images. Positions are in the scan's frame.
 """
 
 import re
@@ -24,7 +25,7 @@ from .relative_poses import COLUMNS, find_columns
 
 WANTED = (
     "wanted Potree's coordinates.txt, a TUM trajectory, or a table with a header that names x, y, z and "
-    "omega, phi, kappa or yaw, pitch, roll"
+    "qx, qy, qz, qw, or omega, phi, kappa, or yaw, pitch, roll"
 )
 STALE = re.compile("r[123][123]")  # a matrix beside angles
 
@@ -57,19 +58,23 @@ class Form(NamedTuple):
         return np.asarray(angles)
 
 
+QUATERNION = Form(("qx", "qy", "qz", "qw"), "", (), 0.0, OPTICAL_FROM_CAM)
+AHEAD = QUATERNION._replace(other_from_cam=np.eye(3))  # of cameras with x ahead
 FORMS = (
-    Form(("qx", "qy", "qz", "qw"), "", (), 0.0, OPTICAL_FROM_CAM),
+    # pano_ori_x ... of NavVis, of which is assumed: ahead, left, up
+    AHEAD._replace(names=("panoorix", "panooriy", "panooriz", "panooriw")),
+    QUATERNION,
     Form(("omega", "phi", "kappa"), "XYZ", (1.0, 1.0, 1.0), 0.0, OPENGL_FROM_CAM),
     Form(("yaw", "pitch", "roll"), "ZXY", (-1.0, 1.0, 1.0), 0.0, OPENGL_FROM_CAM),
     Form(("course", "pitch", "roll"), "ZYX", (-1.0, -1.0, 1.0), 90.0, np.eye(3)),
     Form(("heading", "pitch", "roll"), "ZYX", (-1.0, -1.0, 1.0), 90.0, np.eye(3)),
 )
 GEOGRAPHIC = {"x": "x?easting|", "y": "y?northing|", "z": "z?altitude|height|"}
-KNOWN = COLUMNS | {name: re.compile(name) for form in FORMS[1:] for name in form.names}
+KNOWN = {name: re.compile(name) for form in FORMS for name in form.names} | COLUMNS
 KNOWN |= {name: re.compile(words + COLUMNS[name].pattern) for name, words in GEOGRAPHIC.items()}
-TUM = ("time", *"xyz", *FORMS[0].names)
-OPK = ("name", *"xyz", *FORMS[1].names)
-POTREE = ("name", "time", *"xyz", *FORMS[3].names)
+TUM = ("time", *"xyz", *QUATERNION.names)
+OPK = ("name", *"xyz", "omega", "phi", "kappa")
+POTREE = ("name", "time", *"xyz", "course", "pitch", "roll")
 
 
 @dataclass(frozen=True)
@@ -90,12 +95,18 @@ class PoseTable:
 
     @property
     def times(self) -> Array | None:
-        """Times (N,) [s]; None of none, or if they only count the rows, or do not rise.
+        """Times (N,) [s]; None of named poses if there are none, or they number the rows, or do not rise.
 
-        InputError for what is no number.
+        InputError for what is no number, and for a trajectory, whose times are its names, that does not rise.
         """
         with naming(self.path, WANTED):
             times = np.array(self.column("time") or [], float)
+        if self.column("name") is None:
+            if not np.all(np.diff(times) > 0.0):
+                row = int(np.argmin(np.diff(times) > 0.0)) + 1
+                found = f"found the time {times[row]:.6f} after {times[row - 1]:.6f}"
+                raise InputError(f"{self.path}: {found}, wanted a trajectory in the order of time")
+            return times
         is_clock = len(times) > 1 and np.all(np.diff(times) > 0.0) and np.any(np.diff(times) != 1.0)
         return times if is_clock else None
 
@@ -137,7 +148,7 @@ def read_pose_table(path: Path) -> PoseTable:
     """Return the table of poses in a file, its columns by a header, else by their number; or an E57's."""
     if path.suffix.lower() == ".e57":
         rows = tuple(_row_of(image.file_name, pose) for image, pose in list_posed_images(path))
-        return PoseTable(path, (), rows, " ", {n: at for at, n in enumerate(("name", *TUM[1:]))}, FORMS[0])
+        return PoseTable(path, (), rows, " ", {n: at for at, n in enumerate(("name", *TUM[1:]))}, QUATERNION)
     lines = read_text(path, WANTED).splitlines()
     text = next((line for line in reversed(lines) if line.strip()), "")
     separator = next((mark for mark in ("\t", ",", ";") if text.count(mark) >= len(OPK) - 1), " ")
@@ -158,7 +169,7 @@ def read_pose_table(path: Path) -> PoseTable:
 
 
 def _row_of(name: str, pose: Pose) -> tuple[str, ...]:
-    values = [*pose.center_world, *FORMS[0].write(pose.R_cam_from_world)]
+    values = [*pose.center_world, *QUATERNION.write(pose.R_cam_from_world)]
     return name, *(repr(float(value)) for value in values)
 
 

@@ -39,9 +39,10 @@ NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
 COLUMNS = {  # of a header, without what is no letter
     "name": re.compile("label|.*name|image|file.*|photo"),
     "time": re.compile("time.*|t|stamp"),
-    **{axis: re.compile(f"(p|t|pos.*|tr.*|prsr|){axis}") for axis in "xyz"},
-    **{f"q{axis}": re.compile(f"(q|rot|ori|quat).*{axis}") for axis in "xyzw"},
+    **{axis: re.compile(f"(p|t|(pano)?pos.*|tr.*|prsr|){axis}") for axis in "xyz"},
+    **{f"q{axis}": re.compile(f"(q|rot|(pano)?ori|quat).*{axis}") for axis in "xyzw"},
 }
+NAVVIS = "pano_ori_w"  # in the header of pano-poses.csv, whose cameras have x ahead
 NOT_IN_NAMES = re.compile(r"[\[(].*|[^a-z]")
 LOG = logging.getLogger("piccolo")
 LEVEL = math.cos(math.radians(15.0))  # of an axis that stays as it is while the others turn
@@ -155,6 +156,8 @@ def warn_of_axes(path: Path, poses: Sequence[Pose]) -> None:
 
 
 def _read_tum(path: Path, rows: Sequence[Sequence[str]]) -> list[NamedPose]:
+    if NAVVIS in read_text(path, WANTED).partition("\n")[0]:
+        return [read_tum_row(row, np.eye(3)) for row in rows]
     poses = [read_tum_row(row) for row in rows]
     warn_of_axes(path, [pose for _, pose in poses])
     return poses
@@ -234,8 +237,9 @@ def find_columns(words: Sequence[str], names: Mapping[str, re.Pattern[str]]) -> 
 
 
 def _split(line: str) -> list[str]:
-    """Split a row at blanks, or at commas; a name at the end of COLMAP's may have blanks."""
-    words = line.split(",") if line.count(",") >= NUM_TUM - 1 else line.split()
+    """Split a row at blanks, commas or semicolons; a name at the end of COLMAP's may have blanks."""
+    mark = next((mark for mark in ",;" if line.count(mark) >= NUM_TUM - 1), None)
+    words = line.split(mark)
     is_named = len(words) > NUM_COLMAP and not all(map(is_number, words))
     return line.split(None, NUM_COLMAP - 1) if is_named else [word.strip() for word in words]
 
@@ -264,15 +268,15 @@ def read_colmap_row(row: Sequence[str]) -> NamedPose:
     return row[9], check_transform(T, row[9], OPTICAL_FROM_CAM, is_from_world=True)
 
 
-def read_tum_row(row: Sequence[str]) -> NamedPose:
-    """Return the time and the pose of a row: T_world_from_cam, camera axes right, down, forward."""
+def read_tum_row(row: Sequence[str], other_from_cam: Array = OPTICAL_FROM_CAM) -> NamedPose:
+    """Return the time and the pose of a row: T_world_from_cam, camera axes right, down, forward, or other."""
     if len(row) != NUM_TUM:
         raise ValueError(f"{len(row)} columns")
     if wrong := [word for word in row[1:] if not is_number(word)]:
         raise ValueError(f"{wrong[0][:40]!r}, which is no number")
     values = np.array(row[1:], float)
     T = np.column_stack([read_quaternion(np.roll(values[3:], 1)), values[:3]])
-    return row[0], check_transform(T, row[0], OPTICAL_FROM_CAM)
+    return row[0], check_transform(T, row[0], other_from_cam)
 
 
 def read_quaternion(wxyz: Array) -> Array:

@@ -19,9 +19,14 @@ The photos are localized together first, by the poses that the model gives them 
 or more that are localized decide. The whole model moves: cameras, poses and points (COLMAP), or the transform
 of the chunk (Metashape, whose coordinates become local). Prints one JSON object: x_scan = scale R x_model +
 translation, with R = R_scan_from_model as a quaternion; standard deviations; how far half and nine tenths of
-the photos are from where the model puts them; and the photos that contradict the others.
+the photos are from where the model puts them (null if they were localized by it: then localize some alone to
+know it); and the photos that contradict the others. A model of one place has no scale and is refused.
 """
 SHARES = 0.5, 0.9  # of the photos
+DEPENDENT = (
+    "the photos' poses are its own, as by --relative: how far they are from where it puts them says nothing; "
+    "to know it, localize photos without"
+)
 
 
 def add_arguments(parser: ArgumentParser) -> None:
@@ -40,7 +45,10 @@ def main(arguments: Arguments) -> int:
     (check_output_folder if arguments.model.is_dir() else check_output)(arguments.out)
     fit = fit_alignment(arguments.model, read_results(arguments.results))
     write_aligned(arguments.model, fit, arguments.out)
-    turned, moved = (np.quantile(np.linalg.norm(part, axis=1), SHARES) for part in np.split(fit.steps, 2, 1))
+    norms = [np.linalg.norm(part, axis=1) for part in np.split(fit.steps, 2, axis=1)]
+    turned, moved = (np.quantile(norm, SHARES) for norm in norms)
+    if not fit.is_independent:
+        arguments.warn([f"{arguments.model}: {DEPENDENT}"])
     report = {
         "out": str(arguments.out),
         "scale": fit.scale,
@@ -50,8 +58,8 @@ def main(arguments: Arguments) -> int:
         "translation_m": fit.translation.tolist(),
         "std_m": fit.std[3:6].tolist(),
         "photos": len(fit.steps),
-        "off_deg": np.degrees(turned).tolist(),
-        "off_m": moved.tolist(),
+        "off_deg": np.degrees(turned).tolist() if fit.is_independent else None,
+        "off_m": moved.tolist() if fit.is_independent else None,
         "contradicting": list(fit.contradicting),
     }
     arguments.report(outputs, report)

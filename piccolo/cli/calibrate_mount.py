@@ -1,7 +1,9 @@
 """Find how a camera sits on a scanner, vehicle or robot: rotation, lever arm and clock offset."""
 
+import math
 from argparse import ArgumentParser
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import compress
 from pathlib import Path
 
@@ -10,21 +12,23 @@ import numpy as np
 from ..arrays import Array
 from ..batch.inputs import times_of
 from ..batch.mount import Sighting, Trajectory, fit_mount
-from ..batch.pose_table import PoseTable, read_pose_table
+from ..batch.pose_table import AHEAD, QUATERNION, PoseTable, read_pose_table
 from ..batch.relative_poses import match_names, warn_of_axes
 from ..errors import InputError
-from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, log_so3, quaternion_wxyz
+from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, angle_between, log_so3, quaternion_wxyz
 from ..result import Result, read_results
 from .command import Arguments, UsageError, check_outputs, check_suffix, command, option
 
+ALIKE_DEG = 20.0  # chosen: no camera that is mounted otherwise is turned about this axis by 100 to 140 deg
 EPILOG = """\
 example:
   python tools/calibrate_mount.py --results poses.jsonl --given coordinates.txt --out corrected.txt
 
-Given poses are in the scan's coordinates: Potree's coordinates.txt, a table with a header that names x, y, z
-and omega, phi, kappa or yaw, pitch, roll [deg] (Metashape, Pix4D), a trajectory in TUM's form (time x y z qx
-qy qz qw), which needs the photos' times, or an E57 file, whose images tools/e57_images.py writes. Photos are
-found by their names. --out is the same file with the camera's poses in place of the given ones.
+Given poses are in the scan's coordinates: Potree's coordinates.txt, NavVis' pano-poses.csv, a table with a
+header that names x, y, z and omega, phi, kappa or yaw, pitch, roll [deg] (Metashape, Pix4D) or a quaternion,
+a trajectory in TUM's form (time x y z qx qy qz qw), which needs the photos' times, or an E57 file, whose
+images tools/e57_images.py writes. Photos are found by their names. --out is the same file with the camera's
+poses in place of the given ones.
 
 Prints one JSON object: cam_from_body as a quaternion and a rotation vector [deg], axes of both +x forward, +y
 left, +z up, as those of the camera that the given poses mean; the lever arm [m] in the body's axes; the clock
@@ -38,7 +42,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     option(parser, "--given FILE", "given poses, see below", required=True)
     option(parser, "--out FILE", "write the file again with the mount applied")
-    text = "axes of a trajectory: optical (default): right, down, forward; piccolo: forward, left, up (ROS)"
+    text = "axes of quaternions: optical (default): right, down, forward; piccolo: forward, left, up (ROS)"
     option(parser, "--axes", text, choices=CAMERA_AXES)
     text = "photos' times, for a trajectory: exif, names (the last number in each) or a CSV file of name and "
     option(parser, "--times SOURCE", text + "time [s] (default: of a walk its own, else exif)")
@@ -58,6 +62,18 @@ def find_times(
     return [*found]
 
 
+def warn_of_turn(arguments: Arguments, R_cam_from_body: Array) -> bool:
+    """Warn, and return True, if the mount is about the turn between both conventions of axes."""
+    given = arguments.axes or "optical"
+    other, turn = ("optical", OPTICAL_FROM_CAM.T) if given == "piccolo" else ("piccolo", OPTICAL_FROM_CAM)
+    is_turn = angle_between(R_cam_from_body, turn) < math.radians(ALIKE_DEG)
+    if is_turn:
+        angle = math.degrees(float(np.linalg.norm(log_so3(R_cam_from_body))))
+        found = f"found a camera turned by {angle:.0f} deg, as {other} axes are from {given} ones"
+        arguments.warn([f"{arguments.given}: {found}; if the given poses have those, add --axes {other}"])
+    return is_turn
+
+
 @command(__file__, __doc__, EPILOG, add_arguments)
 def main(arguments: Arguments) -> int:
     """Read, fit, write; returns the exit code."""
@@ -66,11 +82,12 @@ def main(arguments: Arguments) -> int:
     table = read_pose_table(arguments.given)
     if table.path.suffix.lower() == ".e57":
         check_suffix("--out", arguments.out, (".e57",))
-    is_trajectory = not table.form.axes and table.column("name") is None
-    if arguments.axes and not is_trajectory:
-        raise UsageError("--axes: only an option of trajectories; the axes of other files are known")
-    if is_trajectory and not arguments.axes:
-        warn_of_axes(arguments.given, table.poses)
+    has_axes = table.form is QUATERNION and table.path.suffix.lower() != ".e57"
+    if arguments.axes and not has_axes:
+        raise UsageError("--axes: only an option of quaternions; the axes of other files are known")
+    is_base = arguments.axes == "piccolo" and table.column("name") is None
+    if arguments.axes == "piccolo" and not is_base:
+        table = replace(table, form=AHEAD)
     times = table.times
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
@@ -87,10 +104,12 @@ def main(arguments: Arguments) -> int:
         table.write(arguments.out, poses)
     std = np.sqrt(np.diag(fit.covariance))
     mount = fit.cam_from_body
-    if arguments.axes == "piccolo":  # they were read as optical ones
+    if is_base:  # they were read as optical ones
         mount = mount @ Pose(OPTICAL_FROM_CAM.T, np.zeros(3))
         std[3:6] = np.abs(OPTICAL_FROM_CAM) @ std[3:6]
     R = mount.R_cam_from_world
+    if has_axes and not warn_of_turn(arguments, R) and not arguments.axes:
+        warn_of_axes(arguments.given, table.poses)
     report = {
         "photos": len(sightings),
         "contradicting": list(compress(sightings, fit.is_odd)),

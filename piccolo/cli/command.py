@@ -252,7 +252,8 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
     """Within this, SIGTERM raises Terminated in the main thread, and SIGINT KeyboardInterrupt.
 
     Code that is called back from C, as by LLVM while a kernel is compiled, can't pass an exception on: it is
-    added to `lost`, and the signal is sent again a moment later.
+    added to `lost`, and the signal is sent again a moment later. So is each that is raised, as a library may
+    make another error of it.
     """
     if threading.current_thread() is not threading.main_thread():  # where no handler can be set
         yield
@@ -268,9 +269,13 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
         else:
             sys.__unraisablehook__(unraisable)
 
-    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, _terminate)}
-    if signal.getsignal(signal.SIGINT) is quit_at_once:
-        before[signal.SIGINT] = signal.signal(signal.SIGINT, signal.default_int_handler)
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        lost.append(Terminated() if number == signal.SIGTERM else KeyboardInterrupt())
+        raise lost[-1]
+
+    before = {signal.SIGTERM: signal.signal(signal.SIGTERM, interrupt)}
+    if signal.getsignal(signal.SIGINT) in (quit_at_once, signal.default_int_handler):
+        before[signal.SIGINT] = signal.signal(signal.SIGINT, interrupt)
     hook = sys.unraisablehook
     sys.unraisablehook = send_again
     try:
@@ -281,10 +286,6 @@ def raising_signals(lost: list[KeyboardInterrupt]) -> Iterator[None]:
         for number, handler in before.items():
             signal.signal(number, handler)
         sys.unraisablehook = hook
-
-
-def _terminate(signum: int, frame: FrameType | None) -> None:
-    raise Terminated
 
 
 def discard_stdout() -> None:

@@ -58,6 +58,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--max-megapixels X", "size of a picture, by its header", default=200.0)
     option(group, "--max-waiting N", "photos at once, those at work included", default=32)
     option(group, "--max-seconds S", "time of a photo", default=60.0)
+    option(group, "--max-walk-megabytes X", "size of all frames of a walk, until it ends", default=20_000.0)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
@@ -65,6 +66,7 @@ def main(arguments: Arguments) -> int:
     """Open the scan, then answer requests until a signal comes; returns the exit code."""
     a = arguments
     a.check_least(jobs=1, port=0, max_megabytes=0.1, max_megapixels=0.01, max_waiting=1, max_seconds=0.1)
+    a.check_least(max_walk_megabytes=0.01)
     uvicorn = import_optional("tools/serve.py", "uvicorn", "serve")
     for module in ("starlette", "python_multipart"):
         import_optional("tools/serve.py", module, "serve")
@@ -79,7 +81,11 @@ def main(arguments: Arguments) -> int:
         raise UsageError("--quiet: the token would not be printed, wanted --token")
     token = None if a.host in LOOPBACK and not a.token else choose_token(a.token)
     limits = Limits(
-        int(a.max_megabytes * MEGABYTE), a.max_megapixels * MEGABYTE, a.max_waiting, a.max_seconds
+        int(a.max_megabytes * MEGABYTE),
+        a.max_megapixels * MEGABYTE,
+        a.max_waiting,
+        a.max_seconds,
+        int(a.max_walk_megabytes * MEGABYTE),
     )
     memory = a.max_memory and (a.max_memory - memory_taken() / GB) / (a.jobs + MAX_WALKS)
     localizer = replace(localizer, max_memory=memory)

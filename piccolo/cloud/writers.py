@@ -12,7 +12,7 @@ import numpy as np
 
 from ..arrays import Array, Bytes, Floats, Values
 from ..errors import import_optional
-from ..files.atomic import replacing, temporary_folder
+from ..files.atomic import replacing, replacing_by_library
 from ..geometry.pose import transform_points
 from ..jobs.memory import check_memory
 from .readers.ply import MAGIC, PlyHeader, place_of_vertices, read_columns, read_header
@@ -246,7 +246,12 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
         header.add_crs(pyproj.CRS.from_user_input(crs))
     is_packed = out.suffix.lower() == ".laz"
     how = {"mode": "w", "header": header, "do_compress": is_packed, "closefd": False}
-    with replacing(out) as file, laspy.open(file, **how) as writer:
+    errors = import_optional(out, "lazrs").LazrsError if is_packed else ()
+    with (
+        replacing_by_library(out, errors) as path,
+        path.open("w+b") as file,
+        laspy.open(file, **how) as writer,
+    ):
 
         def add(points: Array, colors: Bytes, num_photos: Bytes) -> None:
             record = laspy.ScaleAwarePointRecord.zeros(len(points), header=header)
@@ -262,6 +267,7 @@ def writing_las(out: Path, box: Array, scale: float, crs: str) -> Iterator[Add]:
 def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add]:
     """Yield a function that adds points to an E57 file, whose library wants all of them at once."""
     pye57 = import_optional(out, "pye57")
+    failed = pye57.libe57.E57Exception
     middle = np.floor(box.mean(axis=0))  # coordinates are written in float32
     parts: list[tuple[Any, ...]] = []
 
@@ -273,10 +279,12 @@ def writing_e57(out: Path, box: Array, _scale: float, _crs: str) -> Iterator[Add
     yield add
     names = "cartesianX", "cartesianY", "cartesianZ", "colorRed", "colorGreen", "colorBlue"
     columns = [np.concatenate(values) for values in zip(*parts, strict=True)]
-    with temporary_folder() as folder, replacing(out) as file:
-        path = folder / "scan.e57"
-        with pye57.E57(str(path), mode="w") as writer:
+    with replacing_by_library(out, failed) as path:
+        writer = pye57.E57(str(path), mode="w")
+        try:
             data = dict(zip(names, columns, strict=True))
             writer.write_scan_raw(data, name="coloured", rotation=UNTURNED, translation=middle)
-        with path.open("rb") as written:
-            shutil.copyfileobj(written, file)
+            writer.close()
+        except failed:
+            writer.close = lambda: None  # it would be closed once more, and the error printed
+            raise

@@ -34,7 +34,7 @@ from .posed_images import (
     numbers,
     offset_comment,
     select_images,
-    write_offset_beside,
+    write_with_offset,
 )
 from .reconstructions import (
     NERFSTUDIO_LENSES,
@@ -74,8 +74,7 @@ def write_csv(images: Sequence[PosedImage], out: Path, options: Options) -> None
         words = (cell(image.name), cell(result.cloud_name), result.status, result.confidence, score)
         wxyz = quaternion_wxyz(pose.R_cam_from_world).tolist()
         table.writerow([*words, *pose.center_world.tolist(), *wxyz, *heading_pitch_roll_deg(pose)])
-    write_offset_beside(out, options)
-    write_atomically(out, text.getvalue().encode())
+    write_with_offset(out, text.getvalue(), options)
 
 
 def write_tum(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -98,8 +97,7 @@ def tum_lines(poses: Iterable[tuple[str, Pose]], axes: str) -> list[str]:
 def write_kitti(images: Sequence[PosedImage], out: Path, options: Options) -> None:
     """Write the twelve numbers of a 3 x 4 matrix, world from camera, a row; the format has no comments."""
     matrices = [turn_axes(image.pose, CAMERA_AXES[options.axes]).T_world_from_cam for image in images]
-    write_offset_beside(out, options)
-    write_lines(out, [numbers(T[:3].ravel()) for T in matrices])
+    write_with_offset(out, "".join(f"{numbers(T[:3].ravel())}\n" for T in matrices), options)
 
 
 def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> None:
@@ -114,8 +112,7 @@ def write_potree(images: Sequence[PosedImage], out: Path, options: Options) -> N
     for image in images:
         values = [*image.pose.center_world, *heading_pitch_roll_deg(image.pose)]
         lines.append("\t".join([image.name, image.time, numbers(values, "\t")]))
-    write_offset_beside(out, options)
-    write_lines(out, lines)
+    write_with_offset(out, "".join(f"{line}\n" for line in lines), options)
 
 
 def write_geojson(images: Sequence[PosedImage], out: Path, options: Options) -> None:

@@ -34,6 +34,8 @@ from ..result import Result
 from .colmap import read_model, write_model
 
 LEAST_PHOTOS = 3
+MOST_SCALE = 0.1  # chosen: deviation of the logarithm of a scale that is still told
+MADE = 1e-3  # chosen: of a deviation; a pose that was computed is nearer to where it was put
 NUM_ROUNDS = 4  # in which the errors of the model and its place are estimated in turn
 LOCAL = (
     'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
@@ -49,6 +51,7 @@ class Alignment(NamedTuple):
     std: Array  # (7,) of rotation [rad] about the model's axes, place of its middle [m], logarithm of scale
     contradicting: tuple[str, ...]
     steps: Array  # (N, 6) of photos from where the model puts them [rad, m]
+    is_independent: bool  # False if the photos' poses were made of the model's, so that steps say nothing
 
 
 def file_of_poses(model: Path) -> Path:
@@ -59,7 +62,10 @@ def file_of_poses(model: Path) -> Path:
 
 
 def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
-    """Fit the similarity of a model to photos that are localized; InputError for fewer than three of them."""
+    """Fit the similarity of a model to photos that are localized.
+
+    InputError for fewer than three of them, and for places too near to each other to tell the scale.
+    """
     sure = [(Path(result.pano), result) for result in results if result.pose is not None]
     relative = read_relative_poses(file_of_poses(model), [path for path, _ in sure])
     known = [(result, pose) for (_, result), pose in zip(sure, relative, strict=True) if pose is not None]
@@ -87,7 +93,22 @@ def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
     scale = math.exp(bundle.log_scale)
     R = bundle.pose.R_cam_from_world.T
     translation = bundle.pose.center_world - scale * R @ middle
-    return Alignment(scale, R, translation, np.sqrt(np.diag(adjusted.covariance)), tuple(odd), steps)
+    is_independent = _are_independent(own_covariances, steps)
+    # each pose of a bundle has the errors of the whole: together they tell no more than one
+    covariance = adjusted.covariance * (1.0 if is_independent else len(known))
+    std = np.sqrt(np.diag(covariance))
+    if std[6] > MOST_SCALE:
+        extent = float(np.linalg.norm(np.ptp([own.pose.center_world for own, _ in estimates], axis=0)))
+        found = f"found {len(known)} localized photos within {extent:.2g} m, which tell no scale"
+        wanted = f"{scale:.3g} +- {scale * float(std[6]):.2g}), wanted photos at other places too"
+        raise InputError(f"{model}: {found} ({wanted}")
+    return Alignment(scale, R, translation, std, tuple(odd), steps, is_independent)
+
+
+def _are_independent(covariances: Sequence[Array], steps: Array) -> bool:
+    """Return False if most photos are where the model puts them as no photo is that was localized alone."""
+    deviations = np.sqrt([np.diag(covariance) for covariance in covariances])
+    return bool(np.median(np.abs(steps / deviations).max(axis=1)) > MADE)
 
 
 def _begin(estimates: Sequence[Estimate], errors: RelativeErrors) -> Bundle:

@@ -15,7 +15,7 @@ from ..camera import Calibration, Camera, Mount
 from ..cloud.soa import LocalCloud
 from ..confidence.confidence import LOCALIZED
 from ..errors import InputError, unreadable
-from ..files.atomic import is_stream, write_lines
+from ..files.atomic import is_stream, replacing, write_lines
 from ..geometry.pose import Pose
 from ..panorama import panorama_size
 from ..panorama.gpano import check_size
@@ -255,6 +255,14 @@ def offset_comment(options: Options) -> list[str]:
 def offset_file(out: Path) -> Path:
     """Return the file of the offset beside one that has no place for it."""
     return out.with_name(f"{out.name}.offset.txt")
+
+
+def write_with_offset(out: Path, text: str, options: Options) -> None:
+    """Write a file with the offset beside it: where one can't be written, both stay as they were."""
+    with replacing(out) as file:
+        file.write(text.encode())
+        file.flush()  # a full disk is found here
+        write_offset_beside(out, options)
 
 
 def write_offset_beside(out: Path, options: Options) -> None:

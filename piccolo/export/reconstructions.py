@@ -12,7 +12,7 @@ from ..cloud.writers import vertex_rows, writing_ply
 from ..errors import InputError
 from ..files.atomic import write_atomically
 from ..geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, log_so3, translation, turn_axes
-from .posed_images import Lenses, Options, PosedImage, write_offset_beside
+from .posed_images import Lenses, Options, PosedImage, write_with_offset
 from .scan_points import find_points
 
 FISHEYE = "k1", "k2", "k3", "k4"
@@ -94,8 +94,7 @@ def write_opensfm(images: Sequence[PosedImage], out: Path, options: Options) -> 
         rotation = log_so3(pose.R_cam_from_world).tolist()
         shot = {"rotation": rotation, "translation": translation(pose).tolist(), "camera": number}
         shots[image.name] = shot
-    write_offset_beside(out, options)
-    write_json(out, [{"cameras": cameras, "shots": shots, "points": {}}])
+    write_with_offset(out, json_text([{"cameras": cameras, "shots": shots, "points": {}}]), options)
 
 
 def _opensfm_camera(lens: Camera) -> dict[str, object]:
@@ -121,4 +120,9 @@ def check_shape(image: PosedImage) -> None:
 
 def write_json(out: Path, document: object) -> None:
     """Write a JSON file."""
-    write_atomically(out, (json.dumps(document, indent=1, allow_nan=False) + "\n").encode())
+    write_atomically(out, json_text(document).encode())
+
+
+def json_text(document: object) -> str:
+    """Return a JSON file's content."""
+    return json.dumps(document, indent=1, allow_nan=False) + "\n"

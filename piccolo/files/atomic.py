@@ -20,11 +20,13 @@ from typing import IO
 
 from ..errors import InputError
 
+Errors = type[Exception] | tuple[type[Exception], ...]
 STDOUT = Path("-")
 WRITE_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EPIPE}  # that name no file
 PREFIX = "piccolo-temporary-"
 YOUNG_S = 10.0  # a folder is made a moment before it is locked
 IS_WINDOWS = sys.platform == "win32"
+ROOM = 1 << 16  # [byte] that must fit behind a whole file; more than a block of any file system
 WAITS_S = (0.01, 0.1, 0.5) if IS_WINDOWS else ()  # which replaces no file that somebody reads, for a moment
 
 
@@ -98,7 +100,7 @@ def _in_place_of(path: Path) -> Iterator[tuple[Path, Path]]:
     target = _target_of(path)
     temporary = target.with_name(temporary_prefix(target.name) + secrets.token_hex(8))
     try:
-        with _naming(path, temporary):
+        with naming(path, temporary):
             yield target, temporary
             for wait in WAITS_S:
                 with suppress(PermissionError):
@@ -121,24 +123,30 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
     the new one; its other hard links keep the old content. What is_stream gets the whole content at the end.
     """
     if is_stream(path):
-        with _naming(path), tempfile.TemporaryFile() as file:
+        with naming(path), tempfile.TemporaryFile() as file:
             yield file
             file.seek(0)
             _write_stream(path, file)
         return
-    with _in_place_of(path) as (target, temporary):
-        old = target.stat() if target.exists() else None
-        mode = stat.S_IMODE(old.st_mode) if old else 0o666
-        with open(temporary, "x+b", opener=partial(os.open, mode=mode)) as file:
-            yield file
-            file.flush()
-            if old and not IS_WINDOWS:
-                with suppress(PermissionError):  # where that is not allowed
-                    os.fchown(file.fileno(), old.st_uid, old.st_gid)
-                os.fchmod(file.fileno(), mode)
-            # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
-            # no room, and after a power cut the new name might stand for an empty file.
-            os.fsync(file.fileno())
+    with _in_place_of(path) as (target, temporary), _open_like(target, temporary) as file:
+        yield file
+
+
+@contextmanager
+def _open_like(target: Path, temporary: Path) -> Iterator[IO[bytes]]:
+    """Yield a new file, which at the end has the mode and owner of the target, if that exists."""
+    old = target.stat() if target.exists() else None
+    mode = stat.S_IMODE(old.st_mode) if old else 0o666
+    with open(temporary, "x+b", opener=partial(os.open, mode=mode)) as file:
+        yield file
+        file.flush()
+        if old and not IS_WINDOWS:
+            with suppress(PermissionError):  # where that is not allowed
+                os.fchown(file.fileno(), old.st_uid, old.st_gid)
+            os.fchmod(file.fileno(), mode)
+        # It takes milliseconds. File systems that write late (NFS, quotas) say only now that there is
+        # no room, and after a power cut the new name might stand for an empty file.
+        os.fsync(file.fileno())
 
 
 def _write_stream(path: Path, file: IO[bytes]) -> None:
@@ -155,7 +163,7 @@ def _write_stream(path: Path, file: IO[bytes]) -> None:
 
 
 @contextmanager
-def _naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
+def naming(path: Path, temporary: Path | None = None) -> Iterator[None]:
     """Within this, the system's error while `path` is written names it, and nothing temporary.
 
     That stdout's reader has gone stays an error without a name, as where `print` finds it out.
@@ -180,6 +188,57 @@ def replacing_folder(path: Path) -> Iterator[Path]:
         if target.exists():
             temporary.chmod(stat.S_IMODE(target.stat().st_mode))
             target.rmdir()  # on Windows no folder takes the place of another
+
+
+@contextmanager
+def library_writing(made: Path, errors: Errors = ()) -> Iterator[None]:
+    """Within this, a library writes a file, or files into a folder; OSError at the end unless all are whole.
+
+    Libraries in C++ say nothing, or raise `errors` without a reason, where a disk is full: the system is
+    asked for the reason by writing a little more behind each file.
+    """
+    try:
+        yield
+    except errors as error:
+        _check_whole(made)
+        raise OSError(errno.EIO, " ".join(str(error).split()), str(made)) from error
+    _check_whole(made)
+
+
+def _check_whole(made: Path) -> None:
+    """Raise the system's error, which names the file, if one can't grow; of a folder all files count."""
+    for path in (made, *sorted(made.rglob("*"))):
+        if path.is_file():
+            size = path.stat().st_size
+            with naming(path), path.open("ab") as file:
+                file.write(bytes(ROOM))
+                file.flush()
+                file.truncate(size)
+                os.fsync(file.fileno())  # file systems that write late say only now what has failed
+
+
+@contextmanager
+def replacing_by_library(path: Path, errors: Errors = ()) -> Iterator[Path]:
+    """Yield the name of a file for a library to write, which replaces `path` at the end as by `replacing`."""
+    if is_stream(path):
+        with temporary_folder() as folder, replacing(path) as stream:
+            with library_writing(folder, errors):
+                yield folder / "written"
+            with (folder / "written").open("rb") as written:
+                shutil.copyfileobj(written, stream)
+        return
+    with (
+        _in_place_of(path) as (target, temporary),
+        _open_like(target, temporary),
+        library_writing(temporary, errors),
+    ):
+        yield temporary
+
+
+def write_temporary(path: Path, content: bytes) -> None:
+    """Write a file of a temporary folder, of which half is never seen; the system's error names it."""
+    with naming(path):
+        path.write_bytes(content)
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..arrays import Bytes
 from ..errors import InputError, import_optional
+from ..files.atomic import write_temporary
 from ..jobs.memory import check_memory
 
 SHARPNESS_WIDTH = 512  # [px] at which sharpness is judged
@@ -97,6 +98,6 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
 
 def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFrame:
     path = folder / f"{video.stem}_{round(1000.0 * time):08d}.jpg"
-    if not cv2.imwrite(str(path), cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, QUALITY]):
-        raise OSError(f"{path}: can't be written")
+    bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+    write_temporary(path, cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].tobytes())
     return VideoFrame(time, path)

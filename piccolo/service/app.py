@@ -7,7 +7,6 @@ import secrets
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import fields, replace
-from functools import partial
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
@@ -32,7 +31,7 @@ from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..walk.frames import Motion
 from .asking import apply_options, check_object, clean_name, make_photo, parse_options
-from .desk import Desk, Drawing, Limits, content_of, look_at, open_walk
+from .desk import Desk, Drawing, Limits, WalkDesk, begin_walk, content_of, look_at
 from .guard import COOKIE, Guard, refuse
 
 LOG = logging.getLogger(__name__)
@@ -57,14 +56,14 @@ class Service:
         self.token = token  # which who asks must know; None lets all of this machine ask
         self.desk = open_desk()
         self.num_waiting = 0
-        self.walks: dict[str, tuple[Processes, float]] = {}  # with the time [s] of the last request
+        self.walks: dict[str, WalkDesk] = {}
         self.reopening: asyncio.Task[None] | None = None
 
     def close(self) -> None:
         """End all processes."""
         self.desk.close()
-        for processes, _ in self.walks.values():
-            processes.close()
+        for walk in self.walks.values():
+            walk.close()
 
     async def page(self, request: Request) -> Response:
         """Return the page, or a file of it."""
@@ -136,48 +135,50 @@ class Service:
         options = await read_options(request)
         given = check_object(options.get("motion", {}), {f.name for f in fields(Motion)}, "options.motion")
         settings = self.settings_of(options)
-        for name, (_, used_s) in list(self.walks.items()):
-            if monotonic() - used_s > IDLE_S:
-                self.walks.pop(name)[0].close()
+        for name, walk in list(self.walks.items()):
+            if monotonic() - walk.used_s > IDLE_S:
+                self.walks.pop(name).close()
         if len(self.walks) >= MAX_WALKS:
             raise HTTPException(503, f"found {MAX_WALKS} walks at once, wanted fewer: end one", RETRY)
         localizer = replace(self.desk.localizer, settings=settings)
-        opening = partial(open_walk, localizer, Motion(**given), self.limits.max_pixels)
         name = secrets.token_hex(8)
-        processes = Processes(opening, 1, localizer.num_threads, self.limits.seconds, attempts=1)
-        self.walks[name] = processes, monotonic()
+        self.walks[name] = begin_walk(localizer, Motion(**given), self.limits)
         return JSONResponse({"walk": name}, 201, {"Location": f"/walks/{name}"})
 
     async def follow(self, request: Request) -> Response:
         """Return the line of a walk's next frame, by it and those before; a walk that is lost is over."""
         async with self.asking(request) as frame:
-            name, processes = self.find_walk(request)
-            self.walks[name] = processes, monotonic()
+            name, walk = self.find_walk(request)
+            walk.used_s = monotonic()
+            walk.num_bytes += len(content_of(frame[0]))
+            if walk.num_bytes > self.limits.max_walk_bytes:
+                found = f"found a walk of more than {self.limits.max_walk_bytes} bytes"
+                raise HTTPException(413, f"{found}, wanted it ended: DELETE /walks/{name}")
             try:
-                line = await work(processes, frame)
+                line = await work(walk.processes, frame)
             except HTTPException as error:
                 if error.status_code >= 500:
                     self.walks.pop(name, None)
-                    processes.close()
+                    walk.close()
                 raise
         return Response(line, media_type="application/json")
 
     async def end_walk(self, request: Request) -> Response:
         """Return the lines of all frames of a walk, by all of them; it is over then."""
-        name, processes = self.find_walk(request)
+        name, walk = self.find_walk(request)
         del self.walks[name]
         try:
-            lines = await work(processes, None)
+            lines = await work(walk.processes, None)
         finally:
-            await asyncio.to_thread(processes.close)
+            await asyncio.to_thread(walk.close)
         return Response("".join(f"{line}\n" for line in lines), media_type=LINES)
 
-    def find_walk(self, request: Request) -> tuple[str, Processes]:
-        """Return a walk that has begun and is not over: its name and its process."""
+    def find_walk(self, request: Request) -> tuple[str, WalkDesk]:
+        """Return a walk that has begun and is not over, with its name."""
         name = request.path_params["walk"]
         if name not in self.walks:
             raise HTTPException(404, "found no such walk, wanted one that POST /walks began")
-        return name, self.walks[name][0]
+        return name, self.walks[name]
 
     @asynccontextmanager
     async def asking(self, request: Request) -> AsyncIterator[tuple[Task, float | None]]:

@@ -12,7 +12,7 @@ import numpy as np
 from piccolo import InputError, Pose
 from piccolo.arrays import Bytes
 from piccolo.errors import import_optional
-from piccolo.files.atomic import replacing
+from piccolo.files.atomic import replacing_by_library
 from piccolo.jobs.threads import Workers
 
 from .layout import CHECKS, PLAIN, STRIPES, Room, RoomBuilder, join_rooms
@@ -136,7 +136,7 @@ class Person:
 def writing_video(path: Path, rate: float, size: tuple[int, int]) -> Iterator[Callable[[Bytes], None]]:
     """Yield a function that takes frames (H, W, 3) of an MP4 (H.264), `rate` a second; W and H are even."""
     av = import_optional("video", "av", "video")
-    with replacing(path) as file, av.open(file, "w", format="mp4") as container:
+    with replacing_by_library(path) as file, av.open(str(file), "w", format="mp4") as container:
         stream = container.add_stream("libx264", Fraction(rate).limit_denominator(1001))
         stream.width, stream.height = size
         stream.pix_fmt = "yuv420p"

@@ -4,6 +4,7 @@ The scanner has noise, shadows and uneven density. Light, other cameras, files a
 pictures; photos are cut out of panoramas.
 """
 
+import io
 import itertools
 import math
 import re
@@ -21,6 +22,7 @@ from piccolo.camera import Calibration, Mount
 from piccolo.camera.calibration import compute_extent
 from piccolo.camera.model import camera_of_fov
 from piccolo.errors import InputError
+from piccolo.files.atomic import write_atomically
 from piccolo.geometry.pose import Pose, exp_so3, uniform_rotations, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays, solid_angles
 from piccolo.jobs.threads import Workers
@@ -268,7 +270,9 @@ def write_photo(photo: Photo, path: Path) -> None:
     exif = image.getexif()
     focal_35mm = round(photo.focal_px / math.hypot(*PHOTO_SIZE) * DIAGONAL_35MM)
     exif.get_ifd(EXIF_IFD).update({EXIF_FOCAL_35MM: focal_35mm, EXIF_FOCAL: 4.25})
-    image.save(path, quality=93, exif=exif)
+    file = io.BytesIO()
+    image.save(file, "JPEG", quality=93, exif=exif)
+    write_atomically(path, file.getvalue())
 
 
 def change_sensor(rgb: Bytes, rng: np.random.Generator) -> Bytes:

@@ -352,5 +352,7 @@ def _read_scans(
         for points, values in parts:
             is_return = np.any(points != 0.0, axis=1)
             returned: Array = points[is_return].astype(np.float64, copy=False)
+            # Not held across a yield: another thread may take the next part, and that state is a thread's.
             with np.errstate(invalid="ignore", over="ignore"):  # infinite points are left out later
-                yield transform_points(returned, scan.T_world_from_scanner), values[is_return]
+                points_world = transform_points(returned, scan.T_world_from_scanner)
+            yield points_world, values[is_return]
