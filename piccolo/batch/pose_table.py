@@ -101,7 +101,7 @@ class PoseTable:
         """
         with naming(self.path, WANTED):
             times = np.array(self.column("time") or [], float)
-        if self.column("name") is None:
+        if self.column("name") is None and len(times):
             if not np.all(np.diff(times) > 0.0):
                 row = int(np.argmin(np.diff(times) > 0.0)) + 1
                 found = f"found the time {times[row]:.6f} after {times[row - 1]:.6f}"

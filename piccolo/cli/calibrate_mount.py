@@ -62,16 +62,34 @@ def find_times(
     return [*found]
 
 
-def warn_of_turn(arguments: Arguments, R_cam_from_body: Array) -> bool:
-    """Warn, and return True, if the mount is about the turn between both conventions of axes."""
+def read_table(arguments: Arguments) -> PoseTable:
+    """Return the given poses; those of a trajectory are read as optical ones whatever its axes."""
+    table = read_pose_table(arguments.given)
+    if table.path.suffix.lower() == ".e57":
+        check_suffix("--out", arguments.out, (".e57",))
+    if arguments.axes and not has_axes(table):
+        raise UsageError("--axes: only an option of quaternions; the axes of other files are known")
+    is_named = table.column("name") is not None
+    return replace(table, form=AHEAD) if arguments.axes == "piccolo" and is_named else table
+
+
+def has_axes(table: PoseTable) -> bool:
+    """Return True if a file does not say which axes its poses have."""
+    return table.form.names == QUATERNION.names and table.path.suffix.lower() != ".e57"
+
+
+def warn_of_other_axes(arguments: Arguments, table: PoseTable, R_cam_from_body: Array) -> None:
+    """Warn if the mount is about the turn between both conventions, or the poses are as those of a base."""
+    if not has_axes(table):
+        return
     given = arguments.axes or "optical"
     other, turn = ("optical", OPTICAL_FROM_CAM.T) if given == "piccolo" else ("piccolo", OPTICAL_FROM_CAM)
-    is_turn = angle_between(R_cam_from_body, turn) < math.radians(ALIKE_DEG)
-    if is_turn:
+    if angle_between(R_cam_from_body, turn) < math.radians(ALIKE_DEG):
         angle = math.degrees(float(np.linalg.norm(log_so3(R_cam_from_body))))
         found = f"found a camera turned by {angle:.0f} deg, as {other} axes are from {given} ones"
         arguments.warn([f"{arguments.given}: {found}; if the given poses have those, add --axes {other}"])
-    return is_turn
+    elif not arguments.axes:
+        warn_of_axes(arguments.given, table.poses)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
@@ -79,15 +97,7 @@ def main(arguments: Arguments) -> int:
     """Read, fit, write; returns the exit code."""
     outputs = {"--out": arguments.out}
     check_outputs(outputs, [*arguments.results, arguments.given])
-    table = read_pose_table(arguments.given)
-    if table.path.suffix.lower() == ".e57":
-        check_suffix("--out", arguments.out, (".e57",))
-    has_axes = table.form is QUATERNION and table.path.suffix.lower() != ".e57"
-    if arguments.axes and not has_axes:
-        raise UsageError("--axes: only an option of quaternions; the axes of other files are known")
-    is_base = arguments.axes == "piccolo" and table.column("name") is None
-    if arguments.axes == "piccolo" and not is_base:
-        table = replace(table, form=AHEAD)
+    table = read_table(arguments)
     times = table.times
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
@@ -104,12 +114,11 @@ def main(arguments: Arguments) -> int:
         table.write(arguments.out, poses)
     std = np.sqrt(np.diag(fit.covariance))
     mount = fit.cam_from_body
-    if is_base:  # they were read as optical ones
+    if arguments.axes == "piccolo" and table.form is QUATERNION:  # they were read as optical ones
         mount = mount @ Pose(OPTICAL_FROM_CAM.T, np.zeros(3))
         std[3:6] = np.abs(OPTICAL_FROM_CAM) @ std[3:6]
     R = mount.R_cam_from_world
-    if has_axes and not warn_of_turn(arguments, R) and not arguments.axes:
-        warn_of_axes(arguments.given, table.poses)
+    warn_of_other_axes(arguments, table, R)
     report = {
         "photos": len(sightings),
         "contradicting": list(compress(sightings, fit.is_odd)),

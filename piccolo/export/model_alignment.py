@@ -97,12 +97,17 @@ def fit_alignment(model: Path, results: Sequence[Result]) -> Alignment:
     # each pose of a bundle has the errors of the whole: together they tell no more than one
     covariance = adjusted.covariance * (1.0 if is_independent else len(known))
     std = np.sqrt(np.diag(covariance))
-    if std[6] > MOST_SCALE:
-        extent = float(np.linalg.norm(np.ptp([own.pose.center_world for own, _ in estimates], axis=0)))
-        found = f"found {len(known)} localized photos within {extent:.2g} m, which tell no scale"
-        wanted = f"{scale:.3g} +- {scale * float(std[6]):.2g}), wanted photos at other places too"
-        raise InputError(f"{model}: {found} ({wanted}")
+    _check_scale(model, scale, float(std[6]), estimates)
     return Alignment(scale, R, translation, std, tuple(odd), steps, is_independent)
+
+
+def _check_scale(model: Path, scale: float, std: float, estimates: Sequence[Estimate]) -> None:
+    """Refuse photos so near to each other that the logarithm of the scale has a large deviation."""
+    if std > MOST_SCALE:
+        extent = float(np.linalg.norm(np.ptp([own.pose.center_world for own, _ in estimates], axis=0)))
+        found = f"found {len(estimates)} localized photos within {extent:.2g} m, which tell no scale"
+        wanted = "wanted photos at other places too"
+        raise InputError(f"{model}: {found} ({scale:.3g} +- {scale * std:.2g}), {wanted}")
 
 
 def _are_independent(covariances: Sequence[Array], steps: Array) -> bool:
