@@ -1,4 +1,4 @@
-"""What a photo or its user claims of the photo's geometry, and how far to doubt it when picture and scan differ."""
+"""Claims about a photo's geometry, by itself or its user, and how far to doubt them if picture and scan differ."""
 
 import math
 from typing import NamedTuple
@@ -26,7 +26,7 @@ class Claim(NamedTuple):
         return np.asarray(self.deviations**-2.0)
 
     def contradict(self, values: Array, information: Array) -> tuple[Array, Array]:
-        """Return for each correction (p,) by how many deviations it is wrong if only it is, and their inverse.
+        """Return by how many deviations each correction (p,) is wrong if only it is, and their inverse.
 
         `values` (p,) are those of the picture, `information` (p, p) is the inverse of their covariance. It is
         the score test (Rao, 1948) of each correction, the others as claimed; the inverse deviation is that of
@@ -52,7 +52,10 @@ class Claim(NamedTuple):
 
 
 def marginal(values: Array, information: Array, claim: Claim, k: int) -> tuple[float, float]:
-    """Return value and variance of one correction by the picture, the others as claimed; infinite if unknown."""
+    """Return value and variance of one correction by the picture, the others as claimed.
+
+    The variance is infinite if the picture says nothing of it.
+    """
     precision = claim.precision
     precision[k] = 1e-12
     covariance = np.linalg.inv(information + np.diag(precision))

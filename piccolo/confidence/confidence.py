@@ -86,7 +86,8 @@ def posterior(
     """Return the probabilities (K + 1,) that each of K poses, best first, is right, and that none of them is.
 
     `std_of_fit` is the largest deviation [m] of the best pose with an exact focal length, `within` the
-    probability that it is within 0.1 m if its place is right. The default model is that of the poses' evidence. Right is within 0.1 m and 5 degrees.
+    probability that it is within 0.1 m if its place is right. The default model is that of the poses'
+    evidence. Right is within 0.1 m and 5 degrees.
     Calibrated for queries of which half were taken in the scan. That no pose is right is more likely if the
     best pose's deviation makes 0.1 m doubtful.
     """

@@ -1,9 +1,9 @@
 """The focal length of a photo, fitted with its pose to the scan and to prior knowledge.
 
 Pose and corrections of the lens (`self_calibration`) descend together. Where they end is what photo and scan
-tell; what was given is a claim with deviations of its own. The focal length (and k1, if a guessed camera has it)
-becomes the mean of both; the other corrections are not applied, as photos hardly tell them, but doubted. The
-covariance of the pose is marginal: it includes the errors of all.
+tell; what was given is a claim with deviations of its own. The focal length (and k1, if a guessed camera has
+it) becomes the mean of both; the other corrections are not applied, as photos hardly tell them, but doubted.
+The covariance of the pose is marginal: it includes the errors of all.
 """
 
 import math
@@ -62,7 +62,7 @@ BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is r
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
 LIMIT = 0.4  # of the change by matches
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
-# deviations of corrections by which matches are fitted: of the focal length alone, and of all where descents begin
+# deviations of corrections by which matches are fitted: of the focal length, and of all where descents begin
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 # deviations of corrections, by which matches are fitted
@@ -72,8 +72,8 @@ DISAGREE = 2.0  # deviations between picture and what was given, by which chance
 CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal lengths lie within two deviations
-# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length a
-# right calibration was called wrong in the real corridor of tests/data
+# [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length
+# a right calibration was called wrong in the real corridor of tests/data
 EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
@@ -93,7 +93,7 @@ class FocalFit(NamedTuple):
     conflict: float  # deviations between that and what was given; 0 if it says nothing
     doubt: float = 0.0  # as of FocalLength
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
-    # (6, 6) what all corrections would add if nothing that was given holds; None if the focal length is a guess
+    # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
     of_picture: Array | None = None
 
     @property
@@ -216,8 +216,8 @@ def make_claim(prior: FocalPrior, camera: Camera) -> Claim:
 def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tuple[FreeEnd, FreeEnd]:
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
-    The first descents begin as the photo was taken last and, at first, with other focal lengths; the others at
-    their end, and as matches have it.
+    The first descents begin as the photo was taken last and, at first, with other focal lengths; the others
+    at their end, and as matches have it.
     """
     shown = mask_occluders(query, compare(query, pose))
     corrections = Corrections(query.given.cameras[0])
@@ -282,7 +282,8 @@ def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
-    The last change is applied too, so that what is found lies between what was given and what the picture says.
+    The last change is applied too, so that what is found lies between what was given and what the picture
+    says.
     """
     query, found = follow_matches(query, found)
     fit = fit_focal(query, found.best.pose)
@@ -317,7 +318,7 @@ def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection]:
 def fit_matches(query: Query, pose: Pose, widths: tuple[float, ...] = FOCAL_WIDTHS) -> MatchFit:
     """Fit corrections of the lens and the pose to the matches with the scan drawn at a pose.
 
-    `widths` (5,) are the deviations of the corrections. The loss of a match becomes narrower from step to step.
+    `widths` (5,) are the deviations of the corrections. A match's loss becomes narrower from step to step.
     """
     matches = matches_near(query, pose) if query.uses_matches else NO_MATCHES
     if len(matches.rays) < SURE_MATCHES:

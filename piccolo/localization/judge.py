@@ -62,8 +62,8 @@ FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of t
 MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo; in symmetric scenes it is about 1
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 NOT_AS_CLAIMED = (
-    "the panorama does not show 360 x 180 degrees with the horizon in the middle: give it as it was stitched, "
-    "not cropped or stretched"
+    "the panorama does not show 360 x 180 degrees with the horizon in the middle: give it as it was "
+    "stitched, not cropped or stretched"
 )
 UNCONFIRMED = 0.25  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported

@@ -1,8 +1,8 @@
 """Poses found together with corrections of the photo's geometry, by the loss of the default method.
 
 What a photo says of its own geometry is a claim. The scan's points are displaced as a photo with corrections
-would show them (`camera.corrections`), so that pose and corrections descend together, without a new projection
-of the photo. What fixes the corrections follows from the blocks of the sphere, as for a pose's covariance.
+would show them (`camera.corrections`), so that pose and corrections descend together: no photo is projected
+again. What fixes the corrections follows from the blocks of the sphere, as for a pose's covariance.
 """
 
 from typing import NamedTuple
@@ -26,8 +26,8 @@ FALL = 0.2
 LEAST_DAMPING = 1e-6
 MOST_DAMPING = 1e3
 MASKED_LOSS = 0.25  # of a point on masked pixels, times the square of the loss's scale
-# of the matrix of Gauss and Newton, which ignores that the loss flattens: by 48 crops of three scenes, so that 95 %
-# of true corrections lie within two deviations
+# of the matrix of Gauss and Newton, which ignores that the loss flattens: by 48 crops of three scenes, so that
+# 95 % of true corrections lie within two deviations
 CURVATURE = 0.25
 
 
@@ -137,7 +137,7 @@ def take_step(pose: Pose, step: Array) -> Pose:
 
 
 def estimate_corrections(end: FreeEnd) -> Estimate:
-    """Estimate the corrections by the photo and the scan alone, with the pose free, at the end of a descent."""
+    """Estimate the corrections by photo and scan alone, with the pose free, at the end of a descent."""
     matrix = CURVATURE * end.sums.matrices.sum(axis=0)
     shown = end.sums.weight > 0.0
     gradients = jackknife_gradients(end.sums.gradients[shown], end.sums.matrices[shown])

@@ -1,8 +1,8 @@
-"""What a panorama says of its own geometry, compared with the scan: how much of the sphere it shows, and where.
+"""What a panorama says of its own geometry, compared with the scan: how much of the sphere it shows.
 
 A picture twice as wide as high claims to show 360 by 180 degrees with the horizon in the middle. If rows were
-cut off before it was resized, it does not: walls, floor and ceiling then look nearer or farther together, and a
-pose a few decimetres off fits best. So width, height and horizon descend with the pose. They are taken as
+cut off before it was resized, it does not: walls, floor and ceiling then look nearer or farther together, and
+a pose a few decimetres off fits best. So width, height and horizon descend with the pose. They are taken as
 claimed as long as the photo agrees; else as found, from several starts, and the photo is projected again.
 """
 
@@ -105,7 +105,7 @@ def count_deviations(estimate: Estimate) -> float:
 
 
 def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, SphereFit]:
-    """Compare what a panorama claims with the scan, at the best pose; refine the poses if it shows otherwise."""
+    """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
     camera = whole_sphere(*query.given.rgb.shape[1::-1])
     freedom = make_freedom(camera)
     pose = found.best.pose
