@@ -1,8 +1,8 @@
 """Corrections of a picture's geometry: what it says of itself may be a little wrong, or wrong altogether.
 
-A picture claims how its pixels map to rays, by a calibration, or as a sphere that shows 360 by 180 degrees with
-the horizon in the middle. Corrections act in the plane of the picture, (x, y) = (pixel - centre) / focal length;
-of a sphere these are the azimuth to the right and the angle below the horizon [rad]:
+A picture claims how its pixels map to rays, by a calibration, or as a sphere that shows 360 by 180 degrees
+with the horizon in the middle. Corrections act in the plane of the picture, (x, y) = (pixel - centre) / focal
+length; of a sphere these are the azimuth to the right and the angle below the horizon [rad]:
     of a lens      x' = x exp(f) (1 + k r2) + cx,   y' = y exp(f + a) (1 + k r2) + cy,   r2 = x^2 + y^2;
     of a sphere    x' = x exp(w),                   y' = y exp(h) + cy.
 A sphere cut to 1 / exp(h) of its height and resized is one with h > 0; cy is where its horizon lies.

@@ -1,4 +1,4 @@
-"""Claims about a photo's geometry, by itself or its user, and how far to doubt them if picture and scan differ."""
+"""Claims about a photo's geometry, and how far to doubt them if picture and scan differ."""
 
 import math
 from typing import NamedTuple

@@ -89,8 +89,8 @@ def probability_within(found: PoseGaussian | None) -> float:
 def probability_of_ball(covariance: Array, radius: float) -> float:
     """Return the probability that an error (3,) of mean zero with a covariance (3, 3) is within a radius [m].
 
-    Across the axis of the greatest variance it is the mean over directions of two standard normal numbers, each
-    of which has 1 - exp(-r^2 / 2 v); along that axis it is integrated by Gauss and Legendre.
+    Across the axis of the greatest variance it is the mean over directions of two standard normal numbers,
+    each of which has 1 - exp(-r^2 / 2 v). Along that axis it is integrated by Gauss and Legendre.
     """
     variances = np.maximum(np.linalg.eigvalsh(covariance), LEAST_VARIANCE)
     std = math.sqrt(variances[2])
