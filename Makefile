@@ -2,6 +2,7 @@
 # make test          set up, run every test but those of the report's page
 # make test-kernels  set up, run the numerical tests once without compiling and once with array bounds checked
 # make test-browser  set up, run the tests of the report's page in Chromium (apt-get install chromium npm)
+# make test-wide     set up, try what photos and scans say wrongly of themselves; not in CI, some twenty minutes
 # make check         set up, lint, format and types
 # make check-page    the same of the report's page, and that its bundle is made from its sources (Node 20)
 # make clean         remove what these made
@@ -10,7 +11,7 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-kernels test-browser check check-page clean
+.PHONY: demo test test-kernels test-browser test-wide check check-page clean
 
 $(VENV)/ready: requirements.lock requirements-formats.lock requirements-gps.lock requirements-plans.lock requirements-colmap.lock requirements-serve.lock requirements-rerun.lock requirements-cluster.lock requirements-video.lock requirements-dev.lock
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "found $$($(PYTHON) --version), wanted Python 3.11 or newer: make PYTHON=python3.11" >&2; exit 1; }
@@ -35,6 +36,10 @@ KERNELS := channel_loss cone cloud_morton cloud_octree cloud_profiles p3p pose s
 test-kernels: $(VENV)/ready
 	NUMBA_DISABLE_JIT=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)
 	NUMBA_BOUNDSCHECK=1 $(BIN)/python -m pytest -n auto --dist loadfile $(KERNELS:%=tests/test_%.py)
+
+test-wide: $(VENV)/ready
+	@mkdir -p demo
+	$(BIN)/python tools/benchmark.py confidence --claims --seeds 0 3 --scenes examples/flat --out demo/wide.jsonl
 
 test-browser: $(VENV)/browser page/node_modules/ready
 	$(BIN)/python -m pytest browser_tests

@@ -7,7 +7,7 @@ A photo's way from its file to a result:
 4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`), or
    draws the scan at poses that are known (`verification`), until one is sure (`selection.is_sure`);
 5. `last_descent.refine_best` refines the best poses to the end and selects among them (`selection.select`);
-6. `focal_length.calibrate` fits the focal length of a photo of one camera;
+6. `focal_length.calibrate` or `sphere.calibrate_sphere` compares what the photo says of its geometry;
 7. `judge.judge` measures the best pose, its covariance (`covariance`) and its probability, and decides;
 8. `result.with_localization` makes the result in the world, which a command writes.
 `judge` tells how photos help each other, and what each way hands over.

@@ -4,18 +4,17 @@ import json
 from argparse import ArgumentParser
 from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
-from typing import NamedTuple
 
 import cv2
 import numpy as np
 
 from piccolo import CoarseToFineSettings, Photo
-from piccolo.arrays import Bytes, Floats, Mask, Values
+from piccolo.arrays import Bytes, Values
 from piccolo.cli.command import Arguments, option
 from piccolo.cloud.stream import open_cloud, stream_of_arrays
 from piccolo.confidence.localization import Localization
 from piccolo.geometry.nearness import RIGHT
-from piccolo.geometry.pose import Gravity, Pose
+from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers, num_cores
 from piccolo.localization.localize import localize
 from piccolo.panorama import read_panorama
@@ -26,6 +25,7 @@ from ..synthetic import world as worlds
 from ..synthetic.layout import PLAIN
 from ..synthetic.places import ALIKE_KINDS, CHANGED, make_alike
 from .calibration import Case, print_cases
+from .claims import Points, Trial, claim_trials
 
 EPILOG = """\
 example:
@@ -43,18 +43,6 @@ PHOTO_FOVS_DEG = 55.0, 90.0  # of phone photos
 POINT_NOISE = 0.05  # [m]
 JPEG_QUALITY = 10
 FOVS_DEG = (90.0, 120.0, 65.0)  # of narrow photos
-Points = tuple[Floats, Bytes]
-
-
-class Trial(NamedTuple):
-    """A photo to be localized."""
-
-    case: str
-    rgb: Bytes  # (H, W, 3)
-    true_pose: Pose | None  # None if it was not taken in the scan, or not as a camera would
-    gravity: Gravity = "auto"
-    is_masked: Mask | None = None  # (H, W) what the photo does not show
-    focal_px: float | None = None  # of a pinhole photo; None for a sphere
 
 
 def damage_trial(trial: Trial, other: Bytes, rng: np.random.Generator) -> Iterator[Trial]:
@@ -207,13 +195,22 @@ def photo_trials(scene: Scene, others: Sequence[Scene], number: int) -> Iterator
 def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Points, list[Trial]]]:
     """Yield the name of a scene, its points, its trials."""
     for seed in range(*arguments.seeds):
-        alike = alike_trials(seed, arguments.kinds, workers)
-        for points, trials in chain(room_trials(seed, workers), alike):
+        rooms = list(room_trials(seed, workers))
+        if arguments.claims:
+            rooms = list(claim_trials(rooms[0][0], rooms[0][1][:2], np.random.default_rng([seed, 55])))
+        alike = () if arguments.claims else alike_trials(seed, arguments.kinds, workers)
+        for points, trials in chain(rooms, alike):
             yield f"seed {seed}", points, trials
     scenes = [read_scene(folder) for folder in arguments.scenes]
     for scene in scenes:
         others = [other for other in scenes if other is not scene]
         number = arguments.photos
+        if arguments.claims:
+            points, own = next(scene_trials(scene, ()))
+            spheres = [trial for trial in own if trial.case == "clean"][:2]
+            for changed, trials in claim_trials(points, spheres, np.random.default_rng(55)):
+                yield scene.name, changed, trials
+            continue
         of_scene = photo_trials(scene, others, number) if number else scene_trials(scene, others)
         for points, trials in of_scene:
             yield scene.name, points, trials
@@ -222,8 +219,8 @@ def all_trials(arguments: Arguments, workers: Workers) -> Iterator[tuple[str, Po
 def localize_trial(scan_map: ScanMap, trial: Trial, workers: Workers) -> Localization:
     """Localize the photo of a trial."""
     settings = CoarseToFineSettings(gravity=trial.gravity)
-    photo = read_panorama(Photo(trial.rgb, focal_px=trial.focal_px, mask=trial.is_masked))
-    return localize(scan_map, photo, settings, workers, Stopwatch())
+    photo = Photo(trial.rgb, focal_px=trial.focal_px, camera=trial.calibration, mask=trial.is_masked)
+    return localize(scan_map, read_panorama(photo), settings, workers, Stopwatch())
 
 
 def trial_line(scene: str, trial: Trial, found: Localization) -> dict[str, object]:
@@ -251,6 +248,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(parser, "--kinds KIND ...", text, choices=ALIKE_KINDS, default=list(ALIKE_KINDS))
     option(parser, "--scenes FOLDER ...", "scenes with true poses", default=[])
     option(parser, "--photos N", "cut so many photos out of each panorama of the scenes", default=0)
+    option(parser, "--claims", "try photos and scans that say something wrong of their own geometry instead")
     option(parser, "--ignore-colors", "localize by the shape of the scans alone")
     option(parser, "--out FILE", "write a JSON line per trial", required=True)
     option(parser, "--threads N", "number of threads", default=num_cores())

@@ -28,7 +28,8 @@ from ..evaluation.query_result import QueryResult
 from ..evaluation.tables import Table, count_rows, reliability_table
 from ..scene import Query, Scene, read_scene
 from ..synthetic.world import PHOTO_FOV_DEG, cut_photo, make_query, make_world, write_photo
-from .confidence import DAMAGED_SCANS, Points, Trial, damage_trial
+from .claims import Points, Trial
+from .confidence import DAMAGED_SCANS, damage_trial
 from .speed import clean_queries, kernel_table, size_table
 
 EPILOG = """\

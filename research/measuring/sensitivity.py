@@ -22,7 +22,8 @@ from piccolo.scan_map.scan_map import ScanMap, prepare_map
 
 from ..evaluation.tables import table_of
 from ..scene import read_scene
-from .confidence import Trial, localize_trial, photo_trials, room_trials, scene_trials
+from .claims import Trial
+from .confidence import localize_trial, photo_trials, room_trials, scene_trials
 
 EPILOG = """\
 example:
@@ -42,7 +43,7 @@ CONSTANTS: dict[str, tuple[str, ...]] = {
     "localization.beam": ("FAINT_PART", "FIRST_STARTS", "NUM_FOUND", "NUM_SCORED"),
     "localization.comparison": ("LEAST_SHARED",),
     "localization.covariance": ("MOST_SCORE", "PIXEL_SHARE", "UNCALIBRATED_SHARE"),
-    "localization.focal_length": ("CLEARLY", "EDGE_ERROR", "INFLATION", "MATCHED_DEVIATION", "LAST_REACH"),
+    "localization.focal_length": ("CLEARLY", "INFLATION", "MATCHED_DEVIATION"),
     "localization.judge": ("ENOUGH_EXPLAINED", "MIRROR_RATIO", "WORTH_ASKING"),
     "localization.ladder": ("MAX_PERTURBATIONS", "MIN_GAIN", "PERTURBED_ANGLE", "PERTURBED_DISTANCE"),
     "localization.last_descent": ("NEAR_SCORE",),
