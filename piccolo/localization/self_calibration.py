@@ -26,8 +26,8 @@ FALL = 0.2
 LEAST_DAMPING = 1e-6
 MOST_DAMPING = 1e3
 MASKED_LOSS = 0.25  # of a point on masked pixels, times the square of the loss's scale
-# of the matrix of Gauss and Newton, which ignores that the loss flattens: so that 95 % of true corrections, of
-# 48 crops of three scenes, lie within two deviations
+# of the matrix of Gauss and Newton, which ignores that the loss flattens: with it, 95 % of true corrections
+# of 48 crops of three scenes lie within two deviations
 CURVATURE = 0.25
 
 

@@ -1,4 +1,4 @@
-"""Photos and scans that say something wrong of their own geometry: bent panoramas, calibrations, doubled scans."""
+"""Photos and scans that are not as they say: bent panoramas, wrong calibrations, doubled scans."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -37,7 +37,7 @@ class Trial(NamedTuple):
 
 
 def bend(trial: Trial) -> Iterator[Trial]:
-    """Yield a panorama that shows less or more than the whole sphere, or another horizon, as if it did not."""
+    """Yield a panorama that shows less or more than the sphere, or another horizon, as if it did not."""
     rgb = trial.rgb
     height, width = rgb.shape[:2]
 
@@ -52,10 +52,8 @@ def bend(trial: Trial) -> Iterator[Trial]:
         yield change(f"moved down by {degrees:g} deg", np.roll(rgb, round(degrees / 180.0 * height), axis=0))
     for share in WIDTHS:
         side = round(0.5 * (share - 1.0) * width)
-        wider = (
-            np.concatenate([rgb[:, -side:], rgb, rgb[:, :side]], axis=1) if side > 0 else rgb[:, -side:side]
-        )
-        yield change(f"{share:.0%} of a turn", wider)
+        turned = np.concatenate([rgb[:, -side:], rgb, rgb[:, :side]], axis=1)
+        yield change(f"{share:.0%} of a turn", turned if side > 0 else rgb[:, -side:side])
 
 
 def miscalibrate(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
