@@ -179,7 +179,7 @@ def _check_lens(image: PosedImage, lenses: Lenses, name: str) -> None:
     more = [name for name, value in lens.distortion._asdict().items() if value and name not in known]
     if more or lens.lens not in lenses:
         wanted = f"wanted {' '.join(known) or 'another'} for {name}"
-        raise InputError(f"{image.path}: found the model {lens.model} {' '.join(more)}, {wanted}")
+        raise InputError(f"{image.path}: found the model {' '.join([lens.model, *more])}, {wanted}")
 
 
 def _time(result: Result, path: Path, index: int, options: Options) -> str:

@@ -95,6 +95,7 @@ class FocalFit(NamedTuple):
     of_rest: Array | None = None  # (6, 6) what the other corrections add to the covariance of a pose
     # (6, 6) what all corrections would add if nothing that was given holds; None of a guess
     of_picture: Array | None = None
+    contradicted: str = "log_focal"  # the correction of LENS in which both differ most
 
     @property
     def deviation(self) -> float:
@@ -155,20 +156,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    conflicts = [claim.conflict(*told[:2]) for told in (estimate, free)]
-    doubts = [claim.doubt(*told[:2]) for told in (estimate, free)]
-    conflict = max(conflicts)
-    precision = claim.precision
-    wide = precision.copy()
-    if opinion is not None:
-        # of the prior's variance, as by DerSimonian and Laird (1986)
-        excess = 0.0 if prior.is_measured else max(off**2 - variance - prior.deviation**2, 0.0)
-        wide[FOCAL] = 1.0 / (prior.deviation**2 + excess)
-    if conflict > DISAGREE:
-        precision = wide  # the picture says where to look next
-    goal = information @ values + precision * claim.expected
-    change = np.linalg.inv(information + np.diag(precision)) @ goal
-    total = np.linalg.inv(information + np.diag(wide))
+    tests = [claim.contradict(*told[:2])[0] for told in (estimate, free)]
+    worst = np.abs(tests).max(axis=0)
+    change, total = average(prior, claim, estimate, opinion, float(worst.max()))
     fitted = FITTED if fits_radial(prior, camera) else FITTED[:1]
     rest = [k for k in range(len(values)) if k not in fitted]
     spread = total[np.ix_(rest, rest)] + np.outer(change[rest], change[rest])
@@ -177,11 +167,32 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         np.asarray(total[np.ix_(fitted, fitted)]),
         motion[:, fitted],
         opinion,
-        conflict,
-        max(doubts),
+        float(worst.max()),
+        max(claim.doubt(*told[:2]) for told in (estimate, free)),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
+        LENS[int(worst.argmax())],
     )
+
+
+def average(
+    prior: FocalPrior, claim: Claim, estimate: Estimate, opinion: Opinion | None, conflict: float
+) -> tuple[Array, Array]:
+    """Return the mean (5,) of picture and claim, and its covariance (5, 5).
+
+    The variance of a focal length that was given grows by what both disagree too much.
+    """
+    precision = claim.precision
+    wide = precision.copy()
+    if opinion is not None:
+        # as by DerSimonian and Laird (1986)
+        excess = max(opinion.off**2 - opinion.variance - prior.deviation**2, 0.0)
+        wide[FOCAL] = 1.0 / (prior.deviation**2 + (0.0 if prior.is_measured else excess))
+    if conflict > DISAGREE:
+        precision = wide  # the picture says where to look next
+    goal = estimate.information @ estimate.values + precision * claim.expected
+    change = np.linalg.inv(estimate.information + np.diag(precision)) @ goal
+    return change, np.asarray(np.linalg.inv(estimate.information + np.diag(wide)))
 
 
 def find_errors_of_picture(estimate: Estimate, claim: Claim) -> Array:

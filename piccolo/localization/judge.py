@@ -65,6 +65,12 @@ NOT_AS_CLAIMED = (
     "the panorama does not show 360 x 180 degrees with the horizon in the middle: give it as it was "
     "stitched, not cropped or stretched"
 )
+OTHERS = {  # corrections of a lens besides its focal length, in words
+    "log_aspect": "ratio of its focal lengths",
+    "center_x": "principal point",
+    "center_y": "principal point",
+    "radial": "distortion",
+}
 UNCONFIRMED = 0.25  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
@@ -325,13 +331,20 @@ def explain_doubts(panorama: Panorama, fit: Fit) -> tuple[str, ...]:
         return (NOT_AS_CLAIMED,) if fit.conflict > MOST_CONFLICT else ()
     focal = fit.focal_length(panorama)
     if fit.conflict > MOST_CONFLICT:
-        return (contradict("the picture has", focal, focal.px),)
+        return (explain_conflict(fit.contradicted, focal),)
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
     if std <= TELLING_STD:
         return ()
     found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
     given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
     return (f"{found} ({given}): the position is uncertain by {std:.2f} m",)
+
+
+def explain_conflict(correction: str, focal: FocalLength) -> str:
+    """Return a warning that a photo's geometry is not as it was given."""
+    if correction in OTHERS:
+        return f"the picture has another {OTHERS[correction]} than was given: check {focal.source}"
+    return contradict("the picture has", focal, focal.px)
 
 
 def is_mirrored(query: Query, best: Hypothesis) -> bool:
