@@ -21,11 +21,11 @@ from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
 from .comparison import score_pose
-from .covariance import fuse_allowed, split_errors
+from .covariance import split_errors
 from .judge import judge, reconsider, take_pose
 from .last_descent import refine_best
 from .localize import Found, fit_camera
-from .prior import apply_prior
+from .prior import apply_prior, contradictions
 from .query import Query, prepare_query
 from .settings import CoarseToFineSettings
 from .verification import SURE_MATCHES, Located, match_beside, match_covariance, place_keypoints
@@ -148,3 +148,9 @@ def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor,
     if not found or found[0].num_matches < SURE_MATCHES:
         return None
     return Neighbor(name, picture, matches, found[0].pose), found[0].num_matches
+
+
+def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
+    """Return the mean of two estimates of a pose in the map; None if it contradicts the prior."""
+    fused = one.fuse(other)
+    return None if contradictions(query.scan_map, fused.pose, query.settings.prior) else fused

@@ -23,7 +23,7 @@ from .prior import contradictions
 from .query import Query
 from .scan_errors import layer_covariance, scan_covariance
 from .settings import ImageName
-from .verification import place_by_matches
+from .verification import SURE_MATCHES, count_agreeing, place_by_matches
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
@@ -337,24 +337,23 @@ def estimate_errors(query: Query, pose: Pose) -> Errors:
     """Estimate the errors of a pose in the map that a photo has by itself.
 
     The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan,
-    unless that contradicts the prior.
+    unless that contradicts the prior. Where the points do not fix it, many matches do.
     """
     errors = estimate_covariance(query, pose, compare(query, pose))
     by_matches = place_by_matches(query, pose) if query.is_narrow else None
-    if errors.gaussian is None or by_matches is None:
-        return errors
-    fused = fuse_allowed(query, errors.gaussian, PoseGaussian(*by_matches, errors.gaussian.common))
-    if fused is None:
+    if by_matches is None:
         return errors
     median_range = compute_median_range(query.view_at(pose, "points"))
     of_layers = layer_covariance(query.scan_map, pose, median_range)
-    return Errors(fused, largest_std(fused.covariance - of_layers))
-
-
-def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
-    """Return the mean of two estimates of a pose in the map; None if it contradicts the prior."""
-    fused = one.fuse(other)
-    return None if contradictions(query.scan_map, fused.pose, query.settings.prior) else fused
+    if errors.gaussian is not None:
+        found = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
+    elif count_agreeing(query, pose) >= SURE_MATCHES:
+        found = PoseGaussian(*by_matches, scan_covariance(query.scan_map, median_range) + of_layers)
+    else:
+        return errors
+    if contradictions(query.scan_map, found.pose, query.settings.prior):
+        return errors
+    return Errors(found, largest_std(found.covariance - of_layers))
 
 
 def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:
