@@ -215,6 +215,7 @@ def test_attempts_are_made_until_one_is_sure(monkeypatch, sure, num_made):
 
     monkeypatch.setattr(method, "plan_attempts", plan)
     monkeypatch.setattr(method, "refine_best", lambda query, found: found)
+    monkeypatch.setattr(method, "fit_camera", lambda query, found: method.Found(query, found, None))
     monkeypatch.setattr(method, "judge", lambda query, found, fit: (len(query.features), found))
     how = rooms.AUTO, Workers(1), Stopwatch()
     num_parts, found = method.localize(rooms.scan_map(1), rooms.scene(1)[1], *how)

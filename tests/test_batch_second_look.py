@@ -58,7 +58,7 @@ def test_a_doubtful_photo_is_sure_beside_another(tmp_path):
     out = tmp_path / "poses.jsonl"
     photos.mkdir()
     cameras.mkdir()
-    for name, focal, at in (("narrow", 165.0, near), ("wide", 100.0, pose)):
+    for name, focal, at in (("narrow", 165.0, near), ("wide", 90.0, pose)):
         camera = Mount(pinhole(320, 240, focal))
         write(photos / f"{name}.png", encoded(render_picture(camera, room, at, Workers(2)), ".png"))
         write(cameras / f"{name}.camera.json", json.dumps(document_of((camera,))).encode())

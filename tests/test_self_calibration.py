@@ -234,7 +234,7 @@ def test_a_claim_that_holds_widens_a_pose_by_what_picture_and_claim_leave_open()
     blind = held._replace(estimate=sharp._replace(information=np.zeros((3, 3))))
     assert math.sqrt(blind.pose_covariance[5, 5]) == pytest.approx(4.0 * CLAIM.deviations[2], rel=0.01)
     off = held._replace(estimate=sharp._replace(values=np.array([0.0, 0.0, 0.002])))
-    assert math.sqrt(off.pose_covariance[5, 5]) == pytest.approx(0.008, rel=0.01)
+    assert math.sqrt(off.pose_covariance[5, 5]) == pytest.approx(0.008, rel=0.03)
     assert count_deviations(off.estimate) == pytest.approx(0.002 / CLAIM.deviations[2], rel=0.01)
 
 

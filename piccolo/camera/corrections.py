@@ -35,7 +35,7 @@ class Displaced(NamedTuple):
 
 @dataclass(frozen=True)
 class Corrections:
-    """What may be corrected of the camera that took a picture; its `names` are LENS or OF_SPHERE."""
+    """Corrections of the camera that took a picture; their `names` are LENS or OF_SPHERE."""
 
     mount: Mount
 

@@ -277,8 +277,8 @@ class Camera:
         down = -rays[..., 2]
         across = np.sqrt(right * right + down * down)
         if self.lens == PARTIAL_SPHERE:
-            angles = np.arctan2(right, forward), np.arctan2(down, np.hypot(forward, right))
-            return self._place(*angles, np.ones(forward.shape, np.bool_))
+            below = np.arctan2(down, np.hypot(forward, right))
+            return self._place(np.arctan2(right, forward), below, np.ones(forward.shape, np.bool_))
         if self.lens == PERSPECTIVE:
             is_in = (forward > 0.0) & (across <= math.tan(self.max_angle) * forward)
             per = 1.0 / np.where(is_in, forward, np.inf)

@@ -73,7 +73,7 @@ class FocalLength:
 
 @dataclass(frozen=True)
 class SphereGeometry:
-    """What a panorama shows of the sphere, and where its horizon lies."""
+    """The part of the sphere that a panorama shows, and where its horizon lies."""
 
     width_deg: float  # 360 of a whole sphere
     height_deg: float  # 180 of a whole sphere

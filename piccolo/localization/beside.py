@@ -22,6 +22,7 @@ from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
 from .comparison import score_pose
 from .covariance import split_errors
+from .focal_length import FocalFit
 from .judge import judge, reconsider, take_pose
 from .last_descent import refine_best
 from .localize import Found, fit_camera
@@ -92,7 +93,10 @@ def localize_beside(
         poses = [*known, *(other.pose for other in found)]
         hypotheses = add_verified(query, [score_pose(query, pose) for pose in poses])
         ended = fit_camera(query, refine_best(query, hypotheses))
-        judged = judge(ended.query, ended.selection, ended.fit)
+        fit = ended.fit
+        if isinstance(fit, FocalFit):  # the photo beside confirms the pose
+            fit = fit._replace(of_picture=None)
+        judged = judge(ended.query, ended.selection, fit)
         kept = list_agreeing(judged, found, ended.query.beside, scan_map)
         if not kept:
             return Localization(), ()

@@ -77,7 +77,7 @@ INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal leng
 EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
-MAX_CALIBRATIONS = 4  # fits of a focal length after the first
+MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 17  # [px] of the sphere, around a point that shows nothing beyond the picture
 NEAR = Limits(1.0, 8, 1e-3)  # on fine cells, from another focal length
 CLOSE = Limits(0.7, 15, 1e-4)
@@ -298,14 +298,27 @@ def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFi
     """
     query, found = follow_matches(query, found)
     fit = fit_focal(query, found.best.pose)
-    for num_left in range(MAX_CALIBRATIONS, -1, -1):
+    for _ in range(MAX_CALIBRATIONS):
         if fit.is_at_rest:
             break
         query, found = refine_with(query, found, fit.change, fit.move(found.best.pose))
-        if num_left == 0:
-            return query, found, fit._replace(change=np.zeros_like(fit.change))
         fit = fit_focal(query, found.best.pose, is_first=False)
-    return query, found, fit
+    left = find_change_left(query.given, fit)
+    if left.any():
+        query, found = refine_with(query, found, left, add(found.best.pose, fit.motion @ left))
+    return query, found, fit._replace(change=fit.change - left)
+
+
+def find_change_left(panorama: Panorama, fit: FocalFit) -> Array:
+    """Return the change (p,) that brings the focal length between those of the picture and of the prior."""
+    prior = panorama.focal_prior
+    assert prior is not None
+    left = np.zeros_like(fit.change)
+    if fit.opinion is not None:
+        now = math.log(panorama.cameras[0].camera.focal[0] / prior.focal)
+        least, most = sorted((0.0, fit.opinion.off))
+        left[0] = min(max(now, least), most) - now
+    return left
 
 
 def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tuple[Query, Selection]:

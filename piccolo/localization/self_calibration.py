@@ -136,9 +136,9 @@ def take_step(pose: Pose, step: Array) -> Pose:
     return Pose(orthonormal(exp_so3(step[:3]) @ R), pose.center_world + R.T @ step[3:NUM_OF_POSE])
 
 
-def estimate_corrections(end: FreeEnd) -> Estimate:
+def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> Estimate:
     """Estimate the corrections by photo and scan alone, with the pose free, at the end of a descent."""
-    matrix = CURVATURE * end.sums.matrices.sum(axis=0)
+    matrix = curvature * end.sums.matrices.sum(axis=0)
     shown = end.sums.weight > 0.0
     gradients = jackknife_gradients(end.sums.gradients[shown], end.sums.matrices[shown])
     inverse = np.linalg.pinv(matrix)

@@ -1,4 +1,4 @@
-"""What a panorama says of its own geometry, compared with the scan: how much of the sphere it shows.
+"""The geometry that a panorama claims, compared with the scan: how much of the sphere it shows.
 
 A picture twice as wide as high claims to show 360 by 180 degrees with the horizon in the middle. If rows were
 cut off before it was resized, it does not: walls, floor and ceiling then look nearer or farther together, and
@@ -35,6 +35,8 @@ CLAIM = Claim(
     wrong_deviations=np.array([0.05, 0.1, 0.1]),  # chosen
     wrong_shares=np.array([0.005, 0.005, 0.005]),  # chosen
 )
+CURVATURE = 0.5  # as of `self_calibration`, but of whole panoramas, whose loss flattens less
+BY_CHANCE = 12.0  # squared deviations of the corrections together that a right claim may have
 MOST = np.array([0.2, 0.6, 0.4])  # corrections that are searched
 ANY = np.full(3, np.inf)
 SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
@@ -54,7 +56,7 @@ MOST_ROUNDS = 3
 
 
 class SphereFit(NamedTuple):
-    """How a panorama shows the sphere."""
+    """The geometry of a panorama, with its errors."""
 
     camera: Camera  # as found, or as claimed
     estimate: Estimate  # corrections of that by the photo and the scan alone
@@ -72,9 +74,10 @@ class SphereFit(NamedTuple):
     def pose_covariance(self) -> Array:
         """Covariance (6, 6) that the geometry adds to a pose: rotation, then centre in the map."""
         covariance = self.covariance
-        off = covariance @ self.estimate.information @ self.estimate.values  # which is not applied
-        motion = self.estimate.motion
-        return np.asarray(motion @ (covariance + np.outer(off, off)) @ motion.T)
+        values, information, motion = self.estimate
+        off = covariance @ information @ values  # which is not applied
+        beyond = max(1.0 - BY_CHANCE / max(float(values @ information @ values), BY_CHANCE), 0.0)
+        return np.asarray(motion @ (covariance + beyond * np.outer(off, off)) @ motion.T)
 
     def describe(self) -> SphereGeometry:
         """Return what the panorama shows of the sphere."""
@@ -114,13 +117,16 @@ def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, 
         partial(descend_on_cells, query, pose, freedom, NO_CORRECTION, CHECK),
         partial(descend_on_points, shown, pose, freedom, NEAR),
     )
-    coarse, near = query.workers.map(lambda way: estimate_corrections(way()), ways, "fit the panorama")
+    coarse, near = query.workers.map(
+        lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama"
+    )
     is_suspect = count_deviations(coarse) > SUSPECT
     other = retake_as_found(query, found, camera) if is_suspect else None
     if other is not None:
         return other
-    told = coarse.values, coarse.information
-    return query, found, SphereFit(camera, near, True, CLAIM.conflict(*told), CLAIM.doubt(*told))
+    conflict = CLAIM.conflict(coarse.values, coarse.information)
+    doubt = CLAIM.doubt(coarse.values, coarse.information)
+    return query, found, SphereFit(camera, near, True, conflict, doubt)
 
 
 def retake_as_found(
@@ -128,7 +134,7 @@ def retake_as_found(
 ) -> tuple[Query, Selection, SphereFit] | None:
     """Search other geometries; return the query with the one that explains clearly more, refined, or None."""
     end = search_geometry(query, found.best.pose, claimed)
-    if count_deviations(estimate_corrections(end)) < CONTRADICTED:
+    if count_deviations(estimate_corrections(end, CURVATURE)) < CONTRADICTED:
         return None
     given = query.given
     camera = claimed
@@ -144,7 +150,7 @@ def retake_as_found(
             break
     if best.best.score < MIN_GAIN * found.best.score:
         return None
-    return query, best, SphereFit(camera, estimate_corrections(end), is_claimed=False)
+    return query, best, SphereFit(camera, estimate_corrections(end, CURVATURE), is_claimed=False)
 
 
 def descend_on_cells(query: Query, pose: Pose, freedom: Freedom, values: Array, limits: Limits) -> FreeEnd:

@@ -63,7 +63,8 @@ def miscalibrate(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
     photo = worlds.cut_photo(trial.rgb, trial.true_pose, rng.uniform(*FOVS_DEG), rng)
     height, width = photo.rgb.shape[:2]
     focal = photo.focal_px
-    x, y = 0.5 * width, 0.5 * height
+    x = 0.5 * width
+    y = 0.5 * height
 
     def change(case: str, model: str, *params: float) -> Trial:
         camera = Camera(model, width, height, params)
@@ -74,8 +75,9 @@ def miscalibrate(trial: Trial, rng: np.random.Generator) -> Iterator[Trial]:
         yield change(f"focal length x {factor:g}", "PINHOLE", factor * focal, factor * focal, x, y)
     for factor in ASPECTS:
         yield change(f"aspect x {factor:g}", "PINHOLE", focal, factor * focal, x, y)
-    off = x + CENTER[0] * width, y + CENTER[1] * height
-    yield change("principal point off", "PINHOLE", focal, focal, *off)
+    right = x + CENTER[0] * width
+    down = y + CENTER[1] * height
+    yield change("principal point off", "PINHOLE", focal, focal, right, down)
     yield change("as a fisheye", "FISHEYE", focal, focal, x, y)
 
 
