@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from piccolo.cli import report
-from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.settings import BY_FILE
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
@@ -22,7 +22,7 @@ PHONE = {"width": 390, "height": 844, "device_scale_factor": 2, "has_touch": Tru
 @pytest.fixture(scope="module")
 def scan(demo):
     """The room's points (N, 3), and where its first photo was taken."""
-    cloud = open_points([demo[0] / "cloud.ply"], IN_METRES, Workers(2))
+    cloud = open_points([demo[0] / "cloud.ply"], BY_FILE, Workers(2))
     result = read_results([demo[0] / "poses.jsonl"])[0]
     return cloud.points.stack() + cloud.origin_world, result.pose.center_world, Path(result.pano).name
 

@@ -9,7 +9,7 @@ import pytest
 from report_scenes import HOSTILE
 
 from piccolo.camera.model import pinhole
-from piccolo.cloud.settings import IN_METRES
+from piccolo.cloud.settings import BY_FILE
 from piccolo.jobs.threads import Workers
 from piccolo.result import read_results
 from piccolo.scan_map.open_map import open_points
@@ -52,7 +52,7 @@ def _correlation(one, other):
 def test_sphere_and_scan_are_aligned_with_render_pose(demo, open_page, shoot):
     folder, index = demo
     result = read_results([folder / "poses.jsonl"])[0]
-    cloud = open_points([folder / "cloud.ply"], IN_METRES, Workers(2))
+    cloud = open_points([folder / "cloud.ply"], BY_FILE, Workers(2))
     view = render_points(cloud.points, cloud.from_world(result.pose), 2048, Workers(2))
     pictures = {
         "scan": fill_holes(view.rgb, view.is_seen),
