@@ -65,7 +65,6 @@ MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of 
 # deviations of corrections by which matches are fitted: of the focal length, and of all where descents begin
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
-# deviations of corrections, by which matches are fitted
 AGREES = 0.25  # least weight of a match that agrees
 MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
