@@ -248,6 +248,7 @@ def test_colours_that_need_too_much_memory_are_refused(tmp_path, monkeypatch):
     one = rooms.query(SEED)
     results = [_result(tmp_path / "0.png", one.rgb, one.pose)] * 2
     monkeypatch.setattr("piccolo.jobs.memory.memory_left", lambda: 4e6)
+    monkeypatch.setattr("piccolo.jobs.memory.KNOWN", [])
     with pytest.raises(ResourceError, match=r"^colouring by 2 photos needs .* localize fewer at once"):
         make_aligned_brushes(scan_map, results, Workers(1))
     points = np.zeros((100_000, 3))

@@ -38,6 +38,7 @@ def system(tmp_path, monkeypatch):
     monkeypatch.setattr(memory, "OWN_CGROUPS", tmp_path / "own")
     monkeypatch.setattr(memory, "CGROUPS", tmp_path / "cgroup")
     monkeypatch.setattr(memory, "LIMIT", [])
+    monkeypatch.setattr(memory, "KNOWN", [])
     return tmp_path
 
 
@@ -52,6 +53,16 @@ def test_default_is_a_part_of_what_is_free_and_a_limit_counts_what_is_taken(syst
     assert memory.memory_left() == pytest.approx(8e9)
     for wrong in (0.0, -1.0, float("nan")):
         assert_input_error("`max_memory`: found", memory.limit_memory, wrong)
+
+
+def test_a_small_part_of_what_was_left_a_moment_ago_is_not_measured_again(system, monkeypatch):
+    memory.check_memory(1e9, "a", "b")
+    monkeypatch.setattr(psutil, "virtual_memory", lambda: SimpleNamespace(available=1e6))
+    memory.check_memory(1e8, "a", "b")
+    with pytest.raises(InputError, match=r"^a needs 0.2 GB of memory, 0.0008 GB may be used; b, or"):
+        memory.check_memory(2e8, "a", "b")
+    with pytest.raises(InputError, match=r"^a needs 0.1 GB"):
+        memory.check_memory(1e8, "a", "b")
 
 
 V1 = "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"
@@ -157,6 +168,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     workers = Workers(1)
     asked = prepare_query(taken, whole, CoarseToFineSettings(), workers)
     monkeypatch.setattr(memory, "memory_left", lambda: 1e5)
+    monkeypatch.setattr(memory, "KNOWN", [])
     spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
     for text, ask in (
         ("a.png: found 512 x 256, which needs 0.0016 GB", lambda: read_panorama(picture)),

@@ -7,6 +7,7 @@ numbers is imported here, as `share_arenas` comes before these are.
 import ctypes
 import os
 import sys
+import time
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
@@ -26,6 +27,9 @@ LEAST_LEFT = 200e6  # [byte] of address space: with less, Python may abort where
 M_ARENA_MAX = -8  # of glibc's mallopt(3)
 MOST_ARENAS = 2  # each keeps what was freed in it
 LIMIT: list[float] = []  # [byte] of this process, if the user sets one
+KNOWN_SECONDS = 1.0  # for which what was left is taken as known
+SMALL_PART = 0.02  # of what is left; for more it is measured again
+KNOWN: list[tuple[float, float]] = []  # when what is left was measured last [s], and what it was [byte]
 this_process = cache(psutil.Process)
 
 
@@ -34,11 +38,19 @@ def limit_memory(gigabytes: float | None) -> None:
     if gigabytes is not None and not gigabytes > 0.0:
         raise InputError(f"`max_memory`: found {gigabytes:g}, wanted gigabytes above 0")
     LIMIT[:] = [] if gigabytes is None else [gigabytes * GB]
+    KNOWN.clear()
 
 
 def check_memory(num_bytes: float, purpose: str, advice: str) -> None:
-    """Refuse what needs more bytes than may still be taken; `purpose` begins the line, `advice` ends it."""
+    """Refuse what needs more bytes than may still be taken; `purpose` begins the line, `advice` ends it.
+
+    A small part of what was left less than a second ago is granted without measuring again.
+    """
+    now = time.monotonic()
+    if any(now - at < KNOWN_SECONDS and num_bytes < SMALL_PART * left for at, left in KNOWN):
+        return
     room = memory_left()
+    KNOWN[:] = [(now, room)]
     if num_bytes > room:
         needs = f"{purpose} needs {num_bytes / GB:.2g} GB of memory"
         left = f"{max(room, 0.0) / GB:.2g} GB may be used"

@@ -21,7 +21,7 @@ from ..confidence.claim import Claim
 from ..confidence.localization import SphereGeometry
 from ..geometry.pose import Pose
 from ..panorama import Panorama
-from .comparison import compare, mask_occluders, score_pose
+from .comparison import score_pose
 from .ladder import Limits
 from .last_descent import refine_best
 from .query import Query, prepare_query
@@ -50,8 +50,7 @@ CHECK = Limits(1.0, 8, 1e-3)
 COARSE = Limits(1.2, 10, 5e-3)
 MIDDLE = Limits(1.2, 12, 1e-3)
 FINE = Limits(1.0, 15, 1e-3)
-NEAR = Limits(0.7, 2, 1e-4)  # on points, where the claim holds
-FULL = Limits(0.7, 15, 1e-4)  # on points, where it does not
+FULL = Limits(0.7, 15, 1e-4)  # on points
 MOST_ROUNDS = 3
 
 
@@ -110,23 +109,15 @@ def count_deviations(estimate: Estimate) -> float:
 def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, SphereFit]:
     """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
     camera = whole_sphere(*query.given.rgb.shape[1::-1])
-    freedom = make_freedom(camera)
-    pose = found.best.pose
-    shown = mask_occluders(query, compare(query, pose))
-    ways = (
-        partial(descend_on_cells, query, pose, freedom, NO_CORRECTION, CHECK),
-        partial(descend_on_points, shown, pose, freedom, NEAR),
-    )
-    coarse, near = query.workers.map(
-        lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama"
-    )
-    is_suspect = count_deviations(coarse) > SUSPECT
+    end = descend_on_cells(query, found.best.pose, make_freedom(camera), NO_CORRECTION, CHECK)
+    estimate = estimate_corrections(end, CURVATURE)
+    is_suspect = count_deviations(estimate) > SUSPECT
     other = retake_as_found(query, found, camera) if is_suspect else None
     if other is not None:
         return other
-    conflict = CLAIM.conflict(coarse.values, coarse.information)
-    doubt = CLAIM.doubt(coarse.values, coarse.information)
-    return query, found, SphereFit(camera, near, True, conflict, doubt)
+    conflict = CLAIM.conflict(estimate.values, estimate.information)
+    doubt = CLAIM.doubt(estimate.values, estimate.information)
+    return query, found, SphereFit(camera, estimate, True, conflict, doubt)
 
 
 def retake_as_found(
