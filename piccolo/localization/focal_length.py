@@ -59,6 +59,7 @@ OTHERS_SHARES = (0.02, 0.02, 0.02, 0.02)  # chosen: of those that are wrong
 MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
 BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
+NUM_VIEWS = 2  # of the points, from where a descent ended
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
 LIMIT = 0.4  # of the change by matches
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
@@ -227,7 +228,8 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
     The first descents begin as the photo was taken last and, at first, with other focal lengths; the others
-    at their end, and as matches have it.
+    at their end, and as matches have it. Each goes on with the points that are seen from where it ended: of
+    those that are seen from elsewhere more agree with the pose there.
     """
     shown = mask_occluders(query, compare(query, pose))
     corrections = Corrections(query.given.cameras[0])
@@ -235,30 +237,38 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
     of_focal = Freedom(corrections, np.where(np.arange(len(wide)) == FOCAL, wide, claim.deviations), MOST)
     of_all = Freedom(corrections, wide, MOST)
     cells = shown.view_at(pose, "fine")
-    points = mask_edge(shown.view_at(pose, "points"), pose, query.photo.panorama.is_valid)
 
-    def begin(change: float) -> tuple[Pose, Array]:
+    def begin(change: float) -> FreeEnd:
         values = np.zeros(len(LENS))
         values[FOCAL] = change
-        near = descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR)
-        return near.pose, near.values
+        return descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR)
 
-    def go_on(freedom: Freedom, start: tuple[Pose, Array]) -> FreeEnd:
-        return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
+    def find_lowest(freedom: Freedom, place: Pose, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
+        points = mask_edge(shown.view_at(place, "points"), place, query.photo.panorama.is_valid)
 
-    def find_lowest(freedom: Freedom, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
-        ends = query.workers.map(partial(go_on, freedom), starts, "fit the focal length")
-        return min(ends, key=lambda end: end.loss)
+        def go_on(start: tuple[Pose, Array]) -> FreeEnd:
+            return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
+
+        return min(
+            query.workers.map(go_on, starts, "fit the focal length"),
+            key=lambda end: end.loss,
+        )
+
+    def follow(freedom: Freedom, end: FreeEnd) -> FreeEnd:
+        for _ in range(NUM_VIEWS):
+            end = find_lowest(freedom, end.pose, [end.start])
+        return end
 
     others = query.workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
-    first = find_lowest(of_focal, [(pose, np.zeros(len(LENS))), *others])
+    first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
     motion = estimate_corrections(first).motion[:, FOCAL]
     unit = np.eye(len(LENS))[FOCAL]
     beside = [(add(first.pose, motion * change), first.values + unit * change) for change in BESIDE]
-    near = min(first, find_lowest(of_focal, beside), key=lambda end: end.loss)
+    near = follow(of_focal, find_lowest(of_focal, pose, [first.start, *beside]))
     by_matches = fit_matches(query, pose, ALL_WIDTHS)
-    starts = [(near.pose, near.values), (by_matches.pose, by_matches.values)]
-    return near, find_lowest(of_all, starts[: 1 + int(by_matches.values.any())])
+    starts = [near.start, (by_matches.pose, by_matches.values)]
+    far = find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
+    return near, follow(of_all, far)
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:

@@ -47,6 +47,11 @@ class FreeEnd(NamedTuple):
     loss: float  # with what the deviations of the freedom add
     sums: FreeSums  # by the blocks of the sphere
 
+    @property
+    def start(self) -> tuple[Pose, Array]:
+        """Pose and corrections, from which another descent may begin."""
+        return self.pose, self.values
+
 
 class Estimate(NamedTuple):
     """Corrections by the photo and the scan alone."""
