@@ -19,6 +19,7 @@ from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import bundle, focal_length as focal, localize as module
 from piccolo.localization.comparison import score_pose
+from piccolo.localization.lens_matches import MatchFit, fit_matches
 from piccolo.localization.localize import select_likeliest
 from piccolo.localization.selection import Selection
 from piccolo.localization.self_calibration import Estimate
@@ -141,7 +142,7 @@ def test_the_more_picture_and_user_disagree_the_wider_is_the_prior(monkeypatch, 
     found = Estimate(np.array([minimum, 0.0, 0.0, 0.0, 0.0]), information, np.ones((6, 5)))
     monkeypatch.setattr(focal, "descend_lens", lambda *args: (None, None))
     monkeypatch.setattr(focal, "estimate_corrections", lambda end: found)
-    monkeypatch.setattr(focal, "fit_matches", lambda query, pose: focal.MatchFit(np.zeros(5), 0.0, pose))
+    monkeypatch.setattr(focal, "fit_matches", lambda query, pose, _: MatchFit(np.zeros(5), 0.0, pose))
     fit = focal.fit_focal(query, scan().from_world(pose))
     assert fit.conflict == pytest.approx(minimum / 0.01 / math.sqrt(2.0), rel=0.02)
     assert fit.change[0] / minimum == pytest.approx(share, abs=0.02)
@@ -159,7 +160,7 @@ def test_matches_lead_to_a_focal_length_that_is_far_off():
     query, found = focal.follow_matches(query, found)
     assert query.given.cameras[0].camera.focal[0] == pytest.approx(TRUE, rel=0.05)
     assert found.best.pose.distance(scan().from_world(pose)) < 0.15
-    by_matches = focal.fit_matches(query, found.best.pose)
+    by_matches = fit_matches(query, found.best.pose, focal.FOCAL_WIDTHS)
     assert abs(by_matches.values[0]) < 2.5 / math.sqrt(by_matches.information)
     assert focal.follow_matches(query, found) == (query, found)
 

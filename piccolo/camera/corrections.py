@@ -21,6 +21,7 @@ from .calibration import Mount
 from .model import PARTIAL_SPHERE, Camera
 
 LENS = ("log_focal", "log_aspect", "center_x", "center_y", "radial")
+FOCAL = LENS.index("log_focal")
 OF_SPHERE = ("log_width", "log_height", "horizon")
 STEP_PX = 0.01  # with which rays are differentiated by pixels
 

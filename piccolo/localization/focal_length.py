@@ -17,17 +17,15 @@ import numpy as np
 
 from ..arrays import Array, Array32, Mask
 from ..camera import Camera, Mount
-from ..camera.corrections import LENS, Corrections
+from ..camera.corrections import FOCAL, LENS, Corrections
 from ..camera.model import MODELS, RADIAL
 from ..confidence.claim import Claim, marginal
 from ..confidence.focal_length import WRONG_DEVIATION, WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, rotate_points
-from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
+from ..geometry.pose_gaussian import add
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Once
-from ..local_features.matching import NO_MATCHES
-from ..optimize.self_calibration import NUM_OF_POSE
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior
 from ..views.view import Cells
@@ -35,6 +33,7 @@ from .comparison import compare, mask_occluders, score_pose
 from .covariance import UNCALIBRATED
 from .ladder import Limits
 from .last_descent import refine_best
+from .lens_matches import MOST, add_matches, fit_matches
 from .query import Features, Query, prepare_query
 from .selection import Selection
 from .self_calibration import (
@@ -45,33 +44,28 @@ from .self_calibration import (
     estimate_corrections,
     invert,
 )
-from .verification import LEAST_ERROR, SURE_MATCHES, matches_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
-FOCAL = LENS.index("log_focal")
 FITTED = [FOCAL, LENS.index("radial")]  # corrections that the camera takes; the others widen the covariance
 # deviations of the other corrections: of a calibration, and of a focal length alone
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
 NOT_CALIBRATED = (0.002, 0.005, 0.005, 0.008)
 OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: if they are wrong
 OTHERS_SHARES = (0.02, 0.02, 0.02, 0.02)  # chosen: of those that are wrong
-MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
 BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
 NUM_VIEWS = 2  # of the points, from where a descent ended
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
-LIMIT = 0.4  # of the change by matches
-MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
 # deviations of corrections by which matches are fitted: of the focal length, and of all where descents begin
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
-AGREES = 0.25  # least weight of a match that agrees
-MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
 CLEARLY = 2.5  # deviations by which matches must tell another one
 MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
-INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal lengths lie within two deviations
+# of the covariance where all corrections are free, so that right calibrations of 91 crops differ from what is
+# found as chance has it
+INFLATION_OF_ALL = 2.0
 # [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length
 # a right calibration was called wrong in the real corridor of tests/data
 EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
@@ -132,14 +126,6 @@ class FocalFit(NamedTuple):
         return replace(found, doubt=self.doubt, picture_px=px, picture_std_px=std)
 
 
-class MatchFit(NamedTuple):
-    """Corrections of a lens by the matches with the drawn scan."""
-
-    values: Array  # (5,) of LENS
-    information: float  # of the focal length's logarithm; 0 if few matches agree
-    pose: Pose  # in the map, with them
-
-
 def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     """Fit the focal length of a photo with a focal_prior whose pose in the map is roughly known.
 
@@ -150,13 +136,16 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     assert prior is not None
     claim = make_claim(prior, camera)
     near, far = descend_lens(query, pose, claim, is_first)
-    estimate = add_matches(widen_by_edges(query, estimate_corrections(near)), fit_matches(query, pose))
+    estimate = add_matches(
+        widen_by_edges(query, estimate_corrections(near)), fit_matches(query, pose, FOCAL_WIDTHS)
+    )
     free = widen_by_edges(query, estimate_corrections(far))
     values, information, motion = estimate
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
     opinion = Opinion(off, variance) if variance < MOST_VARIANCE else None
-    tests = [claim.contradict(*told[:2])[0] for told in (estimate, free)]
+    opinions = estimate, free._replace(information=free.information / INFLATION_OF_ALL)
+    tests = [claim.contradict(*told[:2])[0] for told in opinions]
     worst = np.abs(tests).max(axis=0)
     change, total = average(prior, claim, estimate, opinion, float(worst.max()))
     fitted = FITTED if fits_radial(prior, camera) else FITTED[:1]
@@ -168,7 +157,7 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         motion[:, fitted],
         opinion,
         float(worst.max()),
-        max(claim.doubt(*told[:2]) for told in (estimate, free)),
+        max(claim.doubt(*told[:2]) for told in opinions),
         np.asarray(motion[:, rest] @ spread @ motion[:, rest].T),
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
         LENS[int(worst.argmax())],
@@ -290,15 +279,6 @@ def widen_by_edges(query: Query, estimate: Estimate) -> Estimate:
     return estimate._replace(information=invert(covariance + errors))
 
 
-def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
-    """Return the estimate with the focal length that matches tell."""
-    of_matches = np.zeros_like(estimate.information)
-    of_matches[FOCAL, FOCAL] = by_matches.information
-    both = estimate.information + of_matches
-    goal = estimate.information @ estimate.values + of_matches @ by_matches.values
-    return estimate._replace(values=invert(both) @ goal, information=both)
-
-
 def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
@@ -340,48 +320,12 @@ def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tu
 
 def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection]:
     """Begin with the focal length by which most matches agree, if that is clearly another."""
-    by_matches = fit_matches(query, found.best.pose)
+    by_matches = fit_matches(query, found.best.pose, FOCAL_WIDTHS)
     change = float(by_matches.values[FOCAL])
     if abs(change) * math.sqrt(by_matches.information) < CLEARLY:
         return query, found
     other = refine_with(query, found, np.array([change]), by_matches.pose)
     return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (query, found)
-
-
-def fit_matches(query: Query, pose: Pose, widths: tuple[float, ...] = FOCAL_WIDTHS) -> MatchFit:
-    """Fit corrections of the lens and the pose to the matches with the scan drawn at a pose.
-
-    `widths` (5,) are the deviations of the corrections. A match's loss becomes narrower from step to step.
-    """
-    matches = matches_near(query, pose) if query.uses_matches else NO_MATCHES
-    if len(matches.rays) < SURE_MATCHES:
-        return MatchFit(np.zeros(len(LENS)), 0.0, pose)
-    known: MatchFit | None = query.cache.fits.get((pose.key, widths))
-    if known is not None:
-        return known
-    corrections = Corrections(query.given.cameras[0])
-    prior = np.diag([0.0] * NUM_OF_POSE + list((LEAST_ERROR / np.array(widths)) ** 2))
-    end = pose
-    values = np.zeros(len(LENS))
-    for scale in MATCH_SCALES:
-        rays, of_pose = differentiate_rays(matches.points, end)
-        shown = corrections.displace(np.ascontiguousarray(rays.T, np.float32), values)
-        J = np.concatenate([of_pose, shown.moves.transpose(2, 1, 0)], axis=2)
-        residuals = shown.points.T - matches.rays
-        weights = shown.is_shown / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure
-        slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
-        inverse = np.linalg.inv(
-            np.einsum("n,nij,nik->jk", weights, J, J) + prior + LOOSE * np.eye(len(prior))
-        )
-        step = inverse @ (slopes.sum(axis=0) + prior.diagonal() * [*np.zeros(NUM_OF_POSE), *values])
-        end = add(end, -step[:NUM_OF_POSE])
-        values = np.clip(values - step[NUM_OF_POSE:], -MOST, MOST)
-    of_focal = inverse[NUM_OF_POSE + FOCAL]
-    variance = INFLATION * float(np.square(slopes @ of_focal).sum()) + MATCHED_DEVIATION**2
-    is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(values[FOCAL]) < LIMIT
-    fit = MatchFit(values, float(is_known / variance), end)
-    query.cache.fits[pose.key, widths] = fit
-    return fit
 
 
 def recalibrate(query: Query, change: Array) -> Query:

@@ -71,7 +71,7 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
     "center_y": "principal point",
     "radial": "distortion",
 }
-UNCONFIRMED = 0.25  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
+UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
 LAST_STEP = 0.01  # [rad, m] of Adam and the first of L-BFGS, where they take the last descent

@@ -58,7 +58,7 @@ class Cache:
     comparisons: dict[Any, Any] = field(default_factory=dict)  # of `comparison.compare`
     masked: dict[bytes, "Query"] = field(default_factory=dict)  # `comparison.mask_occluders`, by its blocks
     matches: dict[bytes, Any] = field(default_factory=dict)  # `verification.matches_near`, by its grid
-    fits: dict[Any, Any] = field(default_factory=dict)  # `focal_length.fit_matches`
+    fits: dict[Any, Any] = field(default_factory=dict)  # `lens_matches.fit_matches`
     ends: set[bytes] = field(default_factory=set)  # keys of poses that no perturbation improves
 
 

@@ -1,0 +1,75 @@
+"""Corrections of a lens by the matches of a photo with the scan as it is drawn at a pose."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..camera.corrections import FOCAL, LENS, Corrections
+from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
+from ..local_features.matching import NO_MATCHES
+from ..optimize.self_calibration import NUM_OF_POSE
+from .query import Query
+from .self_calibration import Estimate, invert
+from .verification import LEAST_ERROR, SURE_MATCHES, matches_near
+
+MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
+MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
+AGREES = 0.25  # least weight of a match that agrees
+MATCHED_DEVIATION = 0.015  # that errors in common add to a focal length by matches
+INFLATION = 4.0  # of the covariance by matches, so that 95 % of true focal lengths lie within two deviations
+LIMIT = 0.4  # of the change by matches
+
+
+class MatchFit(NamedTuple):
+    """Corrections of a lens by the matches with the drawn scan."""
+
+    values: Array  # (5,) of LENS
+    information: float  # of the focal length's logarithm; 0 if few matches agree
+    pose: Pose  # in the map, with them
+
+
+def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
+    """Return the estimate with the focal length that matches tell."""
+    of_matches = np.zeros_like(estimate.information)
+    of_matches[FOCAL, FOCAL] = by_matches.information
+    both = estimate.information + of_matches
+    goal = estimate.information @ estimate.values + of_matches @ by_matches.values
+    return estimate._replace(values=invert(both) @ goal, information=both)
+
+
+def fit_matches(query: Query, pose: Pose, widths: tuple[float, ...]) -> MatchFit:
+    """Fit corrections of the lens and the pose to the matches with the scan drawn at a pose.
+
+    `widths` (5,) are the deviations of the corrections. A match's loss becomes narrower from step to step.
+    """
+    matches = matches_near(query, pose) if query.uses_matches else NO_MATCHES
+    if len(matches.rays) < SURE_MATCHES:
+        return MatchFit(np.zeros(len(LENS)), 0.0, pose)
+    known: MatchFit | None = query.cache.fits.get((pose.key, widths))
+    if known is not None:
+        return known
+    corrections = Corrections(query.given.cameras[0])
+    prior = np.diag([0.0] * NUM_OF_POSE + list((LEAST_ERROR / np.array(widths)) ** 2))
+    end = pose
+    values = np.zeros(len(LENS))
+    for scale in MATCH_SCALES:
+        rays, of_pose = differentiate_rays(matches.points, end)
+        shown = corrections.displace(np.ascontiguousarray(rays.T, np.float32), values)
+        J = np.concatenate([of_pose, shown.moves.transpose(2, 1, 0)], axis=2)
+        residuals = shown.points.T - matches.rays
+        weights = shown.is_shown / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure
+        slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
+        inverse = np.linalg.inv(
+            np.einsum("n,nij,nik->jk", weights, J, J) + prior + LOOSE * np.eye(len(prior))
+        )
+        step = inverse @ (slopes.sum(axis=0) + prior.diagonal() * [*np.zeros(NUM_OF_POSE), *values])
+        end = add(end, -step[:NUM_OF_POSE])
+        values = np.clip(values - step[NUM_OF_POSE:], -MOST, MOST)
+    of_focal = inverse[NUM_OF_POSE + FOCAL]
+    variance = INFLATION * float(np.square(slopes @ of_focal).sum()) + MATCHED_DEVIATION**2
+    is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(values[FOCAL]) < LIMIT
+    fit = MatchFit(values, float(is_known / variance), end)
+    query.cache.fits[pose.key, widths] = fit
+    return fit
