@@ -103,6 +103,7 @@ def main(arguments: Arguments) -> int:
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
     results = [result for result in read_results(arguments.results) if result.pose]
+    table.check_metres([result.pose for result in results if result.pose])
     found = find_times(results, table, clock, arguments.times)
     sightings = {
         result.pano: Sighting(result.pose, result.pose_errors, time)

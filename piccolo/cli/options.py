@@ -141,7 +141,10 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     title = "prior knowledge (preset default only); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
     text = "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, "
-    text += "within, gravity_x, gravity_y, gravity_z; they take precedence over the options for all photos"
+    text += (
+        "within, gravity_x, gravity_y, gravity_z, or NavVis' pano-poses.csv; they take precedence over the "
+    )
+    text += "options for all photos"
     option(group, "--priors FILE", text)
     option(group, "--near X Y Z RADIUS", "the camera was within RADIUS of this position [m]")
     option(group, "--height MIN MAX", "height of the camera above the floor [m]")
@@ -164,7 +167,7 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
-    option(group, "--video FILE", "video of a walk, instead of --pano")
+    option(group, "--video FILE ...", "video of a walk, or its chapters in order, instead of --pano")
     text = "seconds from one frame of a video to the next, the sharpest around each time "
     option(group, "--every S", f"{text}(default {DEFAULT_EVERY})")
     text = f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file "
