@@ -21,7 +21,6 @@ from ..panorama.photo import read_photo_facts
 from ..photo import Photo, Prior, Vector
 from ..scan_map.scan_map import ScanMap, check_within
 from ..walk.frames import check_times
-from .pose_table import read_pose_table
 
 STDIN = "-"
 WANTED_LIST = "wanted a text file, a photo's path on each line"
@@ -265,6 +264,8 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
 
 def _read_positions(path: Path, general: Prior) -> PriorTable | None:
     """Return priors by the positions in a table of given poses; None if it is none, or a table of priors."""
+    from .pose_table import read_pose_table  # noqa: PLC0415  # it imports scipy, which takes long
+
     try:
         table = read_pose_table(path)
     except InputError:
