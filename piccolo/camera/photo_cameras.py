@@ -52,8 +52,7 @@ def find_images(cameras: Path) -> Path | None:
 @lru_cache(2)
 def _read_model(path: Path, _changed: int) -> tuple[Calibration, list[tuple[str, Mount]]]:
     """Return a model's cameras, and those of its photos by name."""
-    images = find_images(path)
-    assert images is not None
+    images = find_images(path) or path
     with naming(images, WANTED):
         if images == path:
             document = read_json(path, WANTED)
