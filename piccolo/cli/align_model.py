@@ -15,14 +15,16 @@ example:
   python localize.py --cloud scan.ply --pano photos --relative sparse/0/images.bin --out poses.jsonl
   python tools/align_model.py --model sparse/0 --results poses.jsonl --out aligned
 
-The photos are localized together first, by the poses that the model gives them relative to each other; three
-or more that are localized decide. The whole model moves: cameras, poses and points (COLMAP, OpenSfM), or the
-transform of the chunk (Metashape, whose coordinates become local). Dense clouds and meshes are moved by the
-matrix, in CloudCompare (Edit > Apply transformation) or others. Prints one JSON object: x_scan = scale R
-x_model + translation, with R = R_scan_from_model as a quaternion, and the same as T_scan_from_model, the
-rows of a 4x4 matrix; standard deviations; how far half and nine tenths of
-the photos are from where the model puts them (null if they were localized by it: then localize some alone to
-know it); and the photos that contradict the others. A model of one place has no scale and is refused.
+The photos are localized together first, by the poses that the model gives them relative to each other;
+three or more that are localized decide. The whole model moves: cameras, poses and points (COLMAP, OpenSfM),
+or the transform of the chunk (Metashape, whose coordinates become local). Dense clouds and meshes in the
+model's coordinates are moved by the matrix, as in CloudCompare (Edit > Apply transformation); those that
+Metashape has exported are in others: import its cameras and export again.
+
+Prints one JSON object: x_scan = scale R x_model + translation, with R = R_scan_from_model as a quaternion;
+the same as T_scan_from_model, rows of a 4x4 matrix; standard deviations; how far half and nine tenths of
+the photos are from where the model puts them (null if they were localized by it: then localize some alone
+to know it); and the photos that contradict the others. A model of one place has no scale and is refused.
 """
 SHARES = 0.5, 0.9  # of the photos
 DEPENDENT = (
