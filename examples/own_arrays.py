@@ -9,6 +9,8 @@ from plyfile import PlyData
 
 import piccolo
 
+if len(sys.argv) != 3:
+    sys.exit(__doc__)
 scan_path, photo_path = sys.argv[1:]
 
 # %% A scan: points (N, 3) [m] and colours (N, 3), here without what is more than 20 m from the middle

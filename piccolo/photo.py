@@ -11,7 +11,8 @@ import numpy as np
 from .arguments import Projection, check_fields
 from .arrays import Bytes, Mask
 from .camera import Calibration, Mount
-from .camera.calibration import IDENTITY, find_calibration, open_calibration, read_rig
+from .camera.calibration import IDENTITY, read_rig
+from .camera.photo_cameras import find_calibration, open_calibration
 from .errors import InputError
 
 FACE_LETTERS = "rludfb"  # right, left, up, down, front, back
@@ -38,7 +39,7 @@ class Photo:
         Half angle [deg] of the cap about camera -z that is ignored. Only for files.
     camera
         Calibration: COLMAP's cameras.txt, OpenSfM's camera_models.json, or JSON of docs/CAMERAS.md; or a
-        folder with NAME.camera.json or NAME.json for each photo.
+        folder with NAME.camera.json or NAME.json for each photo that is no sphere.
     rig
         Calibration of several cameras; `picture` is the folder of the pictures of one instant.
     focal_px
@@ -104,7 +105,7 @@ class Photo:
 
     @property
     def calibration(self) -> Calibration | Path | None:
-        """Calibration of the camera, or the folder of the calibrations of several photos."""
+        """Calibration of the camera, or the folder or model with those of several photos."""
         return Path(self.camera) if isinstance(self.camera, str | PathLike) else self.camera
 
     @property

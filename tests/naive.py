@@ -288,3 +288,17 @@ def profile(leaves, place, radius):
     is_over &= np.abs(heights - sheet) < 0.0975
     bins = np.floor((heights[is_over] - sheet) / 0.005 + 0.5).astype(int) + 19
     return normal, place + sheet * normal, np.bincount(bins, minlength=39)
+
+
+def spread_votes(votes, guide, reach, near, alike):
+    """Sums of votes (H, W, 2) around each cell: each cell gives its votes to all others, by two Gaussians."""
+    height, width = votes.shape[:2]
+    row, column = (index.ravel() for index in np.indices((height, width)))
+    down = np.abs(row[:, None] - row)
+    across = np.abs(column[:, None] - column)
+    across = np.minimum(across, width - across)
+    colors = guide.reshape(-1, 3).astype(np.float64)
+    unlike = np.linalg.norm(colors[:, None] - colors, axis=2)
+    weights = np.exp(-(down**2 + across**2) / (2 * near**2)) * np.exp(-(unlike**2) / (2 * alike**2))
+    weights[(down > reach) | (across > reach)] = 0.0
+    return (weights @ votes.reshape(-1, 2)).reshape(votes.shape)

@@ -1,8 +1,9 @@
-"""Models of COLMAP and Metashape, moved onto the scan with scale."""
+"""Models of structure from motion, moved onto the scan with scale."""
 
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
@@ -11,9 +12,10 @@ import pytest
 from poses import result, write_results
 from refusals import small_files
 
+from piccolo.batch.relative_poses import read_relative_poses
 from piccolo.cli import align_model
 from piccolo.confidence.covariance import PoseCovariance
-from piccolo.geometry.pose import OPTICAL_FROM_CAM, Pose, exp_so3, log_so3
+from piccolo.geometry.pose import OPENGL_FROM_CAM, OPTICAL_FROM_CAM, Pose, exp_so3, log_so3
 from piccolo.geometry.pose_gaussian import add
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -141,6 +143,53 @@ def test_a_chunk_of_metashape_gets_the_transform(tmp_path, scene, capsys):
     assert chunk.findtext("reference").startswith("LOCAL_CS")
 
 
+def test_a_reconstruction_of_opensfm_moves_with_its_points_and_rigs(tmp_path, scene, capsys):
+    results, in_model, points = scene
+    shots = {}
+    for k, pose in enumerate(in_model):
+        R = OPTICAL_FROM_CAM @ pose.R_cam_from_world
+        shot = {"rotation": log_so3(R).tolist(), "translation": (-R @ pose.center_world).tolist()}
+        shots[f"{k:02d}.jpg"] = {**shot, "camera": "c"}
+    rigs = {
+        "rig_instances": {"3": {**shots["03.jpg"]}},
+        "rig_cameras": {"c": {"translation": [1.0, 0.0, 0.0]}},
+    }
+    placed = {str(k): {"coordinates": point.tolist()} for k, point in enumerate(to_model(points))}
+    part = {"cameras": {}, "shots": shots, **rigs, "points": placed, "reference_lla": {"latitude": 1.0}}
+    model = tmp_path / "reconstruction.json"
+    model.write_text(json.dumps([part]))
+    out = tmp_path / "aligned.json"
+    code, report = _run(tmp_path, scene, model, out, capsys)
+    assert code == 0
+    _check(report)
+    (moved,) = json.loads(out.read_text())
+    found = np.array([moved["points"][str(k)]["coordinates"] for k in range(len(points))])
+    assert np.linalg.norm(found - points, axis=1).max() < 0.01
+    photos = [Path(f"photos/{k:02d}.jpg") for k in range(20)]
+    for pose, one in zip(read_relative_poses(out, photos), results, strict=True):
+        if one.pano != "photos/05.jpg":
+            assert np.linalg.norm(pose.center_world - one.pose.center_world) < 0.03
+    assert moved["rig_instances"]["3"]["translation"] == moved["shots"]["03.jpg"]["translation"]
+    assert moved["rig_cameras"]["c"]["translation"][0] == report["scale"]
+    assert "reference_lla" not in moved
+
+
+def test_the_matrix_moves_what_else_belongs_to_a_model(tmp_path, scene, capsys):
+    """Such as a dense cloud; here the model stays as it is."""
+    results, in_model, points = scene
+    _write_colmap(tmp_path / "model", in_model, points)
+    write_results(tmp_path / "r.jsonl", results)
+    words = ["--model", tmp_path / "model", "--results", tmp_path / "r.jsonl", "--matrix", tmp_path / "T.txt"]
+    assert align_model.main([*map(str, words)]) == 0
+    report = json.loads(capsys.readouterr().out)
+    T = np.loadtxt(tmp_path / "T.txt")
+    assert (report["out"], report["T_scan_from_model"]) == (None, T.tolist())
+    moved = to_model(points) @ T[:3, :3].T + T[:3, 3]
+    assert np.linalg.norm(moved - points, axis=1).max() < 0.01
+    assert np.cbrt(np.linalg.det(T)) == pytest.approx(report["scale"], rel=1e-9)
+    assert T[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-4])  # of the model at one place, in its unit
 def test_a_model_of_one_place_has_no_scale(tmp_path, scene, capsys, noise):
     results, in_model, points = scene
@@ -189,6 +238,19 @@ def test_what_can_not_be_aligned_is_refused(tmp_path, scene, capsys):
     _write_colmap(tmp_path / "model", in_model, points)
     code, text = _run(tmp_path, (results[:2],), tmp_path / "model", tmp_path / "x", capsys)
     assert (code, "found 2 localized photos of it in the results, wanted 3 or more" in text) == (3, True)
+    frames = [{"file_path": f"{k:02d}.jpg", "transform_matrix": np.eye(4).tolist()} for k in range(20)]
+    for frame, pose in zip(frames, in_model, strict=True):
+        R = OPENGL_FROM_CAM @ pose.R_cam_from_world
+        frame["transform_matrix"] = [
+            [*row, x] for row, x in zip(R.T.tolist(), pose.center_world, strict=True)
+        ]
+        frame["transform_matrix"].append([0, 0, 0, 1])
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
+    code, text = _run(tmp_path, scene, tmp_path / "transforms.json", tmp_path / "x.json", capsys)
+    assert (code, "wanted OpenSfM's reconstruction.json; of another model take the matrix" in text) == (
+        3,
+        True,
+    )
     (tmp_path / "a.xml").write_text("<chunk><camera label='00'><transform>1 2</transform></camera></chunk>")
     code, text = _run(tmp_path, scene, tmp_path / "a.xml", tmp_path / "x.xml", capsys)
     assert (code, "a.xml: found" in text) == (3, True)

@@ -9,7 +9,7 @@ from refusals import assert_refused, mutated, read_or_refused
 from scans import read_cloud
 from test_cloud_morton import read, seeded_cloud
 
-from piccolo.camera.calibration import find_calibration
+from piccolo.camera.photo_cameras import find_calibration
 from piccolo.cli import e57_images
 from piccolo.cloud.readers import e57, e57_file
 from piccolo.cloud.readers.e57 import list_images, read_image

@@ -20,9 +20,11 @@ from batches import main_of
 import piccolo
 from piccolo.cloud.stream import FORMATS
 from piccolo.export.formats import FORMATS as EXPORTS
+from piccolo.kernels.jit import COMPILE_TIME
 from research.synthetic import make_room
 
 ROOT = Path(__file__).resolve().parents[1]
+NUMBER = r"-?\d+(?:\.\d+)?"
 README = (ROOT / "README.md").read_text()
 TOOLS = (ROOT / "docs" / "TOOLS.md").read_text()
 
@@ -72,6 +74,25 @@ def test_readme_command_prints_and_writes_what_it_says(tmp_path, monkeypatch, ca
         else:
             assert value == pytest.approx(result[name], abs=5e-3), name
     assert (tmp_path / "overlay.png").read_bytes().startswith(b"\x89PNG")
+
+
+def test_readme_has_the_lines_and_times_of_the_program(monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    words = ["--cloud", "examples/flat/cloud.ply", "--pano", "examples/flat/images/living_room.jpg"]
+    assert main_of("localize.py")(words) == 0
+    printed = capsys.readouterr().err
+    shown = re.search(
+        r"^    (examples/.*\n)    (  conf.*\n)    (  one .*\n)", README, flags=re.MULTILINE
+    ).groups()
+    for line in shown:
+        begin = re.split(r"[-\d.]+", line)[0]
+        (own,) = (found for found in printed.splitlines(keepends=True) if found.startswith(begin))
+        assert re.split(NUMBER, own) == re.split(NUMBER, line)
+        numbers, wanted = ([float(x) for x in re.findall(NUMBER, text)] for text in (own, line))
+        if line is shown[0]:
+            del numbers[-1], wanted[-1]  # seconds
+        assert numbers == pytest.approx(wanted, rel=0.02, abs=0.01)
+    assert f"The first photo waits {COMPILE_TIME}, on one core" in README
 
 
 def test_room_runs_as_written(tmp_path, monkeypatch, capsys):
@@ -167,6 +188,12 @@ def test_a_folder_with_priors_goes_on_after_a_damaged_photo(run, folder):
     for row, center in zip(rows, _true_centers(folder), strict=True):
         assert np.linalg.norm([float(row[axis]) for axis in "xyz"] - center) < 0.01
     assert "a.jpg" in printed.err
+
+
+@pytest.mark.parametrize("name", ["localize_one.py", "localize_folder.py", "own_arrays.py"])
+def test_without_arguments_examples_say_which_are_wanted(run, name):
+    with pytest.raises(SystemExit, match=rf"python examples/{name} scan\.ply"):
+        run(name)
 
 
 def test_own_arrays(run):

@@ -9,8 +9,9 @@ import pye57
 import pytest
 from e57_files import ImageToWrite, ScanToWrite, write
 from poses import result, write_results
-from refusals import assert_input_error
+from refusals import assert_input_error, assert_refused
 
+from piccolo.batch.inputs import read_priors
 from piccolo.batch.mount import Sighting, Trajectory, fit_mount
 from piccolo.batch.pose_table import read_pose_table
 from piccolo.batch.relative_poses import read_relative_poses
@@ -26,6 +27,7 @@ from piccolo.geometry.pose import (
     yaw_rotation,
 )
 from piccolo.geometry.pose_gaussian import add, subtract
+from piccolo.photo import Prior
 
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
 MOUNT = Pose(exp_so3(np.radians([1.2, -1.2, 1.1])), np.array([0.06, -0.05, 0.06]))  # 2 degrees, 10 cm
@@ -244,6 +246,39 @@ def test_poses_of_navvis_have_x_ahead(tmp_path, capsys):
     relative = read_relative_poses(given, [Path(name) for name in PHOTOS])
     for body, read in zip(BODIES, relative, strict=True):
         assert pose_errors(read, body) == pytest.approx((0.0, 0.0), abs=1e-6)
+
+
+def test_positions_of_navvis_are_priors(tmp_path):
+    given = _write_quaternions(tmp_path / "pano-poses.csv", NAVVIS_HEAD, "; ", AHEAD, PHOTOS, BODIES)
+    table = read_priors(given, Prior(height=(1.0, 2.0)))
+    assert [*table.by_name] == PHOTOS
+    for body, (prior, gravity_vector) in zip(BODIES, table.by_name.values(), strict=True):
+        assert prior.near == pytest.approx(body.center_world, abs=1e-12)
+        assert (prior.radius, prior.height, prior.heading_deg, gravity_vector) == (
+            5.0,
+            (1.0, 2.0),
+            None,
+            None,
+        )
+    given.write_text(given.read_text().replace("01.jpg", "00.jpg"))
+    assert_refused("found the name '00.jpg' twice", read_priors, given, Prior())
+
+
+def test_longitudes_and_latitudes_are_recognized(tmp_path, capsys):
+    """As GPS has them in Potree's coordinates.txt; poses in metres as near to each other are taken."""
+    rows = []
+    for name, body in zip(PHOTOS, BODIES, strict=True):
+        x, y, z = (body.center_world - ORIGIN).tolist()
+        rows.append(f"{name}\t0\t{11.5 + 1e-5 * x}\t{48.1 + 1e-5 * y}\t{z}\t10\t0\t0")
+    given = tmp_path / "coordinates.txt"
+    given.write_text("\n".join(["File\tTime\tLong\tLat\tAlt\tcourse\tpitch\troll", *rows]) + "\n")
+    photos = [result(f"photos/{name}", MOUNT @ body) for name, body in zip(PHOTOS, BODIES, strict=True)]
+    results = write_results(tmp_path / "r.jsonl", photos)
+    assert calibrate_mount.main(["--results", str(results), "--given", str(given)]) == 3
+    message = "found longitude and latitude such as 11.5"
+    assert f"{given}: {message}" in capsys.readouterr().err
+    assert_refused(message, read_priors, given, Prior())
+    read_pose_table(given).check_metres([body_at(0.0), body_at(1e-4)])
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,13 @@ from piccolo.batch.relative_poses import find_scale, read_odometry, read_relativ
 from piccolo.errors import InputError
 from piccolo.export.formats import export
 from piccolo.export.posed_images import Options
-from piccolo.geometry.pose import exp_so3, quaternion_wxyz, rotation_from_quaternion_wxyz, yaw_rotation
+from piccolo.geometry.pose import (
+    OPTICAL_FROM_CAM,
+    exp_so3,
+    quaternion_wxyz,
+    rotation_from_quaternion_wxyz,
+    yaw_rotation,
+)
 
 POSES = tilted_poses(4, np.array([20.0, -30.0, 2.0]))
 PHOTOS = [Path(f"photos/{k}.jpg") for k in (7, 8, 12, 100)]
@@ -22,6 +28,7 @@ IDENTITY = np.eye(4).tolist()
 EXPORTED = [
     ("colmap", "model", "model/images.txt", Options(size=SIZE)),
     ("nerfstudio", "transforms.json", "transforms.json", Options(size=SIZE)),
+    ("opensfm", "reconstruction.json", "reconstruction.json", Options(size=SIZE)),
     ("tum", "poses.txt", "poses.txt", Options(timestamps="name")),
 ]
 
@@ -55,6 +62,64 @@ def test_exported_poses_are_read_again(tmp_path, name, out, file, options):
     _assert_same(read_relative_poses(tmp_path / file, [PHOTOS[2], PHOTOS[0]]), [POSES[2], POSES[0]])
     elsewhere = [Path("/elsewhere") / photo.name for photo in PHOTOS]
     _assert_same(read_relative_poses(tmp_path / file, elsewhere), POSES)
+
+
+def _in_model(pose):
+    """The rotation and the centre of an optical camera."""
+    return OPTICAL_FROM_CAM @ pose.R_cam_from_world, pose.center_world.tolist()
+
+
+def _openmvg():
+    views = []
+    extrinsics = []
+    for k, (photo, pose) in enumerate(zip(PHOTOS, POSES, strict=True)):
+        data = {"filename": photo.name, "id_view": k, "id_intrinsic": 0, "id_pose": 10 + k}
+        views.append({"key": k, "value": {"ptr_wrapper": {"id": 1, "data": data}}})
+        R, center = _in_model(pose)
+        extrinsics.append({"key": 10 + k, "value": {"rotation": R.tolist(), "center": center}})
+    views.append({"key": 9, "value": {"ptr_wrapper": {"data": {"filename": "lost.jpg", "id_pose": 99}}}})
+    return {"sfm_data_version": "0.3", "views": views, "extrinsics": extrinsics}
+
+
+def _meshroom(**more):
+    """Numbers are text, and matrices go column after column."""
+    views = [
+        {"viewId": f"{k}", "poseId": f"{k}", "path": f"/x/{photo}", **more} for k, photo in enumerate(PHOTOS)
+    ]
+    poses = []
+    for k, pose in enumerate(POSES):
+        R, center = _in_model(pose)
+        transform = {"rotation": [str(x) for x in R.T.ravel()], "center": [str(x) for x in center]}
+        poses.append({"poseId": f"{k}", "pose": {"transform": transform, "locked": "0"}})
+    return {"version": ["1", "2", "6"], "views": views, "poses": poses}
+
+
+@pytest.mark.parametrize(("name", "document"), [("sfm_data.json", _openmvg()), ("cameras.sfm", _meshroom())])
+def test_models_of_other_programs(tmp_path, name, document):
+    path = _write(tmp_path / name, json.dumps(document))
+    _assert_same(read_relative_poses(path, PHOTOS), POSES)
+    assert find_scale(path) == "unknown"
+
+
+def test_models_that_are_not_read_are_named(tmp_path):
+    texts = {
+        "is Bundler's file, which is not read: export COLMAP's": "# Bundle file v0.3\n4 10\n500 0 0\n",
+        "is RealityCapture's file, which is not read": "#name,x,y,alt,heading\n1.jpg,1,2,3,4\n",
+    }
+    for message, text in texts.items():
+        path = _write(tmp_path / "model.out", text)
+        assert_refused(message, read_relative_poses, path, PHOTOS)
+    path = _write(tmp_path / "cameras.sfm", json.dumps(_meshroom(rigId="7")))
+    assert_refused(
+        "found a rig of Meshroom, which is not read: export COLMAP's", read_relative_poses, path, PHOTOS
+    )
+    part = {"cameras": {}, "shots": {}}
+    path = _write(tmp_path / "reconstruction.json", json.dumps([part, part]))
+    assert_refused(
+        "found 2 reconstructions of OpenSfM, which have nothing in common", read_relative_poses, path, PHOTOS
+    )
+    path = _write(tmp_path / "reconstruction.json", json.dumps([part]))
+    assert_refused("found a model without a scale", read_odometry, path, PHOTOS, [0.0, 1.0, 2.0, 3.0])
 
 
 def test_points_of_photos_are_skipped(tmp_path):
@@ -106,7 +171,7 @@ def test_a_photo_without_a_pose_is_refused(tmp_path, form, out, file, options, n
         ("1 0 0 0 0 0 0 nan\n", "found a quaternion whose length is not 1, wanted"),
         ("1 inf 0 0 0 0 0 1\n", r"poses.txt, 1: found a position \[inf, 0.0, 0.0\], wanted finite numbers"),
         ("1 1e30 0 0 0 0 0 1\n", r"1: found a position \[1e\+30, 0.0, 0.0\], wanted"),
-        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "found 2 poses of 1.jpg, wanted one of each photo"),
+        ("1 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n", "found 2 poses of 1.jpg, wanted one of each photo"),
         (_colmap_row("1.jpg", "0 0 0 0 1 2 3"), "found a quaternion whose length is not 1, wanted"),
         (_colmap_row("1.jpg", "1 0 0 0 1 inf 3"), "1.jpg: found a position .*inf.*, wanted finite numbers"),
         (_colmap_row("1.jpg", "1 0 nan 0 1 2 3"), "found a quaternion whose length is not 1, wanted"),

@@ -8,7 +8,7 @@ import pytest
 from refusals import assert_input_error
 
 from piccolo.panorama.picture import read_picture
-from piccolo.panorama.video import frames_at, frames_of
+from piccolo.panorama.video import frames_at, frames_of, frames_of_chapters
 from research.synthetic.walk_frames import writing_video
 
 MATRICES = {  # of the track, by the turn to the right that players make [deg]
@@ -43,6 +43,21 @@ def test_frames_are_turned_as_players_show_them(tmp_path, turn_deg):
         rgb = read_picture(frame.path).rgb.astype(int)
         assert rgb.shape == SHOWN.shape
         assert np.abs(rgb - SHOWN)[40::80, 80::160].max() < 40
+
+
+def test_chapters_follow_one_another(tmp_path):
+    """Two of one name, of 1.5 s each; their frames keep the names of both."""
+    videos = [tmp_path / name / "a.mp4" for name in ("first", "second")]
+    for video, turn_deg in zip(videos, (90, 180), strict=True):
+        video.parent.mkdir()
+        write_turned(video, turn_deg)
+    frames = list(frames_of_chapters(videos, 0.5, tmp_path))
+    half = len(frames) // 2
+    assert half >= 3
+    assert [video for video, *_ in frames] == [videos[0]] * half + [videos[1]] * half
+    own = [frame.time for _, frame, _ in frames]
+    assert [time for *_, time in frames] == own[:half] + [1.5 + time for time in own[half:]]
+    assert len({frame.path for _, frame, _ in frames}) == len(frames)
 
 
 def test_two_lenses_in_one_video_are_refused(tmp_path):

@@ -1,6 +1,7 @@
 """A walk through a room, in Python and on the command line."""
 
 import json
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -351,7 +352,37 @@ def test_a_video_is_a_walk(building, tmp_path):
     assert len(results) == (len(queries) + 1) // 2
 
 
+def test_chapters_are_one_walk_and_a_time_lapse_says_what_it_needs(building, tmp_path, capsys):
+    """Of a time lapse the second frame is farther than a person walks in a tenth of a second."""
+    _, queries = building
+    for name, taken in (("1.mp4", queries[0]), ("2.mp4", queries[-1])):
+        with writing_video(tmp_path / name, 10.0, (rooms.WIDTH, rooms.WIDTH // 2)) as add:
+            add(cv2.imread(str(taken.image))[..., ::-1])
+    out = tmp_path / "out.jsonl"
+    words = [
+        "--cloud",
+        str(rooms.map_path(3)),
+        "--gravity",
+        "known",
+        "--video",
+        *(str(tmp_path / name) for name in ("1.mp4", "2.mp4")),
+        "--out",
+        str(out),
+    ]
+    assert localize_command.main([*words]) == 1
+    (speed,) = re.findall(
+        r"2.mp4#t=0.000: alone it is localized 1.6 m from .* --max-speed (\d+)\n", capsys.readouterr().err
+    )
+    assert localize_command.main([*words, "--overwrite", "--max-speed", speed]) == 0
+    assert "time lapse" not in capsys.readouterr().err
+    results = read_results([out])
+    _assert_right(results, [queries[0], queries[-1]])
+    assert [r.walk.time for r in results] == [0.0, 0.1]
+    assert [r.pano for r in results] == [f"{word}#t=0.000" for word in words[5:7]]
+
+
 REFUSED = [
+    ("--video a.mp4 b.mp4 a.mp4", 3, "a.mp4: found it twice, wanted each chapter once"),
     ("--video a.mp4 --pano a.jpg", 2, "wanted --walk with --pano, or --video"),
     ("--walk", 2, "wanted --walk with --pano, or --video alone"),
     ("", 2, "the following arguments are required: --pano"),

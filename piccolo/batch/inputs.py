@@ -227,9 +227,12 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
     in any height), radius [m] about them, heading [deg] of the image centre clockwise from +y, its tolerance
     [deg], height [m] above the floor, gravity_x, gravity_y, gravity_z (down, in the camera's axes, of any
     length), within (names of the map's scans, with semicolons between them). Between columns are commas, or
-    semicolons or tabs; then numbers may have decimal commas.
+    semicolons or tabs; then numbers may have decimal commas. Of a table of given poses with names, such as
+    NavVis' pano-poses.csv, the positions count.
     Raises InputError if the file can't be read, a cell is no number, or a row contradicts itself.
     """
+    if (given := _read_positions(path, general)) is not None:
+        return given
     lines = read_text(path, WANTED).splitlines()
     delimiter = next((mark for mark in "\t;" if lines and mark in lines[0]), ",")
     rows = csv.DictReader(lines, restkey="more", delimiter=delimiter)
@@ -257,6 +260,25 @@ def read_priors(path: Path, general: Prior) -> PriorTable:
         except InputError as error:
             raise InputError(f"{where}: {error}") from error
     return PriorTable(path, by_name)
+
+
+def _read_positions(path: Path, general: Prior) -> PriorTable | None:
+    """Return priors by the positions in a table of given poses; None if it is none, or a table of priors."""
+    from .pose_table import read_pose_table  # noqa: PLC0415  # it imports scipy, which takes long
+
+    try:
+        table = read_pose_table(path)
+    except InputError:
+        return None
+    names = table.column("name")
+    if names is None or not table.head or any(re.search(r"\bname\b", line.lower()) for line in table.head):
+        return None
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise InputError(f"{path}: found the name {twice[0]!r} twice")
+    table.check_metres()
+    centers = [dict(zip("xyz", pose.center_world.tolist(), strict=True)) for pose in table.poses]
+    rows = zip(names, centers, strict=True)
+    return PriorTable(path, {name: _row_from(center, (), general) for name, center in rows})
 
 
 def _numbers(where: str, row: Mapping[str, str | None]) -> dict[str, float]:

@@ -27,6 +27,8 @@ WANTED = (
     "wanted Potree's coordinates.txt, a TUM trajectory, or a table with a header that names x, y, z and "
     "qx, qy, qz, qw, or omega, phi, kappa, or yaw, pitch, roll"
 )
+MOST_DEGREES = 0.05  # chosen: between the first and last photo of one scan
+FARTHER = 100.0  # chosen: times as far are photos in metres as in degrees
 STALE = re.compile("r[123][123]")  # a matrix beside angles
 
 
@@ -122,6 +124,19 @@ class PoseTable:
                 )
                 poses.append(check_pose(Pose(self.form.read(values), center), f"row {number}"))
         return poses
+
+    def check_metres(self, found: Sequence[Pose] = ()) -> None:
+        """Refuse longitudes and latitudes [deg]: all within a few kilometres, as the photos were `found`."""
+        lon_lat = np.array([pose.center_world[:2] for pose in self.poses]).reshape(-1, 2)
+        extent = float(np.ptp(lon_lat, axis=0).max(initial=0.0)) if len(lon_lat) else 0.0
+        if not 0.0 < extent < MOST_DEGREES or np.any(np.abs(lon_lat) > (180.0, 90.0)):
+            return
+        others = np.array([pose.center_world[:2] for pose in found]).reshape(-1, 2)
+        if len(others) and np.ptp(others, axis=0).max() < FARTHER * extent:
+            return
+        x, y = lon_lat[0]
+        wanted = "wanted the scan's coordinates [m]"
+        raise InputError(f"{self.path}: found longitude and latitude such as {x:.6f} {y:.6f}, {wanted}")
 
     def write(self, out: Path, poses: Sequence[Pose]) -> None:
         """Write the file with other poses in their order; columns r11 .. r33 are left out."""

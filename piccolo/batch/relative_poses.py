@@ -3,38 +3,33 @@
 import logging
 import math
 import re
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from itertools import takewhile
-from operator import eq
-from pathlib import Path, PurePosixPath
-from typing import TypeVar
+from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
 from ..arguments import PICTURES
 from ..arrays import Array
-from ..camera.foreign import parse_xml, read_binary_images
+from ..camera.foreign import NUM_COLMAP, parse_xml, read_images
 from ..cloud.readers.text_columns import is_number
 from ..errors import InputError
-from ..files.json_file import MAX_SIZE, naming, read_bytes, read_json, read_text
-from ..geometry.pose import (
-    OPENGL_FROM_CAM,
-    OPTICAL_FROM_CAM,
-    Pose,
-    check_transform,
-    rotation_from_quaternion_wxyz,
-)
+from ..files.json_file import naming, read_text
+from ..files.photo_names import match_names
+from ..geometry.pose import OPTICAL_FROM_CAM, Pose, check_transform, rotation_from_quaternion_wxyz
 from ..localization.bundle_adjustment import RelativeScale
+from .model_poses import SUFFIXES, NamedPose, read_json_poses
 
 WANTED = (
-    "wanted COLMAP's images.txt or .bin, hloc's poses, Metashape's cameras.xml, or in metres a "
-    "transforms.json of nerfstudio, a TUM trajectory or a tracker's table with a header"
+    "wanted COLMAP's images.txt or .bin, hloc's poses, Metashape's cameras.xml, JSON of OpenSfM, OpenMVG or "
+    "Meshroom, or in metres a transforms.json of nerfstudio, a TUM trajectory or a table with a header"
 )
+FOREIGN = {  # the programs whose files are not read, by how these begin
+    "Bundler": re.compile("# Bundle file"),
+    "RealityCapture": re.compile(r"#\s*name\s*,\s*x\s*,\s*y\s*,\s*alt\b|<[^>]*xmpmeta.*\bxcr:", re.DOTALL),
+}
 ODOMETRY = "wanted a TUM or KITTI trajectory or a transforms.json (ARKit), in metres"
 NUM_KITTI = 12  # columns: T_world_from_cam without its last row
-NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 NUM_TUM = 8  # columns: time, tx, ty, tz, qx, qy, qz, qw
 COLUMNS = {  # of a header, without what is no letter
     "name": re.compile("label|.*name|image|file.*|photo"),
@@ -48,18 +43,15 @@ LOG = logging.getLogger("piccolo")
 LEVEL = math.cos(math.radians(15.0))  # of an axis that stays as it is while the others turn
 TURNED = math.cos(math.radians(45.0))
 UNIT_LENGTH = 0.01  # by which the length of a quaternion may differ from 1
-NamedPose = tuple[str, Pose]
-Value = TypeVar("Value")
 
 
 def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose | None]:
     """Return each photo's pose in the common frame of a file of poses; None of one that it has not.
 
-    COLMAP's files, hloc's, Metashape's cameras.xml and transforms.json name their photos; in a TUM trajectory
-    the time is the photo's name without suffix. Raises InputError if the file is none of these, or has two
-    poses of a photo, or fewer than two photos'.
+    All but a TUM trajectory name their photos; there the time is the photo's name without suffix. Raises
+    InputError if the file is none that is read, or has two poses of a photo, or fewer than two photos'.
     """
-    poses = read_transforms(path) if path.suffix == ".json" else read_lines(path)
+    poses = read_json_poses(path, WANTED)[0] if path.suffix in SUFFIXES else read_lines(path)
     found = match_names(path, poses, photos)
     if sum(pose is not None for pose in found) < min(2, len(photos)):
         missing = next(photo for photo, pose in zip(photos, found, strict=True) if pose is None)
@@ -69,33 +61,12 @@ def read_relative_poses(path: Path, photos: Sequence[Path]) -> list[Pose | None]
 
 def find_scale(path: Path) -> RelativeScale:
     """Return the unit of a file's positions: structure from motion, as in COLMAP's files, has none."""
-    if path.suffix == ".json":
-        return "metres"
+    if path.suffix in SUFFIXES:
+        return read_json_poses(path, WANTED)[1]
     if path.suffix in (".bin", ".xml"):
         return "unknown"
     rows = _rows(path)
     return "unknown" if _are_colmap(rows) or _are_hloc(rows) else "metres"
-
-
-def match_names(path: Path, poses: Sequence[tuple[str, Value]], photos: Sequence[Path]) -> list[Value | None]:
-    """Return the pose, or what else is named, of each photo by the end of its path or by its stem.
-
-    Raises InputError if two fit alike.
-    """
-    by_name = defaultdict[str, list[tuple[tuple[str, ...], Value]]](list)
-    for name, pose in poses:
-        parts = PurePosixPath(name.replace("\\", "/")).parts or ("",)
-        by_name[parts[-1]].append((parts[::-1], pose))
-    chosen: list[Value | None] = []
-    for photo in photos:
-        own = photo.parts[::-1]
-        found = by_name.get(photo.name) or by_name.get(photo.stem) or []
-        lengths = [sum(1 for _ in takewhile(bool, map(eq, own[1:], parts[1:]))) for parts, _ in found]
-        found = [entry for entry, length in zip(found, lengths, strict=True) if length == max(lengths)]
-        if len(found) > 1:
-            raise InputError(f"{path}: found {len(found)} poses of {photo}, wanted one of each photo")
-        chosen.append(found[0][1] if found else None)
-    return chosen
 
 
 def read_odometry(
@@ -109,7 +80,10 @@ def read_odometry(
     Raises InputError if the file is no odometry, or of other frames.
     """
     if path.suffix == ".json":
-        found = match_names(path, read_transforms(path), frames)
+        named, scale = read_json_poses(path, WANTED)
+        if scale == "unknown":
+            raise InputError(f"{path}: found a model without a scale, {ODOMETRY}")
+        found = match_names(path, named, frames)
     else:
         rows = _rows(path)
         is_kitti = all(len(row) == NUM_KITTI for row in rows)
@@ -163,32 +137,15 @@ def _read_tum(path: Path, rows: Sequence[Sequence[str]]) -> list[NamedPose]:
     return poses
 
 
-def read_transforms(path: Path) -> list[NamedPose]:
-    """Return the poses in a transforms.json with the photos' paths: T_world_from_cam, right, up, back."""
-    poses = []
-    document = read_json(path, WANTED)
-    with naming(path, WANTED):
-        for frame in document["frames"]:
-            T = np.array(frame["transform_matrix"], float)
-            if T.shape != (4, 4):
-                raise ValueError(f"a transform_matrix of shape {T.shape}")
-            name = str(frame["file_path"])
-            poses.append((name, check_transform(T, name, OPENGL_FROM_CAM)))
-    return poses
-
-
 def read_lines(path: Path) -> list[NamedPose]:
     """Return the poses in a file of COLMAP or hloc, by the photos' names, or of a tracker, by times."""
     with naming(path, WANTED):
         if path.suffix == ".xml":
             cameras = read_xml(path).iter("camera")
             return [read_metashape(camera) for camera in cameras if camera.find("transform") is not None]
-        if path.suffix == ".bin":
-            rows = list(read_binary_images(read_bytes(path, WANTED, MAX_SIZE)))
-            return [read_colmap_row(row) for row in rows]
-        rows = _rows(path)
-        if _are_colmap(rows):
-            return [read_colmap_row(row) for row in rows if not all(map(is_number, row))]  # else points
+        rows = [] if path.suffix == ".bin" else _rows(path)
+        if path.suffix == ".bin" or _are_colmap(rows):
+            return [read_colmap_row(row) for row in read_images(path, WANTED)]
         if _are_hloc(rows):
             return [read_colmap_row(["", *row[1:], "", row[0]]) for row in rows]
         return _read_tum(path, rows)
@@ -212,7 +169,10 @@ def _rows(path: Path) -> list[list[str]]:
 
     A header of such a table names its columns; without one a ninth column is a node's number.
     """
-    lines = [line.strip() for line in read_text(path, WANTED).splitlines() if line.strip()]
+    text = read_text(path, WANTED)
+    if program := next((name for name, begin in FOREIGN.items() if begin.match(text.lstrip())), None):
+        raise InputError(f"{path}: is {program}'s file, which is not read: export COLMAP's; {WANTED}")
+    lines = [line.strip() for line in text.splitlines() if line.strip()]
     rows = [_split(line) for line in lines if not line.startswith("#")]
     if _are_colmap(rows):
         return rows

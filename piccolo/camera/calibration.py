@@ -117,7 +117,7 @@ class Calibration:
         if not self.is_choice:
             return self._scale(width, height)
         sizes = {(m.camera.width, m.camera.height) for m in self.mounts}
-        fits = [m for m in self.mounts if (m.camera.width, m.camera.height) == (width, height)]
+        fits = [m for m in dict.fromkeys(self.mounts) if (m.camera.width, m.camera.height) == (width, height)]
         if not fits and len(self.mounts) == 1:
             fits = list(self.mounts)
         if len(fits) != 1:
@@ -178,34 +178,15 @@ def read_calibration(path: Path) -> Calibration:
     return calibration
 
 
-def open_calibration(path: Path) -> Calibration | Path:
-    """Return the cameras in a file, as `read_calibration`; a folder of such files, for `find_calibration`."""
-    return path.absolute() if path.is_dir() else read_calibration(path)
-
-
-def find_calibration(given: Calibration | Path | None, pano: Path) -> Calibration | None:
-    """Return what is given, or from a folder the file NAME.camera.json or NAME.json of a photo NAME.jpg."""
-    if not isinstance(given, Path):
-        return given
-    names = [f"{pano.stem}{suffix}" for suffix in (".camera.json", ".json")]
-    file = next((given / name for name in names if (given / name).is_file()), None)
-    if file is None:
-        raise InputError(f"{pano}: found no calibration of it in {given}, wanted {' or '.join(names)}")
-    return read_calibration(file)
-
-
 def read_cameras(path: Path) -> Calibration:
     """Return the cameras in a file, told by its content; InputError if it holds none."""
-    if path.suffix.lower() == ".bin":
-        with naming(path, WANTED):
-            return _of_colmap(path, foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_SIZE)))
-    text = read_text(path, WANTED, MAX_SIZE)
+    text = "" if path.suffix.lower() == ".bin" else read_text(path, WANTED, MAX_SIZE)
     with naming(path, WANTED):
         if text.lstrip()[:1] in ("{", "["):
             return _of_document(path, json.loads(text))
         if path.suffix.lower() in MARKUP:
             return _of_foreign(path, foreign.parse_markup(text))
-        return _of_colmap(path, text)
+        return Calibration(str(path), tuple(read_colmap_cameras(path).values()), is_choice=True)
 
 
 def calibration_of(document: Any, label: str) -> Calibration:
@@ -282,10 +263,18 @@ def _whole(value: Any) -> int:
 def _of_document(path: Path, document: Any) -> Calibration:
     if "format" in document:
         return Calibration(str(path), read_mounts(document))
-    entries = list(document.values()) if isinstance(document, dict) else []
-    if not (entries and all(isinstance(entry, dict) and "projection_type" in entry for entry in entries)):
-        return _of_foreign(path, document)
-    return Calibration(str(path), tuple(Mount(_of_opensfm(entry)) for entry in entries), is_choice=True)
+    mounts = tuple(opensfm_cameras(document).values())
+    return Calibration(str(path), mounts, is_choice=True) if mounts else _of_foreign(path, document)
+
+
+def opensfm_cameras(document: Any) -> dict[str, Mount]:
+    """Return the cameras of OpenSfM's camera_models.json or reconstruction.json by name; none of others."""
+    if foreign.is_reconstruction(document):
+        document = {name: entry for part in document for name, entry in part["cameras"].items()}
+    entries = document if isinstance(document, dict) else {}
+    if not all(isinstance(entry, dict) and "projection_type" in entry for entry in entries.values()):
+        return {}
+    return {name: Mount(_of_opensfm(entry)) for name, entry in entries.items()}
 
 
 def _of_foreign(path: Path, document: Any) -> Calibration:
@@ -317,9 +306,13 @@ def _of_opensfm(entry: Mapping[str, Any]) -> Camera:
     return Camera(model, width, height, (*(larger * f for f in focals), *center, *more))
 
 
-def _of_colmap(path: Path, text: str) -> Calibration:
-    """Return the cameras of cameras.txt: lines of id, model, width, height, parameters."""
-    mounts = []
+def read_colmap_cameras(path: Path) -> dict[str, Mount]:
+    """Return the cameras of cameras.bin or .txt by id; lines of id, model, width, height, parameters."""
+    if path.suffix.lower() == ".bin":
+        text = foreign.read_binary_cameras(read_bytes(path, WANTED, MAX_SIZE))
+    else:
+        text = read_text(path, WANTED, MAX_SIZE)
+    mounts: dict[str, Mount] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()
         if not words:
@@ -327,14 +320,14 @@ def _of_colmap(path: Path, text: str) -> Calibration:
         try:
             if len(words) < 5:
                 raise ValueError(f"{len(words)} words")
-            _, model, width, height, *params = words
+            name, model, width, height, *params = words
             camera = Camera(model, int(width), int(height), tuple(map(float, params)))
         except ValueError as error:
             raise InputError(f"{path}, line {number}: {error}; {WANTED}") from error
-        mounts.append(Mount(camera))
+        mounts[name] = Mount(camera)
     if not mounts:
         raise InputError(f"{path}: found no camera, {WANTED}")
-    return Calibration(str(path), tuple(mounts), is_choice=True)
+    return mounts
 
 
 def _of_colmap_rig(path: Path, document: Sequence[Any]) -> Calibration:

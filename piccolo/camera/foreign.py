@@ -7,12 +7,15 @@ metadata, and files of OpenCV, ROS, Kalibr and Metashape. Their names differ, wh
 import math
 import struct
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
 
+from ..cloud.readers.text_columns import is_number
 from ..errors import import_optional
+from ..files.json_file import MAX_SIZE, read_bytes, read_text
 from .model import CUT_SPHERE, MODELS, Camera
 
 READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, XML of OpenCV or Metashape"
@@ -20,6 +23,7 @@ READ = "JSON of nerfstudio, Polycam or Record3D, YAML of OpenCV, ROS or Kalibr, 
 MODEL_NUMBERS = dict(
     zip((0, 1, 2, 3, 4, 6, 7, 14, 15, 8, 9, 5, 10, 17), (m for m in MODELS if m != CUT_SPHERE), strict=True)
 )
+NUM_COLMAP = 10  # columns: id, qw, qx, qy, qz, tx, ty, tz, camera, name
 POINT_SIZE = 24  # [byte] of a point in images.bin
 MAX_NAME = 4096  # [byte]
 MATRIX = ("camera_matrix", "cameramatrix", "intrinsic_matrix", "intrinsics", "k")
@@ -50,8 +54,16 @@ def read_binary_cameras(content: bytes) -> str:
     return "\n".join(lines)
 
 
-def read_binary_images(content: bytes) -> Iterator[list[str]]:
-    """Yield the rows of COLMAP's images.bin as images.txt has them; ValueError if it is damaged."""
+def read_images(path: Path, wanted: str) -> list[list[str]]:
+    """Return the rows of COLMAP's images.bin or .txt: number, pose, camera, name; ValueError if damaged."""
+    if path.suffix == ".bin":
+        return list(_read_binary_images(read_bytes(path, wanted, MAX_SIZE)))
+    lines = [line.strip() for line in read_text(path, wanted).splitlines()]
+    rows = [line.split(None, NUM_COLMAP - 1) for line in lines if not line.startswith("#")]
+    return [row for row in rows if not all(map(is_number, " ".join(row).split()))]  # else points
+
+
+def _read_binary_images(content: bytes) -> Iterator[list[str]]:
     (count,) = _unpack("<Q", content, 0)
     at = 8
     for _ in range(min(count, len(content))):
@@ -62,6 +74,12 @@ def read_binary_images(content: bytes) -> Iterator[list[str]]:
         (num_points,) = _unpack("<Q", content, end + 1)
         yield [*map(str, (image, *pose, camera)), content[at + 64 : end].decode("utf-8", "replace")]
         at = end + 9 + POINT_SIZE * num_points
+
+
+def is_reconstruction(document: Any) -> bool:
+    """Return True for OpenSfM's reconstruction.json: a list of parts with cameras and shots."""
+    parts = document if isinstance(document, list) else []
+    return bool(parts) and all(isinstance(part, dict) and {"cameras", "shots"} <= {*part} for part in parts)
 
 
 def _unpack(form: str, content: bytes, at: int) -> tuple[Any, ...]:

@@ -13,8 +13,9 @@ from ..arrays import Array
 from ..batch.inputs import times_of
 from ..batch.mount import Sighting, Trajectory, fit_mount
 from ..batch.pose_table import AHEAD, QUATERNION, PoseTable, read_pose_table
-from ..batch.relative_poses import match_names, warn_of_axes
+from ..batch.relative_poses import warn_of_axes
 from ..errors import InputError
+from ..files.photo_names import match_names
 from ..geometry.pose import CAMERA_AXES, OPTICAL_FROM_CAM, Pose, angle_between, log_so3, quaternion_wxyz
 from ..result import Result, read_results
 from .command import Arguments, UsageError, check_outputs, check_suffix, command, option
@@ -102,6 +103,7 @@ def main(arguments: Arguments) -> int:
     clock = np.arange(float(len(table.rows))) if times is None else times
     trajectory = Trajectory(clock, table.poses, has_clock=times is not None)
     results = [result for result in read_results(arguments.results) if result.pose]
+    table.check_metres([result.pose for result in results if result.pose])
     found = find_times(results, table, clock, arguments.times)
     sightings = {
         result.pano: Sighting(result.pose, result.pose_errors, time)

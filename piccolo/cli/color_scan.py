@@ -17,7 +17,8 @@ examples:
 
 The photos are aligned with each other first, on the surfaces of the scan, and their exposures are balanced.
 A point gets the weighted median of the photos that see it: by the cosine of the angle to its surface,
-divided by the squared distance. Points that no photo sees are black. PLY has the number of photos of each
+divided by the squared distance. Passers-by, whom other photos contradict, give no colour, best where three
+photos or more see a place. Points that no photo sees are black. PLY has the number of photos of each
 point as the property `photos`, LAS and LAZ as user data. Prints one JSON object to stdout.
 """
 

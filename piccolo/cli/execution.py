@@ -156,7 +156,7 @@ def at_the_workers(
     if not isinstance(scan.prepared, ScanMap):
         raise InputError(f"{where}; the preset paper needs it in a shared folder")
     if (arguments.mask or isinstance(localizer.photo.calibration, Path)) and not is_shared:
-        raise InputError(f"{where}; --mask and a folder of --camera need a shared folder")
+        raise InputError(f"{where}; --mask and --camera by photos need a shared folder")
     with TemporaryDirectory(prefix="piccolo-") as folder:
         path = Path(folder) / f"{Path(folder).name}.piccolo-map"
         save_map(scan.prepared, path)

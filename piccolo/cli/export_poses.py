@@ -30,7 +30,8 @@ examples:
 
 Results that are not localized are left out and counted on stderr, and so are pictures that a format can't
 hold: for example with a blank in the name (colmap), or a sphere stored rotated (nerfstudio). --faces writes a
-data set: images, masks (black is ignored), and sparse/0 or transforms.json; photos are copied into it.
+folder: images, masks if anything is masked (black is ignored), and sparse/0 or transforms.json; photos are
+copied into it.
 In csv, a path that a spreadsheet would take for a formula gets a leading apostrophe. Axes and angles:
 docs/CONVENTIONS.md. A file at --out is replaced; - is stdout. Prints one JSON object to stdout (to stderr if
 the poses go there).
@@ -45,7 +46,9 @@ def add_arguments(parser: ArgumentParser) -> None:
     """All options. One that is not given stays None, and keeps its default."""
     option(parser, "--results FILE ...", "results of localize.py, JSON lines", required=True)
     option(parser, "--format", "format of the poses, see below", choices=FORMATS, required=True)
-    option(parser, "--out FILE", "file of the poses; for colmap and gpano a new folder", required=True)
+    option(
+        parser, "--out FILE", "file of the poses; for colmap, gpano and --faces a new folder", required=True
+    )
     option(parser, "--images FOLDER", "write picture names relative to this folder (default: as in results)")
     option(parser, "--all", "also write poses that are ambiguous or not localized")
     option(parser, "--cloud PATH ...", "only results of these clouds", default=[])
@@ -61,7 +64,7 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--crs EPSG", f"coordinate system of the cloud, such as EPSG:25832 ({_takers('crs')})")
     text = f"also write N points of the scan that the pictures show, at most ({_takers('points')})"
     option(group, "--points N", text)
-    text = "write pinhole pictures of spheres, and masks: 6 as of a cube, 8 around the horizon, 14 also at "
+    text = "write pinhole pictures of spheres: 6 as of a cube, 8 around the horizon, 14 also at "
     option(group, "--faces N", f"{text}the cube's corners ({_takers('faces')})", choices=FACES)
     text = "folder of a model in the scan's coordinates, of which --out is a copy with the pictures added"
     option(group, "--into FOLDER", f"{text} ({_takers('into')})")

@@ -108,7 +108,7 @@ def add_panorama_reading_options(group: argparse._ArgumentGroup) -> None:
     text = "refine the focal length (known within 20 %%) and k1, if the model has it; takes 3 times longer"
     option(group, "--refine-focal", text)
     text = "calibration: of COLMAP, OpenSfM, nerfstudio, OpenCV and others, or JSON as in docs/CAMERAS.md; "
-    text += "or a folder with NAME.camera.json or NAME.json for each photo"
+    text += "of a model's cameras each photo takes its own; or a folder with NAME.camera.json for each photo"
     option(group, "--camera FILE", text)
     text = "calibration of a rig: COLMAP's rig_config.json, or JSON of docs/CAMERAS.md; a query is a folder"
     option(group, "--rig FILE", text)
@@ -141,7 +141,10 @@ def add_prior_options(parser: argparse.ArgumentParser) -> None:
     title = "prior knowledge (preset default only); a pose that contradicts it is not localized"
     group = parser.add_argument_group(title)
     text = "CSV file of priors per photo: name and any of x, y, z, radius, heading, tolerance, height, "
-    text += "within, gravity_x, gravity_y, gravity_z; they take precedence over the options for all photos"
+    text += (
+        "within, gravity_x, gravity_y, gravity_z, or NavVis' pano-poses.csv; they take precedence over the "
+    )
+    text += "options for all photos"
     option(group, "--priors FILE", text)
     option(group, "--near X Y Z RADIUS", "the camera was within RADIUS of this position [m]")
     option(group, "--height MIN MAX", "height of the camera above the floor [m]")
@@ -155,12 +158,16 @@ def add_walk_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of walks, and of photos that belong together in another way."""
     group = parser.add_argument_group("photos together")
     text = "relative poses of the photos, which are then localized together: COLMAP's images.txt or .bin, "
-    text += "hloc's or Metashape's cameras.xml (of any scale), or in metres a transforms.json (nerfstudio, "
-    text += "phone apps), or a TUM trajectory or a tracker's table with the photos' names as times"
+    text += (
+        "hloc's, Metashape's cameras.xml, JSON of OpenSfM, OpenMVG or Meshroom (of any scale), or in metres "
+    )
+    text += (
+        "a transforms.json (nerfstudio, phone apps), TUM trajectory or table with the photos' names as times"
+    )
     option(group, "--relative FILE", text)
     text = "the photos are frames of one walk, in this order, and constrain each other"
     option(group, "--walk", text)
-    option(group, "--video FILE", "video of a walk, instead of --pano")
+    option(group, "--video FILE ...", "video of a walk, or its chapters in order, instead of --pano")
     text = "seconds from one frame of a video to the next, the sharpest around each time "
     option(group, "--every S", f"{text}(default {DEFAULT_EVERY})")
     text = f"times of the frames: {EXIF}, {NAMES} (the last number in each name [s]), {ORDER}, or CSV file "

@@ -73,7 +73,7 @@ class Run:
 def check_files(arguments: Arguments, panoramas: list[Path], total: int | None) -> None:
     """Refuse, before any work, what could not be written, or would replace an input or another output."""
     a = arguments
-    given = filter(None, (a.mask, a.priors, a.camera, a.rig, a.video, a.relative, a.odometry))
+    given = filter(None, (a.mask, a.priors, a.camera, a.rig, *(a.video or ()), a.relative, a.odometry))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
     outputs = {"--out": a.out or STDOUT, "--color-scan": a.color_scan, **pictures}

@@ -4,6 +4,7 @@ Results are written when all are known. Until then the steps of the job are kept
 """
 
 import json
+import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,7 +28,7 @@ from ..jobs.processes import InFlight
 from ..jobs.threads import Stopwatch
 from ..opened_scan import OpenedScan
 from ..panorama.photo import sha256_of
-from ..panorama.video import frames_of
+from ..panorama.video import frames_of_chapters
 from ..photo import Photo
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
@@ -45,6 +46,8 @@ NOT_WITH = {  # options that do not go with what is asked for
     "--color-scan": ("walk", "video", "relative", "jobs", "dask", "overlay", "occlusion_mask", "labels"),
 }
 ONLY_WITH_WALKS = ("times", "max_speed", "odometry")
+LEAST_LOST = 0.25  # chosen: of the frames, that may be those of a time lapse
+FASTER = 2.0  # chosen: than between two frames
 NUM_TRIED = 3  # frames that can't be read for one reason, and the last: then none can
 
 
@@ -222,10 +225,10 @@ def walk_frames(
     with temporary_folder() if arguments.video else nullcontext(Path()) as folder:
         times = None
         if arguments.video:
-            taken = frames_of(arguments.video, arguments.every or DEFAULT_EVERY, folder)
+            taken = frames_of_chapters(arguments.video, arguments.every or DEFAULT_EVERY, folder)
             bar = {"desc": "read the video", "unit": " frames", "leave": False}
             shots = terminal.show_progress(taken, arguments.quiet, **bar)
-            found = ((f.path, f.time, f"{arguments.video}#t={f.time:.3f}") for f in shots)
+            found = ((f.path, time, f"{video}#t={f.time:.3f}") for video, f, time in shots)
         else:
             times = times_of(panoramas, arguments.times)
             clock = times or [float(k) for k in range(len(panoramas))]
@@ -252,10 +255,38 @@ def make_walk_job(arguments: Arguments, frames: Sequence[WalkInput], walk: Walk)
 
     def report(results: Sequence[Result]) -> tuple[str, bool]:
         arguments.warn({w for r in results for w in r.warnings if w.startswith("`odometry`")})
+        if arguments.video and not (arguments.max_speed or arguments.quiet):
+            arguments.warn(suggest_speed(walk, results))
         gaps = sum(result.walk is not None and result.walk.gap is not None for result in results)
         return f"; {gaps} gaps", True
 
     return Job("frames", {frame.name: frame.photo for frame in frames}, lambda _: fields, run, report)
+
+
+def suggest_speed(walk: Walk, results: Sequence[Result]) -> list[str]:
+    """Return a warning if many frames were not found, and one of them is, alone, but beyond reach."""
+    lost = [k for k, r in enumerate(results) if r.pose is None and r.error is None and not is_tracked(r)]
+    sure = [(r.walk.time, r.pose) for r in results if r.walk and r.pose]
+    if not sure or len(lost) < LEAST_LOST * len(results):
+        return []
+    k = lost[len(lost) // 2]
+    own = results[k].walk
+    pose = walk.scan.localize(walk.photos[k], walk.tracker.settings).pose
+    if own is None or pose is None:
+        return []
+    time, other = min(sure, key=lambda at: abs(at[0] - own.time))
+    seconds = abs(own.time - time)
+    distance = pose.distance(other)
+    if distance < walk.tracker.motion.reach(seconds):
+        return []
+    found = f"{results[k].pano}: alone it is localized {distance:.1f} m from the walk {seconds:.1f} s away"
+    speed = math.ceil(FASTER * distance / seconds)
+    return [f"{found}; if this is a time lapse, add --max-speed {speed}"]
+
+
+def is_tracked(result: Result) -> bool:
+    """Return True if the motion from another frame is known."""
+    return result.walk is not None and result.walk.how == "tracked"
 
 
 def follow_all(

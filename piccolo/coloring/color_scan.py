@@ -1,6 +1,7 @@
 """A scan in the colours of photos that were localized in it, by its shape or by colours it has already.
 
-A point's colour is the weighted median of the photos that see it, so that no single photo decides.
+A point's colour is the weighted median of the photos that see it, so that no single photo decides; parts that
+the others contradict do not count.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,6 +29,7 @@ from ..result import FAILED, Result
 from ..scan_map.open_map import find_prepared_map
 from ..scan_map.scan_map import SHAPE_ALONE, ScanMap, change_colors
 from .alignment import Anchor, Sight, align, look, weigh_points
+from .passersby import remove_passersby
 
 LEAST_PHOTOS = 2
 NUM_ROUNDS = 2  # in which photos are localized by the colours of the round before
@@ -277,6 +279,7 @@ def make_aligned_brushes(scan_map: ScanMap, results: Sequence[Result], workers: 
     poses = [scan_map.from_world(pose) for _, pose in found]
     anchors = [make_anchor(result, pose, at) for (result, pose), at in zip(found, poses, strict=True)]
     poses, gains = align(scan_map.octree, panoramas, poses, anchors, workers)
+    panoramas = remove_passersby(scan_map.octree, panoramas, poses, gains, workers)
     return make_brushes(scan_map.octree, panoramas, poses, gains, workers)
 
 

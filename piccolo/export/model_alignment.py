@@ -1,4 +1,4 @@
-"""Models of structure from motion, COLMAP's or Metashape's, moved into the scan's coordinates with scale.
+"""Models of structure from motion, moved into the scan's coordinates with scale.
 
 Rotation, scale and position are those of the bundle that localized photos and the model's poses make.
 """
@@ -14,10 +14,13 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..arrays import Array
+from ..batch.model_poses import transform_of_shot
 from ..batch.relative_poses import read_relative_poses, read_xml
+from ..camera.foreign import is_reconstruction
 from ..errors import InputError, import_optional
-from ..files.atomic import write_atomically
-from ..geometry.pose import Pose
+from ..files.atomic import write_atomically, write_lines
+from ..files.json_file import naming, read_json
+from ..geometry.pose import Pose, log_so3
 from ..geometry.pose_gaussian import PoseGaussian, subtract
 from ..localization.bundle_adjustment import (
     UNKNOWN_SCALE,
@@ -32,11 +35,13 @@ from ..localization.bundle_adjustment import (
 from ..localization.bundle_search import move_origin_near
 from ..result import Result
 from .colmap import read_model, write_model
+from .reconstructions import write_json
 
 LEAST_PHOTOS = 3
 MOST_SCALE = 0.1  # chosen: deviation of the logarithm of a scale that is still told
 MADE = 1e-3  # chosen: of a deviation; a pose that was computed is nearer to where it was put
 NUM_ROUNDS = 4  # in which the errors of the model and its place are estimated in turn
+WANTED_OPENSFM = "wanted OpenSfM's reconstruction.json; of another model take the matrix"
 LOCAL = (
     'LOCAL_CS["Local Coordinates (m)",LOCAL_DATUM["Local Datum",0],UNIT["metre",1,AUTHORITY["EPSG","9001"]]]'
 )
@@ -52,6 +57,11 @@ class Alignment(NamedTuple):
     contradicting: tuple[str, ...]
     steps: Array  # (N, 6) of photos from where the model puts them [rad, m]
     is_independent: bool  # False if the photos' poses were made of the model's, so that steps say nothing
+
+    @property
+    def T_scan_from_model(self) -> Array:
+        """The similarity as a matrix (4, 4)."""
+        return np.vstack([np.c_[self.scale * self.R_scan_from_model, self.translation], [0.0, 0.0, 0.0, 1.0]])
 
 
 def file_of_poses(model: Path) -> Path:
@@ -133,14 +143,22 @@ def _find_steps(estimates: Sequence[Estimate], bundle: Bundle) -> Array:
     return np.array([subtract(own.pose, bundle.place(pose)) for own, pose in estimates])
 
 
+def write_matrix(alignment: Alignment, out: Path) -> None:
+    """Write the matrix as four lines of four numbers, as CloudCompare and MeshLab take it."""
+    write_lines(out, [" ".join(map(repr, row)) for row in alignment.T_scan_from_model.tolist()])
+
+
 def write_aligned(model: Path, alignment: Alignment, out: Path) -> None:
-    """Write the whole model, moved: a new folder of COLMAP's files, or Metashape's cameras.xml."""
+    """Write the whole model, moved: a new folder of COLMAP's files, or the file of another program."""
     if model.is_dir():
         pycolmap = import_optional("COLMAP", "pycolmap", "colmap")
         reconstruction = read_model(model)
         rotation = pycolmap.Rotation3d(alignment.R_scan_from_model)
         reconstruction.transform(pycolmap.Sim3d(alignment.scale, rotation, alignment.translation))
         write_model(reconstruction, out)
+        return
+    if model.suffix == ".json":
+        _write_opensfm(model, alignment, out)
         return
     root = read_xml(model)
     frames = [*root.iter("component")] or [*root.iter("chunk")]
@@ -156,3 +174,25 @@ def write_aligned(model: Path, alignment: Alignment, out: Path) -> None:
         if reference.text and reference.text.strip():
             reference.text = LOCAL
     write_atomically(out, ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n")
+
+
+def _write_opensfm(model: Path, alignment: Alignment, out: Path) -> None:
+    """Write a reconstruction.json: poses of shots and rigs, points; what refers to the globe is left out."""
+    document = read_json(model, WANTED_OPENSFM)
+    if not is_reconstruction(document):
+        raise InputError(f"{model}: found no reconstruction of OpenSfM, {WANTED_OPENSFM}")
+    scale, R_scan_from_model, translation, *_ = alignment
+    with naming(model, WANTED_OPENSFM):
+        for part in document:
+            part.pop("reference_lla", None)
+            for posed in [*part["shots"].values(), *part.get("rig_instances", {}).values()]:
+                T = transform_of_shot(posed)
+                R = T[:, :3] @ R_scan_from_model.T
+                posed["rotation"] = log_so3(R).tolist()
+                posed["translation"] = (scale * T[:, 3] - R @ translation).tolist()
+            for camera in part.get("rig_cameras", {}).values():
+                camera["translation"] = (scale * np.array(camera["translation"], float)).tolist()
+            for point in part.get("points", {}).values():
+                placed = scale * R_scan_from_model @ np.array(point["coordinates"], float) + translation
+                point["coordinates"] = placed.tolist()
+    write_json(out, document)

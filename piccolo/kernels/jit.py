@@ -44,6 +44,7 @@ FLAGS = (
     "EXTEND_VARIABLE_LIFETIMES", "LLVM_REFPRUNE_FLAGS", "LLVM_REFPRUNE_PASS", "LOOP_VECTORIZE", "OPT",
     "SLP_VECTORIZE",
 )  # fmt: skip
+COMPILE_TIME = "half a minute"  # of all kernels on one core
 QUIET_S = 3.0  # between two lines on what is compiled, and before the first
 POLL_S = 0.01  # while another process compiles
 MOST_WAIT_S = 60.0  # for one kernel
@@ -71,7 +72,7 @@ def kernel_folder() -> Path | None:
 @cache
 def warn_not_kept(reason: str) -> None:
     """Warn once that the next run has to compile again."""
-    log.warning("%s; compiled code is not kept, and each run takes half a minute longer", reason)
+    log.warning("%s; compiled code is not kept, and each run takes %s longer", reason, COMPILE_TIME)
 
 
 @cache
@@ -126,7 +127,7 @@ class Compiling:
         now = time.monotonic()
         if now - self.quiet_since >= QUIET_S:
             self.quiet_since = now
-            log.info("compiling kernels (only once): %d so far, half a minute on one core", self.count)
+            log.info("compiling kernels (only once): %d so far, %s on one core", self.count, COMPILE_TIME)
 
 
 compiling = Compiling()

@@ -9,8 +9,9 @@ import numpy as np
 
 from ..arrays import Array, Mask
 from ..camera import Calibration, Mount
-from ..camera.calibration import compute_extent, find_calibration
+from ..camera.calibration import compute_extent
 from ..camera.model import SPHERE, Camera, camera_of_fov, pinhole
+from ..camera.photo_cameras import find_calibration
 from ..camera.resampling import View, shrunk
 from ..errors import InputError
 from ..photo import Photo
@@ -75,6 +76,9 @@ def _cameras_of(photo: Photo, picture: Picture, has_gpano: bool) -> Cameras:
     if lens in ("pinhole", "fisheye") and photo.fov_deg is not None:
         return Cameras((Mount(camera_of_fov(lens, photo.fov_deg, width, height)),), OF_FIELD, "`fov_deg`")
     is_two_to_one = abs(width - 2 * height) <= ASPECT_TOLERANCE * 2 * height
+    if photo.calibration is not None and not (is_two_to_one or has_gpano):
+        wanted = f"wanted {photo.path.stem}.camera.json or {photo.path.stem}.json"
+        raise InputError(f"{photo.path}: found no calibration of it in {photo.calibration}, {wanted}")
     is_photo = lens is None and photo.fov_deg is None and not has_gpano
     if not (is_photo or lens == "pinhole"):
         return Cameras()

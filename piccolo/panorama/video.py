@@ -1,6 +1,6 @@
 """Videos: their frames as picture files, the sharpest around each time step."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -43,6 +43,21 @@ def frames_of(video: Path, every: float, folder: Path) -> Iterator[VideoFrame]:
                 best = sharpness, time, rgb
     if best is not None:
         yield _write_frame(video, folder, best[1], best[2])
+
+
+def frames_of_chapters(
+    videos: Sequence[Path], every: float, folder: Path
+) -> Iterator[tuple[Path, VideoFrame, float]]:
+    """Yield the video of each frame, the frame, and its time [s] in chapters that follow one another."""
+    if twice := [video for video in videos if videos.count(video) > 1]:
+        raise InputError(f"{twice[0]}: found it twice, wanted each chapter once")
+    begin = 0.0
+    for number, video in enumerate(videos):
+        own = folder / str(number)  # chapters of two folders may have one name
+        own.mkdir()
+        for frame in frames_of(video, every, own):
+            yield video, frame, begin + frame.time
+        begin += _measure_length(video)
 
 
 def frames_at(video: Path, times: Collection[float], folder: Path) -> Iterator[VideoFrame]:
@@ -94,6 +109,18 @@ def _decode(video: Path) -> Iterator[tuple[float, Any]]:
         if isinstance(error, OSError) and not video.exists():
             raise InputError(f"{video}: no such file, {WANTED}") from error
         raise InputError(f"{video}: found {error.strerror}, {WANTED}") from error
+
+
+def _measure_length(video: Path) -> float:
+    """Return the length [s] of a video that has been read."""
+    av = import_optional(video, "av", "video")
+    with av.open(str(video)) as container:
+        stream = container.streams.video[0]
+        if stream.duration is not None:
+            return float(stream.duration * stream.time_base)
+        if container.duration is not None:
+            return float(container.duration / av.time_base)
+    raise InputError(f"{video}: found no length in it, {WANTED}")
 
 
 def _write_frame(video: Path, folder: Path, time: float, rgb: Bytes) -> VideoFrame:
