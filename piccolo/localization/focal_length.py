@@ -56,6 +56,7 @@ OTHERS_SHARES = (0.02, 0.02, 0.02, 0.02)  # chosen: of those that are wrong
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
 BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
 NUM_VIEWS = 2  # of the points, from where a descent ended
+FAR = 0.5  # [m] from the pose, where a descent shows that the photo fixes none
 MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture says nothing
 # deviations of corrections by which matches are fitted: of the focal length, and of all where descents begin
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
@@ -245,6 +246,8 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
 
     def follow(freedom: Freedom, end: FreeEnd) -> FreeEnd:
         for _ in range(NUM_VIEWS):
+            if end.pose.distance(pose) > FAR:
+                break
             end = find_lowest(freedom, end.pose, [end.start])
         return end
 

@@ -50,7 +50,8 @@ CHECK = Limits(1.0, 8, 1e-3)
 COARSE = Limits(1.2, 10, 5e-3)
 MIDDLE = Limits(1.2, 12, 1e-3)
 FINE = Limits(1.0, 15, 1e-3)
-FULL = Limits(0.7, 15, 1e-4)  # on points
+FULL = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
+HERE = Limits(0.7, 0, 1e-4)  # and where it does, which tells how exact it is
 MOST_ROUNDS = 3
 
 
@@ -109,15 +110,21 @@ def count_deviations(estimate: Estimate) -> float:
 def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, SphereFit]:
     """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
     camera = whole_sphere(*query.given.rgb.shape[1::-1])
-    end = descend_on_cells(query, found.best.pose, make_freedom(camera), NO_CORRECTION, CHECK)
-    estimate = estimate_corrections(end, CURVATURE)
+    freedom = make_freedom(camera)
+    ways = (
+        partial(descend_on_cells, query, found.best.pose, freedom, NO_CORRECTION, CHECK),
+        partial(descend_on_points, query, found.best.pose, freedom, HERE),
+    )
+    estimate, here = query.workers.map(
+        lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama"
+    )
     is_suspect = count_deviations(estimate) > SUSPECT
     other = retake_as_found(query, found, camera) if is_suspect else None
     if other is not None:
         return other
     conflict = CLAIM.conflict(estimate.values, estimate.information)
     doubt = CLAIM.doubt(estimate.values, estimate.information)
-    return query, found, SphereFit(camera, estimate, True, conflict, doubt)
+    return query, found, SphereFit(camera, here._replace(values=estimate.values), True, conflict, doubt)
 
 
 def retake_as_found(
