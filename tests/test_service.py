@@ -1,82 +1,23 @@
 """The service as its clients have it: the command is started, and asked over HTTP."""
 
-import http.client
 import json
 import os
 import signal
-import subprocess
-import sys
 import tempfile
 import time
-import uuid
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 import rooms
 from batches import workers_of
+from services import serving
 
 from piccolo.cli import localize
 from piccolo.result import Result
 from piccolo.service.asking import clean_name
 
-ROOT = Path(__file__).resolve().parents[1]
 NEEDED = ("status", "confidence", "center_world", "R_cam_from_world", "covariance", "alternatives")
-
-
-class Client:
-    """Asks a service that runs at a port."""
-
-    def __init__(self, port, process):
-        self.port = port
-        self.process = process
-
-    def ask(self, method, path, body=b"", **headers):
-        """Status, headers and body of an answer."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
-        connection.request(method, path, body, {name.replace("_", "-"): v for name, v in headers.items()})
-        answer = connection.getresponse()
-        found = answer.status, dict(answer.getheaders()), answer.read()
-        connection.close()
-        return found
-
-    def post(self, path, name, content, options=None, **headers):
-        """The same of a picture that is sent as a form."""
-        mark = uuid.uuid4().hex
-        parts = [("picture", f'; filename="{name}"', content)]
-        if options is not None:
-            text = options if isinstance(options, str) else json.dumps(options)
-            parts.append(("options", "", text.encode()))
-        body = b"".join(
-            f'--{mark}\r\nContent-Disposition: form-data; name="{key}"{more}\r\n\r\n'.encode()
-            + value
-            + b"\r\n"
-            for key, more, value in parts
-        )
-        kind = f"multipart/form-data; boundary={mark}"
-        return self.ask("POST", path, body + f"--{mark}--\r\n".encode(), Content_Type=kind, **headers)
-
-
-@contextmanager
-def serving(*words):
-    """A client of a service that is started with some options, and ended by SIGTERM."""
-    command = [sys.executable, str(ROOT / "tools/serve.py"), "--port", "0", *map(str, words)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    lines = []
-    for line in process.stderr:
-        lines.append(line)
-        if " open http://" in line:
-            break
-    else:
-        pytest.fail("".join(lines))
-    address = lines[-1].split(" open ")[1].split()[0]
-    client = Client(int(address.split(":")[2].split("/")[0]), process)
-    client.address = address
-    yield client
-    if process.poll() is None:
-        process.send_signal(signal.SIGTERM)
-    client.rest = process.communicate(timeout=60)[1]
 
 
 @pytest.fixture(scope="module")
@@ -195,7 +136,6 @@ BROKEN = {
     "another page": (403, "evil", lambda c, p: c.post("/localize", "a.jpg", p, Origin="http://evil.example")),
     "no host": (403, "host", lambda c, p: c.ask("GET", "/scan", Host="[x")),
     "another host": (403, "evil", lambda c, p: c.ask("GET", "/report.js", Host="evil.example:80")),
-    "no walk": (404, "walk", lambda c, p: c.post("/walks/none", "a.jpg", p)),
 }
 
 
@@ -237,11 +177,9 @@ def test_nothing_but_the_page_can_be_read(service):
 def test_the_description_has_every_address(service):
     document = json.loads(service.ask("GET", "/openapi.json")[2])
     found = {(path, method.upper()) for path, item in document["paths"].items() for method in item}
-    found -= {("/walks/{walk}", "PARAMETERS")}
     assert found == {
-        *((path, "POST") for path in ("/localize", "/show", "/walks", "/walks/{walk}")),
+        *((path, "POST") for path in ("/localize", "/show")),
         *((path, "GET") for path in ("/scan", "/health")),
-        ("/walks/{walk}", "DELETE"),
     }
 
 
@@ -261,80 +199,6 @@ def test_the_description_has_every_address(service):
 )
 def test_names_are_no_paths(given, name):
     assert clean_name(given) == name
-
-
-def test_a_walk_is_followed_frame_by_frame(service, scene):
-    status, _, body = service.ask("POST", "/walks", json.dumps({"motion": {"max_speed": 1.5}}))
-    assert status == 201
-    path = f"/walks/{json.loads(body)['walk']}"
-    frames = [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(2)]
-    for k, frame in enumerate(frames):
-        status, _, body = service.post(path, f"{k}.jpg", frame, {"time": 9.0 * k})
-        assert status == 200, body
-        found = json.loads(body)
-        assert (found["status"], found["pano"], found["walk"]["time"]) == ("localized", f"{k}.jpg", 9.0 * k)
-    status, _, body = service.post(path, "early.jpg", frames[0], {"time": 1.0})
-    assert (status, "time" in json.loads(body)["error"]) == (422, True)
-    status, _, body = service.post(path, "large.png", _blank(4096, 2048), {"time": 30.0})
-    assert (status, "1 megapixels" in json.loads(body)["error"]) == (422, True)
-    status, _, body = service.ask("DELETE", path)
-    assert status == 200
-    assert [json.loads(line)["pano"] for line in body.splitlines()] == ["0.jpg", "1.jpg"]
-    assert service.ask("DELETE", path)[0] == 404
-
-
-def _frames_on_disk(content):
-    """The files of this content in the folders of services."""
-    found = Path(tempfile.gettempdir()).glob("piccolo-temporary-*/**/*.jpg")
-    return [path for path in found if path.read_bytes() == content]
-
-
-@pytest.mark.parametrize("end", ["ended", "killed"])
-def test_the_frames_of_a_walk_that_is_over_are_not_on_the_disk(service, photo, end):
-    frame = photo + uuid.uuid4().bytes  # behind the JPEG's end
-    others = set(workers_of(service.process))
-    path = f"/walks/{json.loads(service.ask('POST', '/walks')[2])['walk']}"
-    for name in ("a.jpg", "b.jpg"):
-        assert service.post(path, name, frame)[0] == 200
-    assert len(_frames_on_disk(frame)) == 2
-    if end == "ended":
-        assert service.ask("DELETE", path)[0] == 200
-    else:
-        (worker,) = {*workers_of(service.process)} - others
-        os.kill(worker, signal.SIGKILL)
-        assert service.post(path, "c.jpg", frame)[0] == 500
-    assert _frames_on_disk(frame) == []
-    assert service.post(path, "c.jpg", frame)[0] == 404
-
-
-def test_a_walk_has_so_much_room_and_no_more(scene, folder, photo):
-    words = ["--jobs", "1", "--max-walk-megabytes", f"{1.5e-6 * len(photo):.4f}"]
-    frame = photo + uuid.uuid4().bytes
-    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
-        path = f"/walks/{json.loads(client.ask('POST', '/walks')[2])['walk']}"
-        assert client.post(path, "a.jpg", frame)[0] == 200
-        status, _, body = client.post(path, "b.jpg", frame)
-        assert status == 413
-        assert f"wanted it ended: DELETE {path}" in json.loads(body)["error"]
-        assert len(_frames_on_disk(frame)) == 1
-        status, _, body = client.ask("DELETE", path)
-        assert [json.loads(line)["pano"] for line in body.splitlines()] == ["a.jpg"]
-        path = f"/walks/{json.loads(client.ask('POST', '/walks')[2])['walk']}"
-        assert client.post(path, "a.jpg", frame)[0] == 200
-    assert _frames_on_disk(frame) == []  # of a walk that was not over when the service ended
-
-
-def test_a_walk_that_is_ended_while_a_frame_is_at_work_answers_all(service, photo):
-    path = f"/walks/{json.loads(service.ask('POST', '/walks')[2])['walk']}"
-    with ThreadPoolExecutor(4) as pool:
-        frames = [pool.submit(service.post, path, f"{k}.jpg", photo) for k in range(2)]
-        while json.loads(service.ask("GET", "/health")[2])["waiting"] < 2:
-            time.sleep(0.01)
-        ends = [pool.submit(service.ask, "DELETE", path) for _ in range(2)]
-        answers = [future.result() for future in (*frames, *ends)]
-    assert sorted(status for status, *_ in answers[2:]) == [200, 404]
-    assert {status for status, *_ in answers[:2]} <= {200, 404, 503}
-    assert all(status == 200 or json.loads(body)["error"] for status, _, body in answers)
 
 
 def test_a_worker_that_is_killed_costs_no_answer(service, photo, expected):

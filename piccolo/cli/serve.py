@@ -58,7 +58,6 @@ def add_arguments(parser: ArgumentParser) -> None:
     option(group, "--max-megapixels X", "size of a picture, by its header", default=200.0)
     option(group, "--max-waiting N", "photos at once, those at work included", default=32)
     option(group, "--max-seconds S", "time of a photo", default=60.0)
-    option(group, "--max-walk-megabytes X", "size of all frames of a walk, until it ends", default=20_000.0)
 
 
 @command(__file__, __doc__, EPILOG, add_arguments)
@@ -66,11 +65,11 @@ def main(arguments: Arguments) -> int:
     """Open the scan, then answer requests until a signal comes; returns the exit code."""
     a = arguments
     a.check_least(jobs=1, port=0, max_megabytes=0.1, max_megapixels=0.01, max_waiting=1, max_seconds=0.1)
-    a.check_least(max_walk_megabytes=0.01)
     uvicorn = import_optional("tools/serve.py", "uvicorn", "serve")
     for module in ("starlette", "python_multipart"):
         import_optional("tools/serve.py", module, "serve")
-    from ..service.app import MAX_WALKS, Service, make_app  # noqa: PLC0415  # the extra is known to be there
+    from ..service import connections  # noqa: PLC0415  # the extra is known to be there
+    from ..service.app import Service, make_app  # noqa: PLC0415
     from ..service.guard import LOOPBACK  # noqa: PLC0415
 
     with checking_options():
@@ -85,9 +84,8 @@ def main(arguments: Arguments) -> int:
         a.max_megapixels * MEGABYTE,
         a.max_waiting,
         a.max_seconds,
-        int(a.max_walk_megabytes * MEGABYTE),
     )
-    memory = a.max_memory and (a.max_memory - memory_taken() / GB) / (a.jobs + MAX_WALKS)
+    memory = a.max_memory and (a.max_memory - memory_taken() / GB) / a.jobs
     localizer = replace(localizer, max_memory=memory)
     with listening(a.host, a.port) as server, temporary_folder() as folder:
         os.environ["TMPDIR"] = str(folder)  # of the processes: what a killed one leaves goes at the end
@@ -95,10 +93,8 @@ def main(arguments: Arguments) -> int:
         service = Service(desk, limits, a.keep, token)
         a.warn(service.desk.scan_map.warnings)
         a.note(f"open {page_address(server, token)} in a browser; Ctrl-C ends it")
-        own = {"log_level": "warning", "access_log": False, "server_header": False}
-        grace = int(limits.seconds + GRACE_S)
-        config = uvicorn.Config(make_app(service), timeout_graceful_shutdown=grace, **own)
         with closing(service):
+            config = connections.configure(make_app(service), a.jobs, limits.seconds + GRACE_S)
             uvicorn.Server(config).run(sockets=[server])
     return 0
 
@@ -124,8 +120,10 @@ def choose_token(path: Path | None) -> str:
 
 def listening(host: str, port: int) -> socket.socket:
     """Return a socket that listens; InputError if the system gives none."""
+    from ..service.connections import listen  # noqa: PLC0415  # the extra is known to be there
+
     try:
-        return socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET)
+        return listen(host, port)
     except (OSError, OverflowError) as error:
         reason = str(getattr(error, "strerror", None) or error).partition(" (while")[0]
         raise InputError(f"--host {host} --port {port}: cannot be listened at ({reason})") from error

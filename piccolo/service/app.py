@@ -4,17 +4,16 @@ import asyncio
 import json
 import logging
 import secrets
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
-from dataclasses import fields, replace
+from dataclasses import replace
 from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.requests import ClientDisconnect, Request
@@ -29,15 +28,12 @@ from ..jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostEr
 from ..localization.settings import CoarseToFineSettings
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
-from ..walk.frames import Motion
-from .asking import apply_options, check_object, clean_name, make_photo, parse_options
-from .desk import Desk, Drawing, Limits, WalkDesk, begin_walk, content_of, look_at
+from .asking import apply_options, clean_name, make_photo, parse_options
+from .desk import Desk, Drawing, Limits, content_of, look_at
 from .guard import COOKIE, Guard, refuse
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
-MAX_WALKS = 4  # at once, each with a process
-IDLE_S = 600.0  # [s] after which a walk that nobody goes on with makes room for another
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
 RETRY = {"Retry-After": "2"}
 LINES = "application/x-ndjson"
@@ -56,14 +52,11 @@ class Service:
         self.token = token  # which who asks must know; None lets all of this machine ask
         self.desk = open_desk()
         self.num_waiting = 0
-        self.walks: dict[str, WalkDesk] = {}
         self.reopening: asyncio.Task[None] | None = None
 
     def close(self) -> None:
         """End all processes."""
         self.desk.close()
-        for walk in self.walks.values():
-            walk.close()
 
     async def page(self, request: Request) -> Response:
         """Return the page, or a file of it."""
@@ -105,16 +98,16 @@ class Service:
 
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it."""
-        async with self.asking(request) as (task, _):
+        async with self.asking(request) as task:
             with self.desk.in_use() as desk:
-                result = await self.answer(desk, task)
+                result = await unless_gone(request, self.answer(desk, task))
         return Response(result.to_json(), media_type="application/json")
 
     async def show(self, request: Request) -> Response:
         """Return a photo for the page: a line with its result, then a line with its pictures."""
-        async with self.asking(request) as (task, _):
+        async with self.asking(request) as task:
             with self.desk.in_use() as desk:
-                result = await self.answer(desk, task)
+                result = await unless_gone(request, self.answer(desk, task))
         (short,) = site.shorten_names([result.pano])
         shown = site.Entry(result, None, 0.0)
         entry = site.document_of_entry(shown, result.pano, secrets.token_hex(16), desk.scan_map)
@@ -130,81 +123,32 @@ class Service:
 
         return StreamingResponse(lines(), media_type=LINES)
 
-    async def begin_walk(self, request: Request) -> Response:
-        """Begin a walk; return its name."""
-        options = await read_options(request)
-        given = check_object(options.get("motion", {}), {f.name for f in fields(Motion)}, "options.motion")
-        settings = self.settings_of(options)
-        for name, walk in list(self.walks.items()):
-            if monotonic() - walk.used_s > IDLE_S:
-                self.walks.pop(name).close()
-        if len(self.walks) >= MAX_WALKS:
-            raise HTTPException(503, f"found {MAX_WALKS} walks at once, wanted fewer: end one", RETRY)
-        localizer = replace(self.desk.localizer, settings=settings)
-        name = secrets.token_hex(8)
-        self.walks[name] = begin_walk(localizer, Motion(**given), self.limits)
-        return JSONResponse({"walk": name}, 201, {"Location": f"/walks/{name}"})
-
-    async def follow(self, request: Request) -> Response:
-        """Return the line of a walk's next frame, by it and those before; a walk that is lost is over."""
-        async with self.asking(request) as frame:
-            name, walk = self.find_walk(request)
-            walk.used_s = monotonic()
-            walk.num_bytes += len(content_of(frame[0]))
-            if walk.num_bytes > self.limits.max_walk_bytes:
-                found = f"found a walk of more than {self.limits.max_walk_bytes} bytes"
-                raise HTTPException(413, f"{found}, wanted it ended: DELETE /walks/{name}")
-            try:
-                line = await work(walk.processes, frame)
-            except HTTPException as error:
-                if error.status_code >= 500:
-                    self.walks.pop(name, None)
-                    walk.close()
-                raise
-        return Response(line, media_type="application/json")
-
-    async def end_walk(self, request: Request) -> Response:
-        """Return the lines of all frames of a walk, by all of them; it is over then."""
-        name, walk = self.find_walk(request)
-        del self.walks[name]
-        try:
-            lines = await work(walk.processes, None)
-        finally:
-            await asyncio.to_thread(walk.close)
-        return Response("".join(f"{line}\n" for line in lines), media_type=LINES)
-
-    def find_walk(self, request: Request) -> tuple[str, WalkDesk]:
-        """Return a walk that has begun and is not over, with its name."""
-        name = request.path_params["walk"]
-        if name not in self.walks:
-            raise HTTPException(404, "found no such walk, wanted one that POST /walks began")
-        return name, self.walks[name]
-
     @asynccontextmanager
-    async def asking(self, request: Request) -> AsyncIterator[tuple[Task, float | None]]:
-        """Yield the photo that was sent, and the time of a frame; HTTPException if too many are."""
+    async def asking(self, request: Request) -> AsyncIterator[Task]:
+        """Yield the photo that was sent, when all of it is there; HTTPException if too many wait."""
         self.look_for_another_scan()
-        if self.num_waiting >= self.limits.max_waiting:
-            raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
-        self.num_waiting += 1
-        try:
-            yield await self.read(request)
-        finally:
-            self.num_waiting -= 1
-
-    async def read(self, request: Request) -> tuple[Task, float | None]:
-        """Return the photo, and the time, in a form of the parts `picture` and `options`."""
         async with request.form(max_files=1, max_fields=1, max_part_size=MAX_OPTIONS) as form:
-            picture = form.get("picture")
-            text = form.get("options", "")
-            if not isinstance(picture, UploadFile) or not isinstance(text, str):
-                wanted = "wanted multipart/form-data with `picture`, a file, and perhaps `options`, JSON"
-                raise HTTPException(400, f"found no picture, {wanted}")
-            content = await picture.read()
-            name = clean_name(picture.filename or "")
+            if self.num_waiting >= self.limits.max_waiting:
+                raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
+            self.num_waiting += 1
+            try:
+                task = await self.read(form)
+                await form.close()
+                yield task
+            finally:
+                self.num_waiting -= 1
+
+    async def read(self, form: FormData) -> Task:
+        """Return the photo in a form of the parts `picture` and `options`."""
+        picture = form.get("picture")
+        text = form.get("options", "")
+        if not isinstance(picture, UploadFile) or not isinstance(text, str):
+            wanted = "wanted multipart/form-data with `picture`, a file, and perhaps `options`, JSON"
+            raise HTTPException(400, f"found no picture, {wanted}")
+        content = await picture.read()
+        name = clean_name(picture.filename or "")
         options = parse_options(text)
-        task = Task(make_photo(name, options), self.settings_of(options), {name: content})
-        return task, options.get("time")
+        return Task(make_photo(name, options), self.settings_of(options), {name: content})
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
         """Return the service's settings with a request's own in their place."""
@@ -250,6 +194,20 @@ class Service:
             self.reopening = None
 
 
+async def unless_gone(request: Request, answer: Coroutine[Any, Any, Result]) -> Result:
+    """Return an answer; ClientDisconnect if the client leaves meanwhile: a photo that waits is given up."""
+    answering = asyncio.create_task(answer)
+    leaving = asyncio.ensure_future(request.receive())  # the body was read, so this is all that can come
+    try:
+        await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        if not answering.done():
+            raise ClientDisconnect
+        return answering.result()
+    finally:
+        leaving.cancel()
+        answering.cancel()
+
+
 async def work(processes: Processes, item: object) -> Any:
     """Return what a process says of an item; HTTPException for what it refuses, or did not live to say."""
     future = None
@@ -265,17 +223,7 @@ async def work(processes: Processes, item: object) -> Any:
     except (RuntimeError, asyncio.CancelledError) as error:
         if future is not None and not future.cancelled():
             raise
-        raise HTTPException(503, "this scan, or walk, was closed meanwhile", RETRY) from error
-
-
-async def read_options(request: Request) -> dict[str, Any]:
-    """Return the options that are the body of a request."""
-    text = b""
-    async for part in request.stream():
-        text += part
-        if len(text) > MAX_OPTIONS:
-            raise HTTPException(413, f"found a larger body, wanted options of at most {MAX_OPTIONS} bytes")
-    return parse_options(text.decode(errors="replace"))
+        raise HTTPException(503, "this scan was closed meanwhile", RETRY) from error
 
 
 def keep_photo(folder: Path, task: Task, result: Result) -> None:
@@ -296,9 +244,6 @@ def make_app(service: Service) -> Starlette:
         Route("/openapi.json", service.describe),
         Route("/localize", service.localize, methods=["POST"]),
         Route("/show", service.show, methods=["POST"]),
-        Route("/walks", service.begin_walk, methods=["POST"]),
-        Route("/walks/{walk}", service.follow, methods=["POST"]),
-        Route("/walks/{walk}", service.end_walk, methods=["DELETE"]),
         *(Route(path, service.page) for path in ("/", "/report.js", "/app.js", "/app.css", "/plans/{name}")),
     ]
 

@@ -14,7 +14,7 @@ from ..files.json_file import DAMAGE
 from ..localization.settings import CoarseToFineSettings
 from ..photo import Photo, Prior
 
-PARTS = ("photo", "prior", "gravity", "min_confidence", "time", "motion")  # of options; the last of walks
+PARTS = ("photo", "prior", "gravity", "min_confidence")
 # options of a photo that name no file
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}

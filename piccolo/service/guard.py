@@ -2,7 +2,6 @@
 
 import asyncio
 import secrets
-from time import monotonic
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -14,8 +13,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 COOKIE = "piccolo_token"
 OPEN = ("/health", "/enter")  # paths that need no token
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-READ_S = 60.0  # [s] for a body to arrive
-DROP_S = 10.0  # [s] for what is left of a refused one: a client that still sends would not hear the answer
+DROP_S = 10.0  # [s] for what is left of a refused body, before the connection is closed: a client that still
+# sends would not hear the answer; on a connection that stays open uvicorn reads and drops it
 SECURITY = {
     "Content-Security-Policy": "frame-ancestors 'none'",
     "X-Content-Type-Options": "nosniff",
@@ -26,28 +25,23 @@ SECURITY = {
 
 
 class Body:
-    """The body of a request, read up to a limit; the rest of one that is refused is read and dropped."""
+    """The body of a request, read up to a limit."""
 
     def __init__(self, receive: Receive, max_bytes: int) -> None:
         self._receive = receive
         self._max_bytes = max_bytes
         self._num_bytes = 0
         self._is_whole = False
-        self._end_s = monotonic() + READ_S
 
     async def receive(self) -> Message:
-        """Return the next part; HTTPException for one too many, or too late."""
-        try:
-            left_s = None if self._is_whole else self._end_s - monotonic()
-            message = await asyncio.wait_for(self._next(), left_s)
-        except TimeoutError:
-            raise HTTPException(408, f"found a part of the body after {READ_S:g} s, wanted all") from None
+        """Return the next part; HTTPException for one too many."""
+        message = await self._next()
         if self._num_bytes > self._max_bytes:
             raise too_large(self._max_bytes)
         return message
 
     async def drop_rest(self) -> None:
-        """Read what is left, for a while."""
+        """Read what is left of a refused one, for a while."""
         try:
             async with asyncio.timeout(DROP_S):
                 while not self._is_whole:
@@ -76,15 +70,17 @@ class Guard:
             await self.app(scope, receive, send)
             return
         body = Body(receive, self.max_bytes)
+        headers = Headers(scope=scope)
 
         async def answer(message: Message) -> None:
             if message["type"] == "http.response.start":
-                await body.drop_rest()
+                if headers.get("connection", "").lower() == "close":
+                    await body.drop_rest()
                 MutableHeaders(scope=message).update(SECURITY)
             await send(message)
 
         try:
-            self.check(scope, Headers(scope=scope))
+            self.check(scope, headers)
         except HTTPException as error:
             await refuse(error)(scope, body.receive, answer)
             return
