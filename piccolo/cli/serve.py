@@ -5,7 +5,7 @@ import re
 import secrets
 import socket
 from argparse import ArgumentParser
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -16,6 +16,7 @@ from ..files.json_file import read_text
 from ..jobs.memory import GB, memory_taken
 from ..jobs.threads import num_cores
 from ..service.desk import Limits, open_desk
+from ..service.keep import open_keep
 from .command import Arguments, UsageError, checking_options, command, option
 from .options import CACHE_TEXT, add_cloud_options, add_method_options
 from .settings import localizer_from
@@ -87,10 +88,11 @@ def main(arguments: Arguments) -> int:
     )
     memory = a.max_memory and (a.max_memory - memory_taken() / GB) / a.jobs
     localizer = replace(localizer, max_memory=memory)
-    with listening(a.host, a.port) as server, temporary_folder() as folder:
+    keeping = open_keep(a.keep) if a.keep else nullcontext()
+    with listening(a.host, a.port) as server, temporary_folder() as folder, keeping as keep:
         os.environ["TMPDIR"] = str(folder)  # of the processes: what a killed one leaves goes at the end
         desk = partial(open_desk, localizer, a.jobs, limits, a.keep is not None, a.workers())
-        service = Service(desk, limits, a.keep, token)
+        service = Service(desk, limits, keep, token)
         a.warn(service.desk.scan_map.warnings)
         a.note(f"open {page_address(server, token)} in a browser; Ctrl-C ends it")
         with closing(service):

@@ -7,7 +7,6 @@ import secrets
 from collections.abc import AsyncIterator, Callable, Coroutine
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -23,19 +22,20 @@ from starlette.routing import Route
 from .. import __version__
 from ..batch.localizer import Task
 from ..errors import InputError
-from ..files.atomic import write_atomically
 from ..jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
 from ..localization.settings import CoarseToFineSettings
+from ..photo import Photo
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
+from ..scan_map.scan_map import ScanMap
 from .asking import apply_options, clean_name, make_photo, parse_options
 from .desk import Desk, Drawing, Limits, content_of, look_at
-from .guard import COOKIE, Guard, refuse
+from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
+from .keep import Keep, key_of
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
-RETRY = {"Retry-After": "2"}
 LINES = "application/x-ndjson"
 TYPES = {".js": "text/javascript", ".css": "text/css"}
 
@@ -44,7 +44,7 @@ class Service:
     """Answers requests: of one event loop, while the work is done in other processes."""
 
     def __init__(
-        self, open_desk: Callable[[], Desk], limits: Limits, keep: Path | None, token: str | None
+        self, open_desk: Callable[[], Desk], limits: Limits, keep: Keep | None, token: str | None
     ) -> None:
         self.open_desk = open_desk
         self.limits = limits
@@ -65,7 +65,9 @@ class Service:
         if name in self.desk.plans:
             return Response(self.desk.plans[name], media_type="image/png")
         if name == "report.js":
-            return Response(site.report_script(self.desk.document), media_type=TYPES[".js"])
+            photos = self.keep.photos(self.desk.scan_map) if self.keep else []
+            document = {**self.desk.document, "photos": photos}
+            return Response(site.report_script(document), media_type=TYPES[".js"])
         if name in site.PAGE_FILES:
             return Response(site.page_file(name), media_type=TYPES[Path(name).suffix])
         if name:
@@ -101,6 +103,7 @@ class Service:
         async with self.asking(request) as task:
             with self.desk.in_use() as desk:
                 result = await unless_gone(request, self.answer(desk, task))
+                await self.keep_photo(task, result)
         return Response(result.to_json(), media_type="application/json")
 
     async def show(self, request: Request) -> Response:
@@ -108,20 +111,56 @@ class Service:
         async with self.asking(request) as task:
             with self.desk.in_use() as desk:
                 result = await unless_gone(request, self.answer(desk, task))
-        (short,) = site.shorten_names([result.pano])
-        shown = site.Entry(result, None, 0.0)
-        entry = site.document_of_entry(shown, result.pano, secrets.token_hex(16), desk.scan_map)
-        about = json.dumps({**entry, "short": short, "hasPictures": True, "thumb": None})
+                kept = await self.keep_photo(task, result)
+        about = photo_document(kept or result.pano, result, desk.scan_map)
 
         async def lines() -> AsyncIterator[str]:
-            yield f'{{"photo": {about}, "result": {result.to_json()}}}\n'
+            yield f'{{"photo": {json.dumps(about)}, "result": {result.to_json()}}}\n'
             with desk.in_use():
                 try:
-                    yield f"{await work(desk.processes, Drawing(task, result))}\n"
+                    yield f"{await self.draw(desk, Drawing(task, result), kept)}\n"
                 except HTTPException as error:
                     yield f"{json.dumps({'error': error.detail})}\n"
 
         return StreamingResponse(lines(), media_type=LINES)
+
+    async def keep_photo(self, task: Task, result: Result) -> str | None:
+        """Return the name under which a photo is kept, if any is; HTTPException if there is no room."""
+        if self.keep is None:
+            return None
+        with refusing():
+            return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
+
+    async def draw(self, desk: Desk, drawing: Drawing, kept: str | None) -> str:
+        """Return JSON of a photo's thumbnail and pictures; keep the thumbnail of one that is kept."""
+        text: str = await work(desk.processes, drawing)
+        if self.keep and kept:
+            with refusing():
+                await asyncio.to_thread(self.keep.add_thumb, kept, json.loads(text)["thumb"])
+        return text
+
+    async def photo(self, request: Request) -> Response:
+        """Return the script with the pictures of a photo that is kept."""
+        key = request.path_params["key"]
+        found = await asyncio.to_thread(self.keep.find, key) if self.keep else None
+        if found is None:
+            raise HTTPException(404, "found no such photo")
+        content, result = found
+        name = Path(result.pano).name
+        settings = self.desk.localizer.settings
+        with self.desk.in_use() as desk:
+            task = Task(Photo(Path(name)), settings, {name: content})
+            text = await self.draw(desk, Drawing(task, replace(result, pano=name)), name)
+        script = site.photo_script(key, json.dumps(json.loads(text)["pictures"]))
+        return Response(script, media_type=TYPES[".js"])
+
+    async def thumb(self, request: Request) -> Response:
+        """Return the thumbnail of a photo that is kept."""
+        key = request.path_params["key"]
+        found = await asyncio.to_thread(self.keep.find_thumb, key) if self.keep else None
+        if found is None:
+            raise HTTPException(404, "found no such thumbnail")
+        return Response(found, media_type="image/jpeg")
 
     @asynccontextmanager
     async def asking(self, request: Request) -> AsyncIterator[Task]:
@@ -160,14 +199,10 @@ class Service:
         """Localize a photo; HTTPException for one that can't be read."""
         result: Result = (await work(desk.processes, task)).result
         if result.status == FAILED:
+            LOG.warning("a photo was given up: %s", result.error)
             raise HTTPException(503, result.error, RETRY)
         if result.status == UNREADABLE:
             raise HTTPException(422, result.error)
-        if self.keep:
-            try:
-                await asyncio.to_thread(keep_photo, self.keep, task, result)
-            except OSError as error:
-                LOG.warning("%s: a photo could not be kept: %s", self.keep, error)
         return result
 
     def look_for_another_scan(self) -> None:
@@ -216,6 +251,8 @@ async def work(processes: Processes, item: object) -> Any:
         return await asyncio.wrap_future(future)
     except OpeningError as error:
         raise HTTPException(503, f"the scan can't be opened at the moment: {error}", RETRY) from error
+    except SHORTAGE as error:
+        raise refusal_of(error) from error
     except InputError as error:
         raise HTTPException(422, str(error)) from error
     except (TooSlowError, WorkerLostError) as error:
@@ -226,13 +263,11 @@ async def work(processes: Processes, item: object) -> Any:
         raise HTTPException(503, "this scan was closed meanwhile", RETRY) from error
 
 
-def keep_photo(folder: Path, task: Task, result: Result) -> None:
-    """Write a photo into a folder, under a name that no other has, and its line after those there."""
-    content = content_of(task)
-    path = folder / f"{sha256(content).hexdigest()[:12]}-{task.photo.name}"
-    write_atomically(path, content)
-    with (folder / "results.jsonl").open("a") as file:
-        file.write(f"{replace(result, pano=str(path)).to_json()}\n")
+def photo_document(name: str, result: Result, scan_map: ScanMap) -> dict[str, Any]:
+    """Return what the page knows of a photo that was sent."""
+    (short,) = site.shorten_names([result.pano])
+    entry = site.document_of_entry(site.Entry(result, None, 0.0), name, key_of(name), scan_map)
+    return {**entry, "short": short, "hasPictures": True, "thumb": None}
 
 
 def make_app(service: Service) -> Starlette:
@@ -244,14 +279,20 @@ def make_app(service: Service) -> Starlette:
         Route("/openapi.json", service.describe),
         Route("/localize", service.localize, methods=["POST"]),
         Route("/show", service.show, methods=["POST"]),
+        Route("/photos/{key}.js", service.photo),
+        Route("/thumbs/{key}.jpg", service.thumb),
         *(Route(path, service.page) for path in ("/", "/report.js", "/app.js", "/app.css", "/plans/{name}")),
     ]
 
     async def refuse_error(request: Request, error: Exception) -> Response:
+        if isinstance(error, SHORTAGE):
+            return refuse(refusal_of(error))
         return refuse(error if isinstance(error, HTTPException) else HTTPException(400, str(error)))
+
+    refused = (HTTPException, InputError, ClientDisconnect, *SHORTAGE)
 
     return Starlette(
         routes=routes,
         middleware=[Middleware(Guard, max_bytes=service.limits.max_bytes, token=service.token)],
-        exception_handlers=dict.fromkeys((HTTPException, InputError, ClientDisconnect), refuse_error),
+        exception_handlers=dict.fromkeys(refused, refuse_error),
     )

@@ -3,6 +3,8 @@
 Photos come as their content: a process writes one into a temporary folder for as long as it is at work on it.
 """
 
+import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -128,6 +130,7 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
 
     A `Task` gets its `Answer`, a `Drawing` the JSON of its pictures; None makes ready for both.
     """
+    tempfile.tempdir = os.environ.get("TMPDIR")  # or it is tried out, and on a full disk found not to exist
     scan = localizer.open_here()
     answer = localizer.answer_in(scan)
 

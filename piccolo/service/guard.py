@@ -1,7 +1,12 @@
 """The guard at the door of the service: who may ask, from which page, and how much may be sent."""
 
 import asyncio
+import errno
+import logging
+import os
 import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers, MutableHeaders
@@ -10,6 +15,13 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ..errors import ResourceError, printable
+from ..result import describe_failure
+
+LOG = logging.getLogger(__name__)
+RETRY = {"Retry-After": "2"}
+SHORTAGE = (OSError, MemoryError, ResourceError)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 COOKIE = "piccolo_token"
 OPEN = ("/health", "/enter")  # paths that need no token
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
@@ -114,6 +126,28 @@ class Guard:
 def too_large(max_bytes: int) -> HTTPException:
     """Return the refusal of a body."""
     return HTTPException(413, f"found a larger body, wanted at most {max_bytes} bytes")
+
+
+def refusal_of(error: Exception) -> HTTPException:
+    """Return the refusal where the system gave way, SHORTAGE, and write a line of it into the log.
+
+    507 is a full disk; 503 is memory or files that there were too few of.
+    """
+    LOG.error("a request could not be answered: %s", printable(describe_failure(error)))
+    cause = error.__cause__ if isinstance(error, ResourceError) else error
+    reason = os.strerror(cause.errno or 0) if isinstance(cause, OSError) else "not enough memory"
+    if isinstance(cause, OSError) and cause.errno in NO_ROOM:
+        return HTTPException(507, f"found no room on the disk of the service ({reason}), wanted some")
+    return HTTPException(503, f"found too little of what the service needs ({reason}), try again", RETRY)
+
+
+@contextmanager
+def refusing() -> Iterator[None]:
+    """Within this, HTTPException where the system gives way."""
+    try:
+        yield
+    except SHORTAGE as error:
+        raise refusal_of(error) from error
 
 
 def refuse(error: HTTPException) -> JSONResponse:
