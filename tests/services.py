@@ -60,9 +60,12 @@ def serving(*words, before=()):
     else:
         pytest.fail("".join(lines))
     address = lines[-1].split(" open ")[1].split()[0]
-    client = Client(int(address.split(":")[2].split("/")[0]), process)
+    port = words[words.index("--port") + 1] if "--port" in words else address.split(":")[2].split("/")[0]
+    client = Client(int(port), process)
     client.address = address
-    yield client
-    if process.poll() is None:
-        process.send_signal(signal.SIGTERM)
-    client.rest = process.communicate(timeout=60)[1]
+    try:
+        yield client
+    finally:
+        if process.poll() is None:
+            process.send_signal(signal.SIGTERM)
+        client.rest = process.communicate(timeout=60)[1]

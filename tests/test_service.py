@@ -240,22 +240,6 @@ def test_a_photo_that_takes_too_long_is_given_up(scene, folder, photo):
     assert set(Path(tempfile.gettempdir()).glob("piccolo-*/**/a.jpg")) <= before
 
 
-def test_others_need_the_token(scene, folder):
-    words = ["--host", "0.0.0.0", "--jobs", "1"]
-    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
-        token = client.address.split("token=")[1]
-        for path in ("/", "/scan", "/report.js", "/app.js"):
-            assert client.ask("GET", path)[0] == 401
-            assert client.ask("GET", path, Authorization="Bearer wrong")[0] == 401
-            assert client.ask("GET", path, Authorization=f"Bearer {token}")[0] == 200
-        status, headers, _ = client.ask("GET", f"/enter?token={token}")
-        assert (status, headers["location"]) == (303, "/")
-        assert "httponly" in headers["set-cookie"].lower()
-        cookie = headers["set-cookie"].split(";")[0]
-        assert client.ask("GET", "/", Cookie=cookie)[0] == 200
-        assert client.ask("GET", "/health")[0] == 200
-
-
 def test_a_scan_that_is_replaced_is_opened_again(folder, scene, photo):
     path = folder / "replaced.ply"
     path.write_bytes((scene / "cloud.ply").read_bytes())

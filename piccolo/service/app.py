@@ -15,6 +15,7 @@ from starlette.applications import Starlette
 from starlette.datastructures import FormData, UploadFile
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -28,6 +29,7 @@ from ..photo import Photo
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.scan_map import ScanMap
+from .access import Access
 from .asking import apply_options, clean_name, make_photo, parse_options
 from .desk import Desk, Drawing, Limits, content_of, look_at
 from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
@@ -37,6 +39,9 @@ LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
 LINES = "application/x-ndjson"
+UNBUFFERED = {"X-Accel-Buffering": "no"}  # nginx: a line is sent on at once
+CORS: dict[str, Any] = {"allow_methods": ["GET", "POST"], "allow_headers": ["Authorization"]}
+CORS |= {"expose_headers": ["Retry-After"]}
 TYPES = {".js": "text/javascript", ".css": "text/css"}
 
 
@@ -44,12 +49,12 @@ class Service:
     """Answers requests: of one event loop, while the work is done in other processes."""
 
     def __init__(
-        self, open_desk: Callable[[], Desk], limits: Limits, keep: Keep | None, token: str | None
+        self, open_desk: Callable[[], Desk], limits: Limits, keep: Keep | None, access: Access
     ) -> None:
         self.open_desk = open_desk
         self.limits = limits
         self.keep = keep
-        self.token = token  # which who asks must know; None lets all of this machine ask
+        self.access = access
         self.desk = open_desk()
         self.num_waiting = 0
         self.reopening: asyncio.Task[None] | None = None
@@ -77,11 +82,14 @@ class Service:
 
     async def enter(self, request: Request) -> Response:
         """Take the token from the address into a cookie."""
-        token = request.query_params.get("token", "")
-        if self.token is None or not secrets.compare_digest(token.encode(), self.token.encode()):
+        given = request.query_params.get("token", "")
+        token = self.access.token
+        if token is None or not secrets.compare_digest(given.encode(), token.encode()):
             raise HTTPException(401, "found another token, wanted the one that the service printed")
-        response = RedirectResponse("/", 303)
-        response.set_cookie(COOKIE, self.token, httponly=True, samesite="lax")
+        path = self.access.path
+        response = RedirectResponse(path, 303)
+        secure = self.access.is_secure
+        response.set_cookie(COOKIE, token, path=path, secure=secure, httponly=True, samesite="lax")
         return response
 
     async def scan(self, request: Request) -> Response:
@@ -122,7 +130,7 @@ class Service:
                 except HTTPException as error:
                     yield f"{json.dumps({'error': error.detail})}\n"
 
-        return StreamingResponse(lines(), media_type=LINES)
+        return StreamingResponse(lines(), media_type=LINES, headers=UNBUFFERED)
 
     async def keep_photo(self, task: Task, result: Result) -> str | None:
         """Return the name under which a photo is kept, if any is; HTTPException if there is no room."""
@@ -293,6 +301,9 @@ def make_app(service: Service) -> Starlette:
 
     return Starlette(
         routes=routes,
-        middleware=[Middleware(Guard, max_bytes=service.limits.max_bytes, token=service.token)],
+        middleware=[
+            Middleware(CORSMiddleware, **CORS, allow_origins=service.access.origins),
+            Middleware(Guard, max_bytes=service.limits.max_bytes, access=service.access),
+        ],
         exception_handlers=dict.fromkeys(refused, refuse_error),
     )

@@ -17,6 +17,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ..errors import ResourceError, printable
 from ..result import describe_failure
+from .access import LOOPBACK, Access
 
 LOG = logging.getLogger(__name__)
 RETRY = {"Retry-After": "2"}
@@ -24,7 +25,6 @@ SHORTAGE = (OSError, MemoryError, ResourceError)
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 COOKIE = "piccolo_token"
 OPEN = ("/health", "/enter")  # paths that need no token
-LOOPBACK = ("127.0.0.1", "localhost", "::1")
 DROP_S = 10.0  # [s] for what is left of a refused body, before the connection is closed: a client that still
 # sends would not hear the answer; on a connection that stays open uvicorn reads and drops it
 SECURITY = {
@@ -71,16 +71,17 @@ class Body:
 class Guard:
     """Lets requests through to an application."""
 
-    def __init__(self, app: ASGIApp, max_bytes: int, token: str | None) -> None:
+    def __init__(self, app: ASGIApp, max_bytes: int, access: Access) -> None:
         self.app = app
         self.max_bytes = max_bytes
-        self.token = token
+        self.access = access
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass a request on, or refuse it in one line."""
         if scope["type"] != "http":
             await self.app(scope, receive, send)
             return
+        scope["path"] = self.without_prefix(scope["path"])
         body = Body(receive, self.max_bytes)
         headers = Headers(scope=scope)
 
@@ -98,29 +99,43 @@ class Guard:
             return
         await self.app(scope, body.receive, answer)
 
+    def without_prefix(self, path: str) -> str:
+        """Return the path below that of the page, which proxies may leave in."""
+        prefix = self.access.path.rstrip("/")
+        return path.removeprefix(prefix) if path.startswith(f"{prefix}/") else path
+
     def check(self, scope: Scope, headers: Headers) -> None:
         """Raise HTTPException for a request of a foreign host, a foreign page, or without the token."""
-        host = headers.get("host", "")
-        origin = headers.get("origin")
+        token = self.access.token
+        self.check_addresses(headers.get("host", ""), headers.get("origin"))
+        if token is not None and scope["path"] not in OPEN and not knows_token(scope, headers, token):
+            found = "found no token, or another: open the address that the service printed"
+            raise HTTPException(401, found, {"WWW-Authenticate": "Bearer"})
+        if int(headers.get("content-length", "0")) > self.max_bytes:
+            raise too_large(self.max_bytes)
+
+    def check_addresses(self, host: str, origin: str | None) -> None:
+        """Raise HTTPException for a host or a page that is not of this service."""
         try:
             name = urlsplit(f"//{host}").hostname
             page = host if origin is None else urlsplit(origin).netloc
         except ValueError:
             raise HTTPException(403, "found no name of a host") from None
-        if self.token is None and name not in LOOPBACK:
-            raise HTTPException(403, f"found the host {host[:80]!r}, wanted localhost")
-        if origin is not None and page != host:
-            raise HTTPException(403, f"found a page of {origin[:80]!r}, wanted one of this service")
-        if self.token is not None and scope["path"] not in OPEN and not self.knows_token(scope, headers):
-            raise HTTPException(401, "found no token, or another: open the address that the service printed")
-        if int(headers.get("content-length", "0")) > self.max_bytes:
-            raise too_large(self.max_bytes)
+        if self.access.token is None and name not in LOOPBACK:
+            found = f"found the host {host[:80]!r}, wanted localhost"
+            raise HTTPException(403, f"{found}; behind a proxy the service needs `public_url`")
+        own = (host, urlsplit(self.access.public_url or "").netloc)
+        if page not in own and origin not in self.access.origins:
+            found = f"found a page of {printable(origin or '')[:80]}, wanted one of this service"
+            advice = "it needs `public_url` behind a proxy, `allow_origin` for other sites' pages"
+            raise HTTPException(403, f"{found}; {advice}")
 
-    def knows_token(self, scope: Scope, headers: Headers) -> bool:
-        """Return True if the token came as a bearer's, or as the page's cookie."""
-        scheme, _, bearer = headers.get("authorization", "").partition(" ")
-        given = bearer if scheme.lower() == "bearer" else Request(scope).cookies.get(COOKIE, "")
-        return secrets.compare_digest(given.encode(), (self.token or "").encode())
+
+def knows_token(scope: Scope, headers: Headers, token: str) -> bool:
+    """Return True if the token came as a bearer's, or as the page's cookie."""
+    scheme, _, bearer = headers.get("authorization", "").partition(" ")
+    given = bearer if scheme.lower() == "bearer" else Request(scope).cookies.get(COOKIE, "")
+    return secrets.compare_digest(given.encode(), token.encode())
 
 
 def too_large(max_bytes: int) -> HTTPException:
