@@ -3,9 +3,13 @@
 import json
 import os
 import signal
+import subprocess
+import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 
 import pytest
@@ -94,8 +98,6 @@ def _form(parts):
 
 def _blank(width, height):
     """A PNG that is blank and much smaller than what it becomes."""
-    from io import BytesIO  # noqa: PLC0415
-
     from PIL import Image  # noqa: PLC0415
 
     file = BytesIO()
@@ -110,7 +112,7 @@ BROKEN = {
     "too large": (413, "at most 2000000 bytes", lambda c, p: c.post("/localize", "a.jpg", bytes(20_000_000))),
     "too many pixels": (422, "1 megapixels", lambda c, p: c.post("/localize", "a.png", _blank(4096, 2048))),
     "no form": (400, "multipart/form-data", lambda c, p: c.ask("POST", "/localize", p)),
-    "no picture": (400, "no picture", lambda c, p: c.ask("POST", "/localize", **_form([('name="a"', "b")]))),
+    "no picture": (400, "no picture", lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "")]))),
     "torn form": (400, "", lambda c, p: c.ask("POST", "/localize", p, Content_Type="multipart/form-data")),
     "no JSON": (400, "JSON", lambda c, p: c.post("/localize", "a.jpg", p, "{")),
     "a list": (400, "object", lambda c, p: c.post("/localize", "a.jpg", p, [])),
@@ -129,8 +131,28 @@ BROKEN = {
     "bad type": (400, "near", lambda c, p: c.post("/localize", "a.jpg", p, {"prior": {"near": "here"}})),
     "many files": (
         400,
-        "",
-        lambda c, p: c.ask("POST", "/localize", **_form([(f'name="p"; filename="{k}"', "b") for k in "ab"])),
+        "one file",
+        lambda c, p: c.ask(
+            "POST", "/localize", **_form([(f'name="picture"; filename="{k}"', "b") for k in "ab"])
+        ),
+    ),
+    "very many": (
+        400,
+        "one file",
+        lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "b") for _ in range(20)])),
+    ),
+    "a field": (
+        400,
+        "'fov_deg', wanted it in options.photo",
+        lambda c, p: c.ask(
+            "POST", "/localize", **_form([('name="picture"; filename="a"', "b"), ('name="fov_deg"', "9")])
+        ),
+    ),
+    "an address": (400, "'fov_deg' in the address", lambda c, p: c.post("/localize?fov_deg=70", "a.jpg", p)),
+    "misplaced": (
+        400,
+        "'near', wanted it in options.prior",
+        lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"near": [1, 2]}}),
     ),
     "method": (405, "", lambda c, p: c.ask("GET", "/localize")),
     "another page": (403, "evil", lambda c, p: c.post("/localize", "a.jpg", p, Origin="http://evil.example")),
@@ -174,13 +196,51 @@ def test_nothing_but_the_page_can_be_read(service):
         assert service.ask("GET", f"/{name}")[0] == 200
 
 
-def test_the_description_has_every_address(service):
-    document = json.loads(service.ask("GET", "/openapi.json")[2])
-    found = {(path, method.upper()) for path, item in document["paths"].items() for method in item}
-    assert found == {
-        *((path, "POST") for path in ("/localize", "/show")),
-        *((path, "GET") for path in ("/scan", "/health")),
-    }
+def test_a_client_is_generated_from_the_description(service, photo, expected, tmp_path, monkeypatch):
+    (tmp_path / "openapi.json").write_bytes(service.ask("GET", "/openapi.json")[2])
+    (tmp_path / "config.yml").write_text("post_hooks: []")
+    words = [
+        "generate",
+        "--path",
+        "openapi.json",
+        "--config",
+        "config.yml",
+        "--meta",
+        "none",
+        "--output-path",
+        "asking_piccolo",
+    ]
+    command = [sys.executable, "-m", "openapi_python_client", *words, "--fail-on-warning"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.syspath_prepend(tmp_path)
+    made = import_module("asking_piccolo")
+    models = import_module("asking_piccolo.models")
+    localize = import_module("asking_piccolo.api.default.localize").sync
+    file = import_module("asking_piccolo.types").File(BytesIO(photo), "a.jpg", "image/jpeg")
+    with made.Client(f"http://127.0.0.1:{service.port}", timeout=120) as client:
+        result = localize(client=client, body=models.PhotoForm(file))
+        assert type(result) is models.Result
+        assert result.center_world == expected["center_world"]
+        assert result.r_cam_from_world == expected["R_cam_from_world"]
+        far = models.Options(prior=models.PriorOptions(near=[90.0, 0.0, None], radius=1.0))
+        other = localize(client=client, body=models.PhotoForm(file, far))
+        assert other.status == models.ResultStatus.NOT_LOCALIZED
+
+
+def test_a_request_can_be_tried_without_the_net(service):
+    status, headers, body = service.ask("GET", "/docs")
+    assert (status, headers["content-type"]) == (200, "text/html; charset=utf-8")
+    assert b"http" not in body.replace(b"http-equiv", b"")
+    assert b'action="localize"' in body
+
+
+def test_null_is_not_given(service, photo, expected):
+    asked = {"photo": {"fov_deg": None}, "prior": {"near": None}, "gravity": None, "min_confidence": None}
+    status, _, body = service.post("/localize", "a.jpg", photo, {**asked, "prior": None})
+    assert status == 200
+    assert _same(json.loads(body), expected)
+    assert service.post("/localize", "a.jpg", photo, asked)[0] == 200
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.datastructures import FormData, UploadFile
+from starlette.datastructures import FormData
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
 from starlette.middleware.cors import CORSMiddleware
@@ -30,13 +30,14 @@ from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.scan_map import ScanMap
 from .access import Access
-from .asking import apply_options, clean_name, make_photo, parse_options
+from .asking import FORM, apply_options, make_photo, parse_options, read_form
 from .desk import Desk, Drawing, Limits, content_of, look_at
 from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
-from .keep import Keep, key_of
+from .keep import Keep
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
+MAX_PARTS = 8  # of a form: more are not read, to say which is wrong
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
 LINES = "application/x-ndjson"
 UNBUFFERED = {"X-Accel-Buffering": "no"}  # nginx: a line is sent on at once
@@ -106,6 +107,16 @@ class Service:
         text = (files("piccolo.service") / "openapi.json").read_text(encoding="utf-8")
         return Response(text.replace("{{version}}", __version__), media_type="application/json")
 
+    async def docs(self, request: Request) -> Response:
+        """Return a page on which a request can be tried."""
+        text = (files("piccolo.service") / "docs.html").read_text(encoding="utf-8")
+        return Response(text, media_type="text/html")
+
+    async def docs(self, request: Request) -> Response:
+        """Return a page on which a request can be tried."""
+        text = (files("piccolo.service") / "docs.html").read_text(encoding="utf-8")
+        return Response(text, media_type="text/html")
+
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it."""
         async with self.asking(request) as task:
@@ -174,28 +185,19 @@ class Service:
     async def asking(self, request: Request) -> AsyncIterator[Task]:
         """Yield the photo that was sent, when all of it is there; HTTPException if too many wait."""
         self.look_for_another_scan()
-        async with request.form(max_files=1, max_fields=1, max_part_size=MAX_OPTIONS) as form:
+        if request.query_params:
+            raise HTTPException(400, f"found {min(request.query_params)!r} in the address, {FORM}")
+        async with reading_form(request) as form:
             if self.num_waiting >= self.limits.max_waiting:
                 raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
             self.num_waiting += 1
             try:
-                task = await self.read(form)
+                name, content, text = await read_form(form)
                 await form.close()
-                yield task
+                options = parse_options(text)
+                yield Task(make_photo(name, options), self.settings_of(options), {name: content})
             finally:
                 self.num_waiting -= 1
-
-    async def read(self, form: FormData) -> Task:
-        """Return the photo in a form of the parts `picture` and `options`."""
-        picture = form.get("picture")
-        text = form.get("options", "")
-        if not isinstance(picture, UploadFile) or not isinstance(text, str):
-            wanted = "wanted multipart/form-data with `picture`, a file, and perhaps `options`, JSON"
-            raise HTTPException(400, f"found no picture, {wanted}")
-        content = await picture.read()
-        name = clean_name(picture.filename or "")
-        options = parse_options(text)
-        return Task(make_photo(name, options), self.settings_of(options), {name: content})
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
         """Return the service's settings with a request's own in their place."""
@@ -237,6 +239,22 @@ class Service:
             self.reopening = None
 
 
+@asynccontextmanager
+async def reading_form(request: Request) -> AsyncIterator[FormData]:
+    """Yield the form that was sent; HTTPException for a torn one, which says what to send."""
+    limits = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_OPTIONS}
+    try:
+        form = await request.form(**limits)
+    except HTTPException as error:
+        if error.status_code != 400:
+            raise
+        raise HTTPException(400, f"{error.detail.rstrip('.')}; {FORM}") from error
+    try:
+        yield form
+    finally:
+        await form.close()
+
+
 async def unless_gone(request: Request, answer: Coroutine[Any, Any, Result]) -> Result:
     """Return an answer; ClientDisconnect if the client leaves meanwhile: a photo that waits is given up."""
     answering = asyncio.create_task(answer)
@@ -274,7 +292,7 @@ async def work(processes: Processes, item: object) -> Any:
 def photo_document(name: str, result: Result, scan_map: ScanMap) -> dict[str, Any]:
     """Return what the page knows of a photo that was sent."""
     (short,) = site.shorten_names([result.pano])
-    entry = site.document_of_entry(site.Entry(result, None, 0.0), name, key_of(name), scan_map)
+    entry = site.document_of_entry(site.Entry(result, None, 0.0), name, secrets.token_hex(16), scan_map)
     return {**entry, "short": short, "hasPictures": True, "thumb": None}
 
 
@@ -285,6 +303,8 @@ def make_app(service: Service) -> Starlette:
         Route("/scan", service.scan),
         Route("/health", service.health),
         Route("/openapi.json", service.describe),
+        Route("/docs", service.docs),
+        Route("/docs", service.docs),
         Route("/localize", service.localize, methods=["POST"]),
         Route("/show", service.show, methods=["POST"]),
         Route("/photos/{key}.js", service.photo),
