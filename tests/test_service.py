@@ -112,7 +112,11 @@ BROKEN = {
     "too large": (413, "at most 2000000 bytes", lambda c, p: c.post("/localize", "a.jpg", bytes(20_000_000))),
     "too many pixels": (422, "1 megapixels", lambda c, p: c.post("/localize", "a.png", _blank(4096, 2048))),
     "no form": (400, "multipart/form-data", lambda c, p: c.ask("POST", "/localize", p)),
-    "no picture": (400, "no picture", lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "")]))),
+    "no picture": (
+        400,
+        "no picture",
+        lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "")])),
+    ),
     "torn form": (400, "", lambda c, p: c.ask("POST", "/localize", p, Content_Type="multipart/form-data")),
     "no JSON": (400, "JSON", lambda c, p: c.post("/localize", "a.jpg", p, "{")),
     "a list": (400, "object", lambda c, p: c.post("/localize", "a.jpg", p, [])),

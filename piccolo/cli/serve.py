@@ -30,10 +30,10 @@ examples:
   curl -F picture=@crop.jpg -F options='{"photo": {"fov_deg": 70}}' http://127.0.0.1:8765/localize
   python tools/serve.py --cloud house.map --host 0.0.0.0 --jobs 4 --keep photos
 
-/localize answers the line of JSON that localize.py writes; /openapi.json describes all addresses. Only this
-machine may ask, unless --host says otherwise: then a token is needed, which is printed as part of the page's
-address. Photos are not kept without --keep. A scan that is replaced is opened again. Ctrl-C or SIGTERM lets
-the photos at work finish. Needs the extra serve.
+/localize answers the line of JSON that localize.py writes; /docs tries it. Only this machine may ask, unless
+--host or --public-url says otherwise: then a token is needed, which is printed as part of the page's address.
+--host alone sends all in clear text; docs/recipes/proxy.md has HTTPS. Photos are not kept without --keep. A
+scan that is replaced is opened again. Ctrl-C or SIGTERM lets photos at work finish. Needs the extra serve.
 """
 TOKEN = re.compile(r"[\w-]{8,200}", re.ASCII)
 HERE = "127.0.0.1"

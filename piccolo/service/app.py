@@ -112,11 +112,6 @@ class Service:
         text = (files("piccolo.service") / "docs.html").read_text(encoding="utf-8")
         return Response(text, media_type="text/html")
 
-    async def docs(self, request: Request) -> Response:
-        """Return a page on which a request can be tried."""
-        text = (files("piccolo.service") / "docs.html").read_text(encoding="utf-8")
-        return Response(text, media_type="text/html")
-
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it."""
         async with self.asking(request) as task:
@@ -303,7 +298,6 @@ def make_app(service: Service) -> Starlette:
         Route("/scan", service.scan),
         Route("/health", service.health),
         Route("/openapi.json", service.describe),
-        Route("/docs", service.docs),
         Route("/docs", service.docs),
         Route("/localize", service.localize, methods=["POST"]),
         Route("/show", service.show, methods=["POST"]),

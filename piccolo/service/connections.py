@@ -161,7 +161,8 @@ class Throttle(logging.Filter):
 
 
 def configure(app: ASGIApp, num_jobs: int, grace_s: float) -> uvicorn.Config:
-    """Return how uvicorn runs an application; its log goes to stderr."""
+    """Return how uvicorn runs an application; all logs go to stderr, few lines of a kind."""
+    logging.getLogger("piccolo").handlers.clear()  # a command's says a thing once, however long it runs
     handler = logging.StreamHandler()
     handler.addFilter(Throttle())
     logging.basicConfig(handlers=[handler], format="%(message)s", level=logging.WARNING)
