@@ -55,7 +55,7 @@ def serving(*words, before=()):
     lines = []
     for line in process.stderr:
         lines.append(line)
-        if " open http://" in line:
+        if " open http" in line:
             break
     else:
         pytest.fail("".join(lines))
