@@ -60,6 +60,7 @@ def test_who_leaves_is_not_computed(scene, tmp_path, photo):
                 time.sleep(0.01)
         assert client.post("/localize", "a.jpg", photo)[0] == 200
         assert json.loads(client.ask("GET", "/health")[2])["waiting"] == 0
+    assert "Task exception" not in client.rest
     assert len((tmp_path / "results.jsonl").read_text().splitlines()) < 12
 
 

@@ -4,8 +4,8 @@ import asyncio
 import json
 import logging
 import secrets
-from collections.abc import AsyncIterator, Callable, Coroutine
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
@@ -71,8 +71,7 @@ class Service:
         if name in self.desk.plans:
             return Response(self.desk.plans[name], media_type="image/png")
         if name == "report.js":
-            photos = self.keep.photos(self.desk.scan_map) if self.keep else []
-            document = {**self.desk.document, "photos": photos}
+            document = await asyncio.to_thread(self.document)
             return Response(site.report_script(document), media_type=TYPES[".js"])
         if name in site.PAGE_FILES:
             return Response(site.page_file(name), media_type=TYPES[Path(name).suffix])
@@ -80,6 +79,11 @@ class Service:
             raise HTTPException(404, "found no such plan")
         policy = site.POLICY.format(script=site.OWN, style=site.OWN)
         return Response(site.page_under(f"{policy}; connect-src 'self'"), media_type="text/html")
+
+    def document(self) -> dict[str, Any]:
+        """Return what the page knows when it opens: the scan, and the photos that are kept."""
+        photos = self.keep.photos(self.desk.scan_map) if self.keep else []
+        return {**self.desk.document, "photos": photos}
 
     async def enter(self, request: Request) -> Response:
         """Take the token from the address into a cookie."""
@@ -162,7 +166,7 @@ class Service:
         content, result = found
         name = Path(result.pano).name
         settings = self.desk.localizer.settings
-        with self.desk.in_use() as desk:
+        with self.place(), self.desk.in_use() as desk:
             task = Task(Photo(Path(name)), settings, {name: content})
             text = await self.draw(desk, Drawing(task, replace(result, pano=name)), name)
         script = site.photo_script(key, json.dumps(json.loads(text)["pictures"]))
@@ -183,16 +187,22 @@ class Service:
         if request.query_params:
             raise HTTPException(400, f"found {min(request.query_params)!r} in the address, {FORM}")
         async with reading_form(request) as form:
-            if self.num_waiting >= self.limits.max_waiting:
-                raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
-            self.num_waiting += 1
-            try:
+            with self.place():
                 name, content, text = await read_form(form)
                 await form.close()
                 options = parse_options(text)
                 yield Task(make_photo(name, options), self.settings_of(options), {name: content})
-            finally:
-                self.num_waiting -= 1
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """Hold a place among the photos that wait; HTTPException if all are taken."""
+        if self.num_waiting >= self.limits.max_waiting:
+            raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
+        self.num_waiting += 1
+        try:
+            yield
+        finally:
+            self.num_waiting -= 1
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
         """Return the service's settings with a request's own in their place."""
@@ -262,6 +272,7 @@ async def unless_gone(request: Request, answer: Coroutine[Any, Any, Result]) -> 
     finally:
         leaving.cancel()
         answering.cancel()
+        await asyncio.gather(leaving, answering, return_exceptions=True)
 
 
 async def work(processes: Processes, item: object) -> Any:

@@ -58,7 +58,7 @@ class Keep:
     def photos(self, scan_map: ScanMap) -> list[dict[str, Any]]:
         """Return what the page knows of the photos in a scan."""
         digest = scan_map.scan_sha256
-        results = {n: r for n, r in self._results.items() if r.source.cloud_sha256 == digest}
+        results = {n: r for n, r in list(self._results.items()) if r.source.cloud_sha256 == digest}
         shorts = site.shorten_names([name[MARK + 1 :] for name in results])
         return [
             self.photo(name, short, result, scan_map)
@@ -75,7 +75,7 @@ class Keep:
 
     def find(self, key: str) -> tuple[bytes, Result] | None:
         """Return the content of a photo and its result, by its key on the page."""
-        for name, result in self._results.items():
+        for name, result in list(self._results.items()):
             if key_of(name) == key and (self.folder / name).exists():
                 return (self.folder / name).read_bytes(), result
         return None
