@@ -42,9 +42,14 @@ def opening(browser, own, is_strict=True):
     contexts = []
     wrong = []
 
+    def answer(dialog):
+        if dialog.type != "beforeunload":
+            wrong.append(f"dialog: {dialog.message}")
+        dialog.accept()
+
     def watch(page):
         page.on("pageerror", lambda error: wrong.append(str(error)))
-        page.on("dialog", lambda dialog: wrong.append(f"dialog: {dialog.message}"))
+        page.on("dialog", answer)
         page.on("request", lambda asked: asked.url.startswith(own) or wrong.append(f"asked: {asked.url}"))
         if is_strict:
             page.on("console", lambda message: message.type == "error" and wrong.append(message.text))

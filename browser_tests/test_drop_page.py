@@ -33,35 +33,50 @@ PASTE = """() => {
 }"""
 # keeps the options that are sent in window.told
 LISTEN = """() => {
-  const send = window.fetch;
-  window.fetch = (url, how) => {
-    window.told = JSON.parse(how.body.get("options"));
-    return send(url, how);
+  const append = FormData.prototype.append;
+  FormData.prototype.append = function (name, value) {
+    if (name === "options") window.told = JSON.parse(value);
+    append.call(this, name, value);
   };
 }"""
 
 WITHOUT_PICTURES = """() => {
-  const send = window.fetch;
-  window.fetch = async (url, how) => {
-    const [found] = (await (await send(url, how)).text()).split("\\n");
-    return new Response(found + '\\n{"error": "found no memory"}\\n');
-  };
+  const { get } = Object.getOwnPropertyDescriptor(XMLHttpRequest.prototype, "responseText");
+  Object.defineProperty(XMLHttpRequest.prototype, "responseText", {
+    get() {
+      const [found, pictures] = get.call(this).split("\\n");
+      return pictures === undefined ? found : found + '\\n{"error": "found no memory"}\\n';
+    },
+  });
 }"""
 
 
-@pytest.fixture(scope="session")
-def service(tmp_path_factory):
-    """The address of a service of the sample flat."""
-    words = ["--cloud", str(FLAT / "cloud.ply"), "--port", "0", "--jobs", "2"]
-    words += ["--cache", str(tmp_path_factory.mktemp("cache"))]
-    serve = [sys.executable, str(ROOT / "tools" / "serve.py"), *words]
+@contextmanager
+def _serving(cache, *more):
+    """Within this, the address of a service of the sample flat."""
+    words = ["--cloud", str(FLAT / "cloud.ply"), "--port", "0", "--jobs", "2", "--cache", str(cache)]
+    serve = [sys.executable, str(ROOT / "tools" / "serve.py"), *words, *map(str, more)]
     with subprocess.Popen(serve, stderr=subprocess.PIPE, text=True) as process:
-        for line in process.stderr:
-            if found := re.search(r"open (http://\S+) in a browser", line):
-                break
-        yield found[1]
-        process.terminate()
-        process.communicate(timeout=30)
+        try:
+            for line in process.stderr:
+                if found := re.search(r"open (http://\S+) in a browser", line):
+                    break
+            yield found[1]
+        finally:
+            process.terminate()
+            process.communicate(timeout=30)
+
+
+@pytest.fixture(scope="session")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+@pytest.fixture(scope="session")
+def service(cache):
+    """The address of a service that keeps nothing."""
+    with _serving(cache) as address:
+        yield address
 
 
 @pytest.fixture
@@ -119,7 +134,8 @@ def test_panorama_phone_photo_and_photo_of_another_place(visit, elsewhere, shoot
     assert _names(page) == ["living_room", "elsewhere", "phone"]
     assert page.locator(".row-status").all_inner_texts() == ["Waiting"] * 3
     sent = page.locator(".row-facts").all_inner_texts()
-    assert sent == ["Being localized", "Being localized", "Waiting for its turn"]
+    assert all(re.match(r"Being (localized|sent, \d+ %)", words) for words in sent[:2])
+    assert sent[2] == "Waiting for its turn"
     shoot(page, "drop-waiting")
     _wait(page, "localized", "not_localized", "localized")
     page.wait_for_selector("#viewer[data-shown]")  # the last one to finish is opened by itself
@@ -281,6 +297,89 @@ def test_a_full_service_is_asked_again_and_a_lost_one_when_told_to(visit, shoot)
     shoot(page, "drop-lost")
     page.click('.copy:has-text("Try again")')
     _wait(page, "localized", "localized")
+
+
+ANSWERS = {
+    507: ("found no room on the disk of the service", "The disk of the service is full"),
+    502: ("or a proxy before it, answered 502", "does not run behind its proxy"),
+    500: ("the photo was given up", "see what the service printed"),
+}
+
+
+@pytest.mark.parametrize("status", ANSWERS)
+def test_what_gave_way_is_told(visit, shoot, status):
+    page = visit()
+    found, advice = ANSWERS[status]
+    body = "<h1>Bad gateway</h1>" if status == 502 else f'{{"error": "{found}"}}'
+    with _answering(page, lambda route: route.fulfill(status=status, body=body)):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector(f"#facts >> text={found}")
+    assert page.locator(f"#facts >> text={advice}").is_visible()
+    assert "opens here" not in page.inner_text("#facts")
+    shoot(page, f"drop-{status}")
+    page.click('.copy:has-text("Try again")')
+    _wait(page, "localized")
+
+
+def test_a_slow_upload_shows_how_far_it_is(visit, tmp_path):
+    page = visit(**PHONE)
+    link = {"offline": False, "latency": 0, "downloadThroughput": -1, "uploadThroughput": 500_000}
+    page.context.new_cdp_session(page).send("Network.emulateNetworkConditions", link)
+    large = tmp_path / "large.jpg"
+    large.write_bytes((FLAT / "images" / "bedroom.jpg").read_bytes() + bytes(1_500_000))
+    _choose(page, large)
+    page.wait_for_selector(r"text=/Being sent, [1-9]\d? %/", state="attached")
+    page.wait_for_selector("#viewer[data-shown]")
+
+
+def test_a_reload_asks_before_it_loses_what_was_found(visit):
+    page = visit()
+    asked = []
+    page.on("dialog", lambda dialog: asked.append(dialog.type))
+    _choose(page, FLAT / "images" / "bedroom.jpg")
+    _wait(page, "localized")
+    page.wait_for_selector("#viewer[data-shown]")
+    assert page.locator(".copy:has-text('Copy link')").count() == 0  # it would open an empty page
+    page.click("#plan")  # browsers ask only on pages that were used
+    page.reload()
+    page.wait_for_selector("body.no-photos")
+    assert asked == ["beforeunload"]
+    page.reload()
+    assert asked == ["beforeunload"]
+
+
+@contextmanager
+def _keeping(browser, cache, folder):
+    """Within this, the address of a service that keeps photos, and a function that opens its page."""
+    with _serving(cache, "--keep", folder) as address, opening(browser, (address, "data:", "blob:")) as visit:
+        yield address, visit
+
+
+def test_what_is_kept_is_there_again_and_links_open_it(browser, cache, tmp_path, shoot):
+    photos = [FLAT / "images" / name for name in ("bedroom.jpg", "living_room.jpg")]
+    with _keeping(browser, cache, tmp_path) as (address, visit):
+        page = visit(address, 1400, 860)
+        page.set_default_timeout(SLOW_MS)
+        _choose(page, *photos)
+        _wait(page, "localized", "localized")
+        page.click("#row-1")
+        page.wait_for_selector('#viewer[data-shown="1"]')
+        assert page.locator("#facts .copy:has-text('Copy link')").is_visible()
+        link = page.evaluate("location.href")
+        page.reload()  # it asks nothing
+        assert _names(page) == ["bedroom", "living_room"]
+    with _keeping(browser, cache, tmp_path) as (again, visit):
+        page = visit(link.replace(address, again), 1400, 860)
+        page.set_default_timeout(SLOW_MS)
+        page.wait_for_selector('#viewer[data-shown="1"]')
+        assert page.inner_text("#photo-name") == "living_room"
+        assert _names(page) == ["bedroom", "living_room"]
+        assert page.locator("#row-1 img").evaluate("image => image.naturalWidth") > 0
+        shoot(page, "drop-kept")
+        _choose(page, photos[0])  # the same photo takes its own place
+        page.wait_for_selector("#row-1 >> text=bedroom")
+        _wait(page, "localized", "localized")
+        assert sorted(_names(page)) == ["bedroom", "living_room"]
 
 
 def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit):

@@ -1,6 +1,5 @@
 """The service as its clients have it: the command is started, and asked over HTTP."""
 
-import http.client
 import json
 import os
 import signal
@@ -8,75 +7,21 @@ import subprocess
 import sys
 import tempfile
 import time
-import uuid
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from importlib import import_module
+from io import BytesIO
 from pathlib import Path
 
 import pytest
 import rooms
 from batches import workers_of
+from services import serving
 
 from piccolo.cli import localize
 from piccolo.result import Result
 from piccolo.service.asking import clean_name
 
-ROOT = Path(__file__).resolve().parents[1]
 NEEDED = ("status", "confidence", "center_world", "R_cam_from_world", "covariance", "alternatives")
-
-
-class Client:
-    """Asks a service that runs at a port."""
-
-    def __init__(self, port, process):
-        self.port = port
-        self.process = process
-
-    def ask(self, method, path, body=b"", **headers):
-        """Status, headers and body of an answer."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=120)
-        connection.request(method, path, body, {name.replace("_", "-"): v for name, v in headers.items()})
-        answer = connection.getresponse()
-        found = answer.status, dict(answer.getheaders()), answer.read()
-        connection.close()
-        return found
-
-    def post(self, path, name, content, options=None, **headers):
-        """The same of a picture that is sent as a form."""
-        mark = uuid.uuid4().hex
-        parts = [("picture", f'; filename="{name}"', content)]
-        if options is not None:
-            text = options if isinstance(options, str) else json.dumps(options)
-            parts.append(("options", "", text.encode()))
-        body = b"".join(
-            f'--{mark}\r\nContent-Disposition: form-data; name="{key}"{more}\r\n\r\n'.encode()
-            + value
-            + b"\r\n"
-            for key, more, value in parts
-        )
-        kind = f"multipart/form-data; boundary={mark}"
-        return self.ask("POST", path, body + f"--{mark}--\r\n".encode(), Content_Type=kind, **headers)
-
-
-@contextmanager
-def serving(*words):
-    """A client of a service that is started with some options, and ended by SIGTERM."""
-    command = [sys.executable, str(ROOT / "tools/serve.py"), "--port", "0", *map(str, words)]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    lines = []
-    for line in process.stderr:
-        lines.append(line)
-        if " open http://" in line:
-            break
-    else:
-        pytest.fail("".join(lines))
-    address = lines[-1].split(" open ")[1].split()[0]
-    client = Client(int(address.split(":")[2].split("/")[0]), process)
-    client.address = address
-    yield client
-    if process.poll() is None:
-        process.send_signal(signal.SIGTERM)
-    client.rest = process.communicate(timeout=60)[1]
 
 
 @pytest.fixture(scope="module")
@@ -153,8 +98,6 @@ def _form(parts):
 
 def _blank(width, height):
     """A PNG that is blank and much smaller than what it becomes."""
-    from io import BytesIO  # noqa: PLC0415
-
     from PIL import Image  # noqa: PLC0415
 
     file = BytesIO()
@@ -169,7 +112,11 @@ BROKEN = {
     "too large": (413, "at most 2000000 bytes", lambda c, p: c.post("/localize", "a.jpg", bytes(20_000_000))),
     "too many pixels": (422, "1 megapixels", lambda c, p: c.post("/localize", "a.png", _blank(4096, 2048))),
     "no form": (400, "multipart/form-data", lambda c, p: c.ask("POST", "/localize", p)),
-    "no picture": (400, "no picture", lambda c, p: c.ask("POST", "/localize", **_form([('name="a"', "b")]))),
+    "no picture": (
+        400,
+        "no picture",
+        lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "")])),
+    ),
     "torn form": (400, "", lambda c, p: c.ask("POST", "/localize", p, Content_Type="multipart/form-data")),
     "no JSON": (400, "JSON", lambda c, p: c.post("/localize", "a.jpg", p, "{")),
     "a list": (400, "object", lambda c, p: c.post("/localize", "a.jpg", p, [])),
@@ -188,14 +135,33 @@ BROKEN = {
     "bad type": (400, "near", lambda c, p: c.post("/localize", "a.jpg", p, {"prior": {"near": "here"}})),
     "many files": (
         400,
-        "",
-        lambda c, p: c.ask("POST", "/localize", **_form([(f'name="p"; filename="{k}"', "b") for k in "ab"])),
+        "one file",
+        lambda c, p: c.ask(
+            "POST", "/localize", **_form([(f'name="picture"; filename="{k}"', "b") for k in "ab"])
+        ),
+    ),
+    "very many": (
+        400,
+        "one file",
+        lambda c, p: c.ask("POST", "/localize", **_form([('name="options"', "b") for _ in range(20)])),
+    ),
+    "a field": (
+        400,
+        "'fov_deg', wanted it in options.photo",
+        lambda c, p: c.ask(
+            "POST", "/localize", **_form([('name="picture"; filename="a"', "b"), ('name="fov_deg"', "9")])
+        ),
+    ),
+    "an address": (400, "'fov_deg' in the address", lambda c, p: c.post("/localize?fov_deg=70", "a.jpg", p)),
+    "misplaced": (
+        400,
+        "'near', wanted it in options.prior",
+        lambda c, p: c.post("/localize", "a.jpg", p, {"photo": {"near": [1, 2]}}),
     ),
     "method": (405, "", lambda c, p: c.ask("GET", "/localize")),
     "another page": (403, "evil", lambda c, p: c.post("/localize", "a.jpg", p, Origin="http://evil.example")),
     "no host": (403, "host", lambda c, p: c.ask("GET", "/scan", Host="[x")),
     "another host": (403, "evil", lambda c, p: c.ask("GET", "/report.js", Host="evil.example:80")),
-    "no walk": (404, "walk", lambda c, p: c.post("/walks/none", "a.jpg", p)),
 }
 
 
@@ -234,15 +200,51 @@ def test_nothing_but_the_page_can_be_read(service):
         assert service.ask("GET", f"/{name}")[0] == 200
 
 
-def test_the_description_has_every_address(service):
-    document = json.loads(service.ask("GET", "/openapi.json")[2])
-    found = {(path, method.upper()) for path, item in document["paths"].items() for method in item}
-    found -= {("/walks/{walk}", "PARAMETERS")}
-    assert found == {
-        *((path, "POST") for path in ("/localize", "/show", "/walks", "/walks/{walk}")),
-        *((path, "GET") for path in ("/scan", "/health")),
-        ("/walks/{walk}", "DELETE"),
-    }
+def test_a_client_is_generated_from_the_description(service, photo, expected, tmp_path, monkeypatch):
+    (tmp_path / "openapi.json").write_bytes(service.ask("GET", "/openapi.json")[2])
+    (tmp_path / "config.yml").write_text("post_hooks: []")
+    words = [
+        "generate",
+        "--path",
+        "openapi.json",
+        "--config",
+        "config.yml",
+        "--meta",
+        "none",
+        "--output-path",
+        "asking_piccolo",
+    ]
+    command = [sys.executable, "-m", "openapi_python_client", *words, "--fail-on-warning"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    monkeypatch.syspath_prepend(tmp_path)
+    made = import_module("asking_piccolo")
+    models = import_module("asking_piccolo.models")
+    localize = import_module("asking_piccolo.api.default.localize").sync
+    file = import_module("asking_piccolo.types").File(BytesIO(photo), "a.jpg", "image/jpeg")
+    with made.Client(f"http://127.0.0.1:{service.port}", timeout=120) as client:
+        result = localize(client=client, body=models.PhotoForm(file))
+        assert type(result) is models.Result
+        assert result.center_world == expected["center_world"]
+        assert result.r_cam_from_world == expected["R_cam_from_world"]
+        far = models.Options(prior=models.PriorOptions(near=[90.0, 0.0, None], radius=1.0))
+        other = localize(client=client, body=models.PhotoForm(file, far))
+        assert other.status == models.ResultStatus.NOT_LOCALIZED
+
+
+def test_a_request_can_be_tried_without_the_net(service):
+    status, headers, body = service.ask("GET", "/docs")
+    assert (status, headers["content-type"]) == (200, "text/html; charset=utf-8")
+    assert b"http" not in body.replace(b"http-equiv", b"")
+    assert b'action="localize"' in body
+
+
+def test_null_is_not_given(service, photo, expected):
+    asked = {"photo": {"fov_deg": None}, "prior": {"near": None}, "gravity": None, "min_confidence": None}
+    status, _, body = service.post("/localize", "a.jpg", photo, {**asked, "prior": None})
+    assert status == 200
+    assert _same(json.loads(body), expected)
+    assert service.post("/localize", "a.jpg", photo, asked)[0] == 200
 
 
 @pytest.mark.parametrize(
@@ -261,80 +263,6 @@ def test_the_description_has_every_address(service):
 )
 def test_names_are_no_paths(given, name):
     assert clean_name(given) == name
-
-
-def test_a_walk_is_followed_frame_by_frame(service, scene):
-    status, _, body = service.ask("POST", "/walks", json.dumps({"motion": {"max_speed": 1.5}}))
-    assert status == 201
-    path = f"/walks/{json.loads(body)['walk']}"
-    frames = [(scene / "images" / f"clean_{k}.jpg").read_bytes() for k in range(2)]
-    for k, frame in enumerate(frames):
-        status, _, body = service.post(path, f"{k}.jpg", frame, {"time": 9.0 * k})
-        assert status == 200, body
-        found = json.loads(body)
-        assert (found["status"], found["pano"], found["walk"]["time"]) == ("localized", f"{k}.jpg", 9.0 * k)
-    status, _, body = service.post(path, "early.jpg", frames[0], {"time": 1.0})
-    assert (status, "time" in json.loads(body)["error"]) == (422, True)
-    status, _, body = service.post(path, "large.png", _blank(4096, 2048), {"time": 30.0})
-    assert (status, "1 megapixels" in json.loads(body)["error"]) == (422, True)
-    status, _, body = service.ask("DELETE", path)
-    assert status == 200
-    assert [json.loads(line)["pano"] for line in body.splitlines()] == ["0.jpg", "1.jpg"]
-    assert service.ask("DELETE", path)[0] == 404
-
-
-def _frames_on_disk(content):
-    """The files of this content in the folders of services."""
-    found = Path(tempfile.gettempdir()).glob("piccolo-temporary-*/**/*.jpg")
-    return [path for path in found if path.read_bytes() == content]
-
-
-@pytest.mark.parametrize("end", ["ended", "killed"])
-def test_the_frames_of_a_walk_that_is_over_are_not_on_the_disk(service, photo, end):
-    frame = photo + uuid.uuid4().bytes  # behind the JPEG's end
-    others = set(workers_of(service.process))
-    path = f"/walks/{json.loads(service.ask('POST', '/walks')[2])['walk']}"
-    for name in ("a.jpg", "b.jpg"):
-        assert service.post(path, name, frame)[0] == 200
-    assert len(_frames_on_disk(frame)) == 2
-    if end == "ended":
-        assert service.ask("DELETE", path)[0] == 200
-    else:
-        (worker,) = {*workers_of(service.process)} - others
-        os.kill(worker, signal.SIGKILL)
-        assert service.post(path, "c.jpg", frame)[0] == 500
-    assert _frames_on_disk(frame) == []
-    assert service.post(path, "c.jpg", frame)[0] == 404
-
-
-def test_a_walk_has_so_much_room_and_no_more(scene, folder, photo):
-    words = ["--jobs", "1", "--max-walk-megabytes", f"{1.5e-6 * len(photo):.4f}"]
-    frame = photo + uuid.uuid4().bytes
-    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
-        path = f"/walks/{json.loads(client.ask('POST', '/walks')[2])['walk']}"
-        assert client.post(path, "a.jpg", frame)[0] == 200
-        status, _, body = client.post(path, "b.jpg", frame)
-        assert status == 413
-        assert f"wanted it ended: DELETE {path}" in json.loads(body)["error"]
-        assert len(_frames_on_disk(frame)) == 1
-        status, _, body = client.ask("DELETE", path)
-        assert [json.loads(line)["pano"] for line in body.splitlines()] == ["a.jpg"]
-        path = f"/walks/{json.loads(client.ask('POST', '/walks')[2])['walk']}"
-        assert client.post(path, "a.jpg", frame)[0] == 200
-    assert _frames_on_disk(frame) == []  # of a walk that was not over when the service ended
-
-
-def test_a_walk_that_is_ended_while_a_frame_is_at_work_answers_all(service, photo):
-    path = f"/walks/{json.loads(service.ask('POST', '/walks')[2])['walk']}"
-    with ThreadPoolExecutor(4) as pool:
-        frames = [pool.submit(service.post, path, f"{k}.jpg", photo) for k in range(2)]
-        while json.loads(service.ask("GET", "/health")[2])["waiting"] < 2:
-            time.sleep(0.01)
-        ends = [pool.submit(service.ask, "DELETE", path) for _ in range(2)]
-        answers = [future.result() for future in (*frames, *ends)]
-    assert sorted(status for status, *_ in answers[2:]) == [200, 404]
-    assert {status for status, *_ in answers[:2]} <= {200, 404, 503}
-    assert all(status == 200 or json.loads(body)["error"] for status, _, body in answers)
 
 
 def test_a_worker_that_is_killed_costs_no_answer(service, photo, expected):
@@ -374,22 +302,6 @@ def test_a_photo_that_takes_too_long_is_given_up(scene, folder, photo):
         assert status in (500, 503)  # 503 if the scan could not be opened in ten times that
         assert "more than 0.1 s" in json.loads(body)["error"] or status == 503
     assert set(Path(tempfile.gettempdir()).glob("piccolo-*/**/a.jpg")) <= before
-
-
-def test_others_need_the_token(scene, folder):
-    words = ["--host", "0.0.0.0", "--jobs", "1"]
-    with serving("--cloud", scene / "cloud.ply", "--cache", folder / "maps", *words) as client:
-        token = client.address.split("token=")[1]
-        for path in ("/", "/scan", "/report.js", "/app.js"):
-            assert client.ask("GET", path)[0] == 401
-            assert client.ask("GET", path, Authorization="Bearer wrong")[0] == 401
-            assert client.ask("GET", path, Authorization=f"Bearer {token}")[0] == 200
-        status, headers, _ = client.ask("GET", f"/enter?token={token}")
-        assert (status, headers["location"]) == (303, "/")
-        assert "httponly" in headers["set-cookie"].lower()
-        cookie = headers["set-cookie"].split(";")[0]
-        assert client.ask("GET", "/", Cookie=cookie)[0] == 200
-        assert client.ask("GET", "/health")[0] == 200
 
 
 def test_a_scan_that_is_replaced_is_opened_again(folder, scene, photo):

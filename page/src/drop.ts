@@ -11,6 +11,7 @@ import type { Photo } from "./types";
 import { asJson, type Found, LOST, NO_PICTURE, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
 
 const AT_ONCE = 2;
+const STEP = 5; // percent
 const TRIES = 6; // of a photo that a busy service sends away
 const FOV = "65"; // degrees, of most phones
 const NARROW = "(max-width: 860px)";
@@ -53,7 +54,7 @@ export class Drop {
   }
 
   private fill(): void {
-    const { maxBytes, keepsPhotos } = this.model.report.service!;
+    const { maxBytes } = this.model.report.service!;
     const chooser = (how: Record<string, string | boolean>) => {
       const input = h("input", { type: "file", accept: "image/*", hidden: true, ...how });
       input.addEventListener("change", () => {
@@ -78,7 +79,7 @@ export class Drop {
       h("h2", {}, words.title),
       h("p", {}, words.lead(words.megabytes(maxBytes))),
       h("div", { class: "copies" }, ...buttons),
-      h("p", { class: "quiet" }, keepsPhotos ? words.kept : words.notKept),
+      h("p", { class: "quiet" }, this.keeps ? words.kept : words.notKept),
       files,
       camera,
     );
@@ -90,7 +91,13 @@ export class Drop {
     document.body.append(h("div", { class: "veil", "aria-hidden": "true" }, icon("pin"), words.here));
   }
 
+  private get keeps(): boolean {
+    return this.model.report.service!.keepsPhotos;
+  }
+
   private listen(): void {
+    const isLost = ({ state, result }: Job) => state !== "done" || (result && !this.keeps);
+    window.addEventListener("beforeunload", (event) => this.jobs.some(isLost) && event.preventDefault());
     const veil = (isOver: boolean) => document.body.classList.toggle("dropping", isOver);
     document.addEventListener("dragstart", (event) => event.preventDefault()); // of the page's own pictures
     document.addEventListener("dragover", (event) => {
@@ -147,15 +154,21 @@ export class Drop {
 
   private async run(job: Job): Promise<void> {
     job.state = "sent";
-    this.replace(job, { error: words.sent });
+    this.replace(job, { error: words.sending(0) });
     try {
       const options = asJson(job.options, await isSphere(job));
-      const found = await send(job.file, options, job.stop.signal);
+      const found = await send(job.file, options, job.stop.signal, (part) => this.tell(job, part));
       if (this.jobs.includes(job)) this.show(job, found);
     } catch (error) {
       if (this.jobs.includes(job)) this.refuse(job, error instanceof Refusal ? error : new Refusal(LOST, String(error)));
     }
     this.next();
+  }
+
+  /** Tell how far an upload is, in steps: each makes the list anew. */
+  private tell(job: Job, part: number): void {
+    const error = part < 1 ? words.sending(STEP * Math.floor((100 * part) / STEP)) : words.sent;
+    if (this.jobs.includes(job) && job.photo.error !== error) this.replace(job, { error });
   }
 
   private show(job: Job, { photo, result, pictures }: Found): void {
@@ -173,7 +186,10 @@ export class Drop {
       throw new Refusal(REPLACED, words.replaced);
     }
     (window.PICCOLO_PHOTOS ??= {})[photo.key] = own;
-    const { name, short, thumb } = job.photo;
+    const { short, thumb } = job.photo;
+    const name = this.keeps ? photo.name : job.photo.name;
+    const isOlder = (other: Photo) => other.name === name && !this.jobs.some((one) => one.photo === other);
+    this.model.report.photos.filter(isOlder).forEach((older) => this.model.remove(older));
     job.result = result;
     this.replace(job, { ...photo, name, short, thumb });
     this.finish(job);

@@ -97,7 +97,7 @@ export class Facts {
       { class: "copies" },
       copyButton("copy", text.copyPosition, () => pose.world.join(" ")),
       copyButton("copy", text.copyPose, json),
-      copyButton("link", text.copyLink, () => location.href),
+      this.model.hasLinks ? copyButton("link", text.copyLink, () => location.href) : null,
     );
     return section(text.position, table(rows), buttons);
   }

@@ -51,6 +51,11 @@ export class Model {
     for (const listener of this.listeners[name] ?? []) listener();
   }
 
+  /** False where a link would find nothing: what was dropped is lost with the page, unless the service keeps it. */
+  get hasLinks(): boolean {
+    return this.report.service?.keepsPhotos ?? true;
+  }
+
   get photo(): Photo | null {
     return this.selected === null ? null : this.report.photos[this.selected];
   }

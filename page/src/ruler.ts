@@ -31,7 +31,7 @@ export class Ruler {
     this.button = h("button", { type: "button", class: "toggle", title: text.measureHelp, onclick: () => this.toggle() }, icon("ruler"), text.measure);
     const names = () => this.points.map(({ spot }) => model.report.photos[spot.photo].name).join(", ");
     const link = () => location.href.replace(/#.*|$/, linkOf(model));
-    this.copies = h("div", { class: "copies" }, copyButton("copy", text.copyDistance, () => `${this.told()} (${names()})`), copyButton("link", text.copyLink, link));
+    this.copies = h("div", { class: "copies" }, copyButton("copy", text.copyDistance, () => `${this.told()} (${names()})`), model.hasLinks ? copyButton("link", text.copyLink, link) : null);
     this.panel = h("div", { class: "ruler-panel" }, this.words, this.copies);
     box.append(this.drawing, h("div", { class: "reticle", "aria-hidden": "true" }), this.label);
     model.on("measure selected alternative", () => void this.find());

@@ -6,6 +6,8 @@ export const LOST = 0; // the network, in place of a status of HTTP
 export const REPLACED = 409;
 export const TOO_LARGE = 413;
 export const NO_PICTURE = 422;
+const LATE = 408;
+const DONE = 200;
 const BUSY = 503;
 const RADIUS = 5; // m around a place, unless another is told
 
@@ -30,29 +32,57 @@ export class Refusal extends Error {
   }
 
   get mayPass(): boolean {
-    return this.status === LOST || this.status >= 500;
+    return this.status === LOST || this.status === LATE || this.status >= 500;
   }
 }
 
-/** Localize a photo; throws a Refusal. */
-export async function send(file: File, options: object, signal: AbortSignal): Promise<Found> {
+/** Localize a photo; throws a Refusal. `onSent` is told the part of it that was sent, which fetch does not know. */
+export function send(file: File, options: object, signal: AbortSignal, onSent: (part: number) => void): Promise<Found> {
   const form = new FormData();
   form.append("picture", file);
   form.append("options", JSON.stringify(options));
+  const request = new XMLHttpRequest();
+  request.open("POST", "show");
+  request.upload.addEventListener("progress", ({ loaded, total }) => onSent(loaded / total));
+  signal.addEventListener("abort", () => request.abort());
+  const line = (number: number) => (request.status === DONE ? parsed(request.responseText.split("\n")[number]) : null);
+  const pictures = new Promise<{ pictures: Pictures; thumb: string }>((resolve, reject) => {
+    request.addEventListener("loadend", () => {
+      const last = line(1);
+      if (last && !last.error) resolve(last);
+      else reject(new Error(last?.error));
+    });
+  });
+  pictures.catch(() => undefined); // who asks for them hears it
+  return new Promise((resolve, reject) => {
+    const look = () => {
+      if (!request.responseText.includes("\n")) return;
+      request.removeEventListener("progress", look); // the second line is long
+      const found = line(0);
+      if (found) resolve({ ...found, pictures });
+    };
+    request.addEventListener("progress", look);
+    request.addEventListener("loadend", () => {
+      look();
+      reject(refusalOf(request)); // unless it was found
+    });
+    request.send(form);
+  });
+}
+
+function refusalOf(request: XMLHttpRequest): Refusal {
+  const { status } = request;
+  if (status === 0 || status === DONE) return new Refusal(LOST, text.drop.lost);
+  const wait = status === BUSY ? Number(request.getResponseHeader("Retry-After")) || 5 : null;
+  return new Refusal(status, parsed(request.responseText)?.error ?? text.drop.answered(status), wait);
+}
+
+/** What a line of JSON says; null for another, as of a proxy. */
+function parsed(line: string) {
   try {
-    const response = await fetch("show", { method: "POST", body: form, signal });
-    if (!response.ok) {
-      const wait = response.status === BUSY ? Number(response.headers.get("Retry-After")) || 5 : null;
-      throw new Refusal(response.status, (await response.json()).error, wait);
-    }
-    const lines = linesOf(response.body!);
-    const next = async () => JSON.parse((await lines.next()).value as string);
-    const found = await next();
-    const pictures = next().then((line) => (line.error ? Promise.reject(new Error(line.error)) : line));
-    pictures.finally(() => lines.next()).catch(() => undefined); // to its end, or the browser counts it as broken off
-    return { ...found, pictures };
-  } catch (error) {
-    throw error instanceof Refusal ? error : new Refusal(LOST, text.drop.lost);
+    return JSON.parse(line);
+  } catch {
+    return null;
   }
 }
 
@@ -63,17 +93,4 @@ export function asJson({ fov, focal, x, y, radius }: Options, isSphere: boolean)
     photo: (fov || focal) && !isSphere ? { ...lens, projection: "pinhole" } : undefined,
     prior: x && y ? { near: [Number(x), Number(y), null], radius: Number(radius) || RADIUS } : undefined,
   };
-}
-
-async function* linesOf(body: ReadableStream<Uint8Array>): AsyncGenerator<string> {
-  const reader = body.getReader();
-  const decoder = new TextDecoder();
-  let rest = "";
-  for (;;) {
-    const { done, value } = await reader.read();
-    const lines = (rest + decoder.decode(value, { stream: !done })).split("\n");
-    rest = lines.pop()!;
-    yield* lines;
-    if (done) return;
-  }
 }

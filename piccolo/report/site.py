@@ -221,8 +221,12 @@ def picture_path(out: Path, folder: str, key: str) -> Path:
 
 def write_photo_script(out: Path, key: str, document: str) -> None:
     """Write the pictures of a photo, in JSON, as a script that hands them to the page."""
-    text = f'(window.PICCOLO_PHOTOS ??= {{}})["{key}"] = {document};\n'
-    write_atomically(picture_path(out, "photos", key), text.encode())
+    write_atomically(picture_path(out, "photos", key), photo_script(key, document).encode())
+
+
+def photo_script(key: str, document: str) -> str:
+    """Return the script that hands the pictures of a photo, in JSON, to the page."""
+    return f'(window.PICCOLO_PHOTOS ??= {{}})["{key}"] = {document};\n'
 
 
 def finish_folder(out: Path, document: Mapping[str, Any]) -> None:

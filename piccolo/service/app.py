@@ -4,19 +4,18 @@ import asyncio
 import json
 import logging
 import secrets
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
-from dataclasses import fields, replace
-from hashlib import sha256
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
-from time import monotonic
 from typing import Any
 
 from starlette.applications import Starlette
-from starlette.datastructures import UploadFile
+from starlette.datastructures import FormData
 from starlette.exceptions import HTTPException
 from starlette.middleware import Middleware
+from starlette.middleware.cors import CORSMiddleware
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import JSONResponse, RedirectResponse, Response, StreamingResponse
 from starlette.routing import Route
@@ -24,23 +23,26 @@ from starlette.routing import Route
 from .. import __version__
 from ..batch.localizer import Task
 from ..errors import InputError
-from ..files.atomic import write_atomically
 from ..jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
 from ..localization.settings import CoarseToFineSettings
+from ..photo import Photo
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
-from ..walk.frames import Motion
-from .asking import apply_options, check_object, clean_name, make_photo, parse_options
-from .desk import Desk, Drawing, Limits, WalkDesk, begin_walk, content_of, look_at
-from .guard import COOKIE, Guard, refuse
+from ..scan_map.scan_map import ScanMap
+from .access import Access
+from .asking import FORM, apply_options, make_photo, parse_options, read_form
+from .desk import Desk, Drawing, Limits, content_of, look_at
+from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
+from .keep import Keep
 
 LOG = logging.getLogger(__name__)
 MAX_OPTIONS = 1 << 16  # [byte] of the options' text
-MAX_WALKS = 4  # at once, each with a process
-IDLE_S = 600.0  # [s] after which a walk that nobody goes on with makes room for another
+MAX_PARTS = 8  # of a form: more are not read, to say which is wrong
 SETTLED_S = 1.0  # [s] for which the files of a scan must not change before they are opened again
-RETRY = {"Retry-After": "2"}
 LINES = "application/x-ndjson"
+UNBUFFERED = {"X-Accel-Buffering": "no"}  # nginx: a line is sent on at once
+CORS: dict[str, Any] = {"allow_methods": ["GET", "POST"], "allow_headers": ["Authorization"]}
+CORS |= {"expose_headers": ["Retry-After"]}
 TYPES = {".js": "text/javascript", ".css": "text/css"}
 
 
@@ -48,22 +50,19 @@ class Service:
     """Answers requests: of one event loop, while the work is done in other processes."""
 
     def __init__(
-        self, open_desk: Callable[[], Desk], limits: Limits, keep: Path | None, token: str | None
+        self, open_desk: Callable[[], Desk], limits: Limits, keep: Keep | None, access: Access
     ) -> None:
         self.open_desk = open_desk
         self.limits = limits
         self.keep = keep
-        self.token = token  # which who asks must know; None lets all of this machine ask
+        self.access = access
         self.desk = open_desk()
         self.num_waiting = 0
-        self.walks: dict[str, WalkDesk] = {}
         self.reopening: asyncio.Task[None] | None = None
 
     def close(self) -> None:
         """End all processes."""
         self.desk.close()
-        for walk in self.walks.values():
-            walk.close()
 
     async def page(self, request: Request) -> Response:
         """Return the page, or a file of it."""
@@ -72,7 +71,8 @@ class Service:
         if name in self.desk.plans:
             return Response(self.desk.plans[name], media_type="image/png")
         if name == "report.js":
-            return Response(site.report_script(self.desk.document), media_type=TYPES[".js"])
+            document = await asyncio.to_thread(self.document)
+            return Response(site.report_script(document), media_type=TYPES[".js"])
         if name in site.PAGE_FILES:
             return Response(site.page_file(name), media_type=TYPES[Path(name).suffix])
         if name:
@@ -80,13 +80,21 @@ class Service:
         policy = site.POLICY.format(script=site.OWN, style=site.OWN)
         return Response(site.page_under(f"{policy}; connect-src 'self'"), media_type="text/html")
 
+    def document(self) -> dict[str, Any]:
+        """Return what the page knows when it opens: the scan, and the photos that are kept."""
+        photos = self.keep.photos(self.desk.scan_map) if self.keep else []
+        return {**self.desk.document, "photos": photos}
+
     async def enter(self, request: Request) -> Response:
         """Take the token from the address into a cookie."""
-        token = request.query_params.get("token", "")
-        if self.token is None or not secrets.compare_digest(token.encode(), self.token.encode()):
+        given = request.query_params.get("token", "")
+        token = self.access.token
+        if token is None or not secrets.compare_digest(given.encode(), token.encode()):
             raise HTTPException(401, "found another token, wanted the one that the service printed")
-        response = RedirectResponse("/", 303)
-        response.set_cookie(COOKIE, self.token, httponly=True, samesite="lax")
+        path = self.access.path
+        response = RedirectResponse(path, 303)
+        secure = self.access.is_secure
+        response.set_cookie(COOKIE, token, path=path, secure=secure, httponly=True, samesite="lax")
         return response
 
     async def scan(self, request: Request) -> Response:
@@ -103,108 +111,98 @@ class Service:
         text = (files("piccolo.service") / "openapi.json").read_text(encoding="utf-8")
         return Response(text.replace("{{version}}", __version__), media_type="application/json")
 
+    async def docs(self, request: Request) -> Response:
+        """Return a page on which a request can be tried."""
+        text = (files("piccolo.service") / "docs.html").read_text(encoding="utf-8")
+        return Response(text, media_type="text/html")
+
     async def localize(self, request: Request) -> Response:
         """Return the line of a photo, as localize.py writes it."""
-        async with self.asking(request) as (task, _):
+        async with self.asking(request) as task:
             with self.desk.in_use() as desk:
-                result = await self.answer(desk, task)
+                result = await unless_gone(request, self.answer(desk, task))
+                await self.keep_photo(task, result)
         return Response(result.to_json(), media_type="application/json")
 
     async def show(self, request: Request) -> Response:
         """Return a photo for the page: a line with its result, then a line with its pictures."""
-        async with self.asking(request) as (task, _):
+        async with self.asking(request) as task:
             with self.desk.in_use() as desk:
-                result = await self.answer(desk, task)
-        (short,) = site.shorten_names([result.pano])
-        shown = site.Entry(result, None, 0.0)
-        entry = site.document_of_entry(shown, result.pano, secrets.token_hex(16), desk.scan_map)
-        about = json.dumps({**entry, "short": short, "hasPictures": True, "thumb": None})
+                result = await unless_gone(request, self.answer(desk, task))
+                kept = await self.keep_photo(task, result)
+        about = photo_document(kept or result.pano, result, desk.scan_map)
 
         async def lines() -> AsyncIterator[str]:
-            yield f'{{"photo": {about}, "result": {result.to_json()}}}\n'
+            yield f'{{"photo": {json.dumps(about)}, "result": {result.to_json()}}}\n'
             with desk.in_use():
                 try:
-                    yield f"{await work(desk.processes, Drawing(task, result))}\n"
+                    yield f"{await self.draw(desk, Drawing(task, result), kept)}\n"
                 except HTTPException as error:
                     yield f"{json.dumps({'error': error.detail})}\n"
 
-        return StreamingResponse(lines(), media_type=LINES)
+        return StreamingResponse(lines(), media_type=LINES, headers=UNBUFFERED)
 
-    async def begin_walk(self, request: Request) -> Response:
-        """Begin a walk; return its name."""
-        options = await read_options(request)
-        given = check_object(options.get("motion", {}), {f.name for f in fields(Motion)}, "options.motion")
-        settings = self.settings_of(options)
-        for name, walk in list(self.walks.items()):
-            if monotonic() - walk.used_s > IDLE_S:
-                self.walks.pop(name).close()
-        if len(self.walks) >= MAX_WALKS:
-            raise HTTPException(503, f"found {MAX_WALKS} walks at once, wanted fewer: end one", RETRY)
-        localizer = replace(self.desk.localizer, settings=settings)
-        name = secrets.token_hex(8)
-        self.walks[name] = begin_walk(localizer, Motion(**given), self.limits)
-        return JSONResponse({"walk": name}, 201, {"Location": f"/walks/{name}"})
+    async def keep_photo(self, task: Task, result: Result) -> str | None:
+        """Return the name under which a photo is kept, if any is; HTTPException if there is no room."""
+        if self.keep is None:
+            return None
+        with refusing():
+            return await asyncio.to_thread(self.keep.add, task.photo.name, content_of(task), result)
 
-    async def follow(self, request: Request) -> Response:
-        """Return the line of a walk's next frame, by it and those before; a walk that is lost is over."""
-        async with self.asking(request) as frame:
-            name, walk = self.find_walk(request)
-            walk.used_s = monotonic()
-            walk.num_bytes += len(content_of(frame[0]))
-            if walk.num_bytes > self.limits.max_walk_bytes:
-                found = f"found a walk of more than {self.limits.max_walk_bytes} bytes"
-                raise HTTPException(413, f"{found}, wanted it ended: DELETE /walks/{name}")
-            try:
-                line = await work(walk.processes, frame)
-            except HTTPException as error:
-                if error.status_code >= 500:
-                    self.walks.pop(name, None)
-                    walk.close()
-                raise
-        return Response(line, media_type="application/json")
+    async def draw(self, desk: Desk, drawing: Drawing, kept: str | None) -> str:
+        """Return JSON of a photo's thumbnail and pictures; keep the thumbnail of one that is kept."""
+        text: str = await work(desk.processes, drawing)
+        if self.keep and kept:
+            with refusing():
+                await asyncio.to_thread(self.keep.add_thumb, kept, json.loads(text)["thumb"])
+        return text
 
-    async def end_walk(self, request: Request) -> Response:
-        """Return the lines of all frames of a walk, by all of them; it is over then."""
-        name, walk = self.find_walk(request)
-        del self.walks[name]
-        try:
-            lines = await work(walk.processes, None)
-        finally:
-            await asyncio.to_thread(walk.close)
-        return Response("".join(f"{line}\n" for line in lines), media_type=LINES)
+    async def photo(self, request: Request) -> Response:
+        """Return the script with the pictures of a photo that is kept."""
+        key = request.path_params["key"]
+        found = await asyncio.to_thread(self.keep.find, key) if self.keep else None
+        if found is None:
+            raise HTTPException(404, "found no such photo")
+        content, result = found
+        name = Path(result.pano).name
+        settings = self.desk.localizer.settings
+        with self.place(), self.desk.in_use() as desk:
+            task = Task(Photo(Path(name)), settings, {name: content})
+            text = await self.draw(desk, Drawing(task, replace(result, pano=name)), name)
+        script = site.photo_script(key, json.dumps(json.loads(text)["pictures"]))
+        return Response(script, media_type=TYPES[".js"])
 
-    def find_walk(self, request: Request) -> tuple[str, WalkDesk]:
-        """Return a walk that has begun and is not over, with its name."""
-        name = request.path_params["walk"]
-        if name not in self.walks:
-            raise HTTPException(404, "found no such walk, wanted one that POST /walks began")
-        return name, self.walks[name]
+    async def thumb(self, request: Request) -> Response:
+        """Return the thumbnail of a photo that is kept."""
+        key = request.path_params["key"]
+        found = await asyncio.to_thread(self.keep.find_thumb, key) if self.keep else None
+        if found is None:
+            raise HTTPException(404, "found no such thumbnail")
+        return Response(found, media_type="image/jpeg")
 
     @asynccontextmanager
-    async def asking(self, request: Request) -> AsyncIterator[tuple[Task, float | None]]:
-        """Yield the photo that was sent, and the time of a frame; HTTPException if too many are."""
+    async def asking(self, request: Request) -> AsyncIterator[Task]:
+        """Yield the photo that was sent, when all of it is there; HTTPException if too many wait."""
         self.look_for_another_scan()
+        if request.query_params:
+            raise HTTPException(400, f"found {min(request.query_params)!r} in the address, {FORM}")
+        async with reading_form(request) as form:
+            with self.place():
+                name, content, text = await read_form(form)
+                await form.close()
+                options = parse_options(text)
+                yield Task(make_photo(name, options), self.settings_of(options), {name: content})
+
+    @contextmanager
+    def place(self) -> Iterator[None]:
+        """Hold a place among the photos that wait; HTTPException if all are taken."""
         if self.num_waiting >= self.limits.max_waiting:
             raise HTTPException(503, f"found {self.num_waiting} photos that wait, try again", RETRY)
         self.num_waiting += 1
         try:
-            yield await self.read(request)
+            yield
         finally:
             self.num_waiting -= 1
-
-    async def read(self, request: Request) -> tuple[Task, float | None]:
-        """Return the photo, and the time, in a form of the parts `picture` and `options`."""
-        async with request.form(max_files=1, max_fields=1, max_part_size=MAX_OPTIONS) as form:
-            picture = form.get("picture")
-            text = form.get("options", "")
-            if not isinstance(picture, UploadFile) or not isinstance(text, str):
-                wanted = "wanted multipart/form-data with `picture`, a file, and perhaps `options`, JSON"
-                raise HTTPException(400, f"found no picture, {wanted}")
-            content = await picture.read()
-            name = clean_name(picture.filename or "")
-        options = parse_options(text)
-        task = Task(make_photo(name, options), self.settings_of(options), {name: content})
-        return task, options.get("time")
 
     def settings_of(self, options: dict[str, Any]) -> CoarseToFineSettings:
         """Return the service's settings with a request's own in their place."""
@@ -216,14 +214,10 @@ class Service:
         """Localize a photo; HTTPException for one that can't be read."""
         result: Result = (await work(desk.processes, task)).result
         if result.status == FAILED:
+            LOG.warning("a photo was given up: %s", result.error)
             raise HTTPException(503, result.error, RETRY)
         if result.status == UNREADABLE:
             raise HTTPException(422, result.error)
-        if self.keep:
-            try:
-                await asyncio.to_thread(keep_photo, self.keep, task, result)
-            except OSError as error:
-                LOG.warning("%s: a photo could not be kept: %s", self.keep, error)
         return result
 
     def look_for_another_scan(self) -> None:
@@ -250,6 +244,37 @@ class Service:
             self.reopening = None
 
 
+@asynccontextmanager
+async def reading_form(request: Request) -> AsyncIterator[FormData]:
+    """Yield the form that was sent; HTTPException for a torn one, which says what to send."""
+    limits = {"max_files": MAX_PARTS, "max_fields": MAX_PARTS, "max_part_size": MAX_OPTIONS}
+    try:
+        form = await request.form(**limits)
+    except HTTPException as error:
+        if error.status_code != 400:
+            raise
+        raise HTTPException(400, f"{error.detail.rstrip('.')}; {FORM}") from error
+    try:
+        yield form
+    finally:
+        await form.close()
+
+
+async def unless_gone(request: Request, answer: Coroutine[Any, Any, Result]) -> Result:
+    """Return an answer; ClientDisconnect if the client leaves meanwhile: a photo that waits is given up."""
+    answering = asyncio.create_task(answer)
+    leaving = asyncio.ensure_future(request.receive())  # the body was read, so this is all that can come
+    try:
+        await asyncio.wait({answering, leaving}, return_when=asyncio.FIRST_COMPLETED)
+        if not answering.done():
+            raise ClientDisconnect
+        return answering.result()
+    finally:
+        leaving.cancel()
+        answering.cancel()
+        await asyncio.gather(leaving, answering, return_exceptions=True)
+
+
 async def work(processes: Processes, item: object) -> Any:
     """Return what a process says of an item; HTTPException for what it refuses, or did not live to say."""
     future = None
@@ -258,6 +283,8 @@ async def work(processes: Processes, item: object) -> Any:
         return await asyncio.wrap_future(future)
     except OpeningError as error:
         raise HTTPException(503, f"the scan can't be opened at the moment: {error}", RETRY) from error
+    except SHORTAGE as error:
+        raise refusal_of(error) from error
     except InputError as error:
         raise HTTPException(422, str(error)) from error
     except (TooSlowError, WorkerLostError) as error:
@@ -265,26 +292,14 @@ async def work(processes: Processes, item: object) -> Any:
     except (RuntimeError, asyncio.CancelledError) as error:
         if future is not None and not future.cancelled():
             raise
-        raise HTTPException(503, "this scan, or walk, was closed meanwhile", RETRY) from error
+        raise HTTPException(503, "this scan was closed meanwhile", RETRY) from error
 
 
-async def read_options(request: Request) -> dict[str, Any]:
-    """Return the options that are the body of a request."""
-    text = b""
-    async for part in request.stream():
-        text += part
-        if len(text) > MAX_OPTIONS:
-            raise HTTPException(413, f"found a larger body, wanted options of at most {MAX_OPTIONS} bytes")
-    return parse_options(text.decode(errors="replace"))
-
-
-def keep_photo(folder: Path, task: Task, result: Result) -> None:
-    """Write a photo into a folder, under a name that no other has, and its line after those there."""
-    content = content_of(task)
-    path = folder / f"{sha256(content).hexdigest()[:12]}-{task.photo.name}"
-    write_atomically(path, content)
-    with (folder / "results.jsonl").open("a") as file:
-        file.write(f"{replace(result, pano=str(path)).to_json()}\n")
+def photo_document(name: str, result: Result, scan_map: ScanMap) -> dict[str, Any]:
+    """Return what the page knows of a photo that was sent."""
+    (short,) = site.shorten_names([result.pano])
+    entry = site.document_of_entry(site.Entry(result, None, 0.0), name, secrets.token_hex(16), scan_map)
+    return {**entry, "short": short, "hasPictures": True, "thumb": None}
 
 
 def make_app(service: Service) -> Starlette:
@@ -294,19 +309,26 @@ def make_app(service: Service) -> Starlette:
         Route("/scan", service.scan),
         Route("/health", service.health),
         Route("/openapi.json", service.describe),
+        Route("/docs", service.docs),
         Route("/localize", service.localize, methods=["POST"]),
         Route("/show", service.show, methods=["POST"]),
-        Route("/walks", service.begin_walk, methods=["POST"]),
-        Route("/walks/{walk}", service.follow, methods=["POST"]),
-        Route("/walks/{walk}", service.end_walk, methods=["DELETE"]),
+        Route("/photos/{key}.js", service.photo),
+        Route("/thumbs/{key}.jpg", service.thumb),
         *(Route(path, service.page) for path in ("/", "/report.js", "/app.js", "/app.css", "/plans/{name}")),
     ]
 
     async def refuse_error(request: Request, error: Exception) -> Response:
+        if isinstance(error, SHORTAGE):
+            return refuse(refusal_of(error))
         return refuse(error if isinstance(error, HTTPException) else HTTPException(400, str(error)))
+
+    refused = (HTTPException, InputError, ClientDisconnect, *SHORTAGE)
 
     return Starlette(
         routes=routes,
-        middleware=[Middleware(Guard, max_bytes=service.limits.max_bytes, token=service.token)],
-        exception_handlers=dict.fromkeys((HTTPException, InputError, ClientDisconnect), refuse_error),
+        middleware=[
+            Middleware(CORSMiddleware, **CORS, allow_origins=service.access.origins),
+            Middleware(Guard, max_bytes=service.limits.max_bytes, access=service.access),
+        ],
+        exception_handlers=dict.fromkeys(refused, refuse_error),
     )

@@ -8,19 +8,36 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
+from starlette.datastructures import FormData, UploadFile
+
 from ..camera.calibration import calibration_of
 from ..errors import UNPRINTABLE, InputError, printable
 from ..files.json_file import DAMAGE
 from ..localization.settings import CoarseToFineSettings
 from ..photo import Photo, Prior
 
-PARTS = ("photo", "prior", "gravity", "min_confidence", "time", "motion")  # of options; the last of walks
+PARTS = ("photo", "prior", "gravity", "min_confidence")
 # options of a photo that name no file
 PHOTO = {f.name for f in fields(Photo)} - {"picture", "mask", "rig"}
 PRIOR = {f.name for f in fields(Prior)}
-MAX_NAME = (
-    240  # bytes of a photo's name that are kept; a file's name has up to 255, with what is put before it
-)
+PLACES: dict[str, Collection[str]] = {"options": PARTS, "options.photo": PHOTO, "options.prior": PRIOR}
+# bytes of a photo's name that are kept; a file's name has up to 255, with what is put before it
+MAX_NAME = 240
+FORM = "wanted multipart/form-data with `picture`, one file, and perhaps `options`, one text of JSON"
+
+
+async def read_form(form: FormData) -> tuple[str, bytes, str]:
+    """Return name and content of the picture in a form, and the text of its options."""
+    for name in form:
+        if name not in ("picture", "options"):
+            raise InputError(f"{describe_unknown(name, ('picture', 'options'))}; {FORM}")
+    picture = form.get("picture")
+    text = form.get("options", "")
+    if len(form.multi_items()) != len(form):
+        raise InputError(f"found a part twice, {FORM}")
+    if not isinstance(picture, UploadFile) or not isinstance(text, str):
+        raise InputError(f"found no picture, {FORM}")
+    return clean_name(picture.filename or ""), await picture.read(), text
 
 
 def clean_name(name: str) -> str:
@@ -40,20 +57,29 @@ def parse_options(text: str) -> dict[str, Any]:
 
 
 def check_object(given: object, known: Collection[str], where: str) -> dict[str, Any]:
-    """Return a JSON object; InputError for anything else, and for a name that is not known."""
+    """Return what a JSON object gives; null is not given.
+
+    Raises InputError for anything else, and for a name that is not known.
+    """
     if not isinstance(given, dict):
         raise InputError(f"{where}: found {type(given).__name__}, wanted a JSON object")
     if unknown := given.keys() - set(known):
-        wanted = ", ".join(sorted(known))
-        raise InputError(f"{where}: found {printable(min(unknown))[:40]!r}, wanted any of {wanted}")
-    return given
+        raise InputError(f"{where}: {describe_unknown(min(unknown), known)}")
+    return {name: value for name, value in given.items() if value is not None}
+
+
+def describe_unknown(name: str, known: Collection[str]) -> str:
+    """Return words on an option that is unknown, or that belongs elsewhere."""
+    place = next((place for place, names in PLACES.items() if name in names), None)
+    wanted = f"it in {place}" if place else f"any of {', '.join(sorted(known))}"
+    return f"found {printable(name)[:40]!r}, wanted {wanted}"
 
 
 def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
     """Return the photo with the options of its part; its calibration is JSON in place of a file."""
     given = check_object(options.get("photo", {}), PHOTO, "options.photo")
     try:
-        if given.get("camera") is not None:
+        if "camera" in given:
             given = {**given, "camera": calibration_of(given["camera"], "options.photo.camera")}
         return Photo(Path(name), **given)
     except DAMAGE as error:
@@ -63,7 +89,7 @@ def make_photo(name: str, options: Mapping[str, Any]) -> Photo:
 def apply_options(settings: CoarseToFineSettings, options: Mapping[str, Any]) -> CoarseToFineSettings:
     """Return the settings of a photo: those of the service, with the request's own in their place."""
     given = check_object(options.get("prior", {}), PRIOR, "options.prior")
-    changed = {name: options[name] for name in ("gravity", "min_confidence") if options.get(name) is not None}
+    changed = {name: options[name] for name in ("gravity", "min_confidence") if name in options}
     try:
         return replace(settings, prior=replace(settings.prior, **given), **changed)
     except DAMAGE as error:

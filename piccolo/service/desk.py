@@ -3,18 +3,18 @@
 Photos come as their content: a process writes one into a temporary folder for as long as it is at work on it.
 """
 
+import os
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
-from time import monotonic
 from typing import Any, NamedTuple
 
 from ..batch.localizer import Answer, Localizer, Task
 from ..errors import InputError
-from ..files.atomic import temporary_folder, write_temporary
-from ..files.json_file import DAMAGE
+from ..files.atomic import temporary_folder
 from ..jobs.processes import Function, Processes
 from ..jobs.threads import Workers
 from ..opened_scan import OpenedScan
@@ -25,9 +25,7 @@ from ..report.pictures import make_pictures
 from ..result import Result
 from ..scan_map.open_map import write_map
 from ..scan_map.scan_map import ScanMap
-from ..scan_walk import Walk
 from ..views.surfels import MAX_SURFELS, make_surfels
-from ..walk.frames import Motion
 
 PIXELS = 1e6  # in a megapixel
 MAP = "service.piccolo-map"
@@ -40,7 +38,6 @@ class Limits(NamedTuple):
     max_pixels: float  # of a picture, by its header
     max_waiting: int  # requests at once; one more is sent away
     seconds: float  # from the moment that a process takes it
-    max_walk_bytes: int  # of all frames of a walk, which lie on the disk until it is over
 
 
 class Drawing(NamedTuple):
@@ -133,6 +130,7 @@ def open_answering(localizer: Localizer, max_pixels: float) -> Function:
 
     A `Task` gets its `Answer`, a `Drawing` the JSON of its pictures; None makes ready for both.
     """
+    tempfile.tempdir = os.environ.get("TMPDIR")  # or it is tried out, and on a full disk found not to exist
     scan = localizer.open_here()
     answer = localizer.answer_in(scan)
 
@@ -176,50 +174,3 @@ def draw(scan: OpenedScan, surfels: Any, drawing: Drawing) -> str:
     with drawing.task.place(Path()) as photo:
         thumbnail, pictures = make_pictures(photo.path, result, poses, surfels, WIDTH)
     return f'{{"thumb": "{site.data_url(thumbnail, "image/jpeg")}", "pictures": {pictures}}}'
-
-
-@dataclass
-class WalkDesk:
-    """A walk that is followed by a process of its own."""
-
-    processes: Processes  # one, of `open_walk`
-    end: ExitStack  # of the folder of its frames, which a process that is killed can't remove
-    used_s: float  # time of the last request [s]
-    num_bytes: int = 0  # of its frames so far
-
-    def close(self) -> None:
-        """Kill the process and remove the frames."""
-        self.processes.close()
-        self.end.close()
-
-
-def begin_walk(localizer: Localizer, motion: Motion, limits: Limits) -> WalkDesk:
-    """Begin a walk."""
-    end = ExitStack()
-    folder = end.enter_context(temporary_folder())
-    opening = partial(open_walk, localizer, motion, limits.max_pixels, folder)
-    processes = Processes(opening, 1, localizer.num_threads, limits.seconds, attempts=1)
-    return WalkDesk(processes, end, monotonic())
-
-
-def open_walk(localizer: Localizer, motion: Motion, max_pixels: float, folder: Path) -> Function:
-    """Open what a process follows a walk with.
-
-    A frame, a `Task` with its time [s] or None, gets its line; None gets the lines of all frames. The frames
-    are kept in a folder.
-    """
-    walk = Walk(localizer.open_here(), localizer.settings, motion)
-
-    def follow(frame: tuple[Task, float | None] | None) -> str | list[str]:
-        if frame is None:
-            return [result.to_json() for result in walk.finish()]
-        task, time = frame
-        check_size(task, max_pixels)
-        path = folder / f"{len(walk.photos)}{task.photo.path.suffix}"
-        write_temporary(path, content_of(task))
-        try:
-            return walk.add(replace(task.photo, picture=path), time, task.photo.name).to_json()
-        except DAMAGE as error:
-            raise InputError(str(error)) from error
-
-    return follow
