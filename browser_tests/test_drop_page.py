@@ -4,6 +4,7 @@ import re
 import subprocess
 import sys
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -191,14 +192,15 @@ def test_what_is_refused_says_why(visit, tmp_path, shoot):
     assert page.locator("#facts >> text=Save the photo smaller").is_visible()
     assert not any(url.endswith("/show") for url in asked)
     page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
-    _wait(page, "unreadable", "unreadable")
+    _wait(page, "waiting", "unreadable")
+    assert page.inner_text("#row-0 .row-status") == "Too large"
     page.click("#row-1")
     page.wait_for_selector("#facts >> text=wanted a whole JPEG")
     assert page.locator("#facts >> text=Drop a JPEG").is_visible()
     assert page.locator('.copy:has-text("Tell field")').count() == 0
     assert page.locator('.copy:has-text("Try again")').count() == 0
     page.evaluate(PASTE)
-    _wait(page, "unreadable", "unreadable", "unreadable")
+    _wait(page, "waiting", "unreadable", "unreadable")
     assert _names(page) == ["large", "notes", "pasted"]
     shoot(page, "drop-refused")
 
@@ -211,7 +213,10 @@ def test_a_phone_photo_without_focal_length_is_localized_once_its_field_is_told(
     bare.write_bytes(content[:start] + content[start + 2 + length :])
     page = visit()
     _choose(page, bare)
-    page.wait_for_selector("#facts >> text=no focal length in EXIF")
+    page.wait_for_selector("#facts .verdict >> text=Needs its field of view")
+    assert page.inner_text("#row-0 .row-status") == "Needs its field of view"
+    assert page.locator(".count.unreadable").count() == 0
+    assert "`" not in page.inner_text("#facts")
     page.click('.copy:has-text("Tell field")')
     assert page.locator("[name=fov]").input_value() == "65"
     page.wait_for_timeout(200)
@@ -240,6 +245,88 @@ def test_a_place_is_shown_on_the_plan(visit):
     _choose(page, FLAT / "images" / "bedroom.jpg")
     _wait(page, "localized")
     assert page.evaluate("told") == {"prior": {"near": [x, y, None], "radius": 5}}
+
+
+def _tell_place(page, x, y, radius):
+    page.click(".drop >> text=Options")
+    for name, value in (("x", x), ("y", y), ("radius", radius)):
+        page.fill(f"[name={name}]", str(value))
+    page.click(".options .main")
+
+
+WRONG = {
+    "Contradicts the place you told": (29.0, -7.5),  # at the other end of the flat
+    "The place you told is not in the scan": (500.0, 500.0),
+}
+
+
+@pytest.mark.parametrize("verdict", WRONG)
+def test_a_place_that_the_photo_contradicts_is_the_headline(visit, shoot, verdict):
+    page = visit()
+    _tell_place(page, *WRONG[verdict], 1.0)
+    _choose(page, FLAT / "images" / "bedroom.jpg")
+    _wait(page, "not_localized")
+    page.wait_for_selector("#viewer[data-shown]")
+    assert page.inner_text("#facts .verdict") == verdict
+    assert page.inner_text("#row-0 .row-status") == verdict
+    facts = page.inner_text("#facts")
+    assert "%" not in page.inner_text(".facts-head")
+    assert "Most likely not of this scan" not in facts
+    told = page.evaluate("PICCOLO_REPORT.photos[0].contradiction")
+    assert facts.count(told[1:].replace("`near`", "the place")) == 1
+    shoot(page, f"drop-{verdict[:3]}".lower())
+    page.evaluate(LISTEN)
+    page.click('.copy:has-text("Search everywhere")')
+    _wait(page, "localized")
+    assert page.evaluate("told") == {}
+    page.wait_for_selector("#facts .verdict >> text=Localized")
+    page.click(".drop >> text=Options")  # the place is not told of later photos either
+    assert page.input_value("[name=x]") == ""
+
+
+# the azimuth [deg] at which the second photo looks
+AHEAD = """() => {
+  const { rotation } = PICCOLO_REPORT.photos[1].pose;
+  return (Math.atan2(rotation[1], rotation[0]) * 180) / Math.PI;
+}"""
+
+
+def test_the_view_turns_to_a_photo_that_would_be_out_of_sight(visit):
+    page = visit()
+    _choose(page, FLAT / "images" / "living_room.jpg", FLAT / "images" / "phone.jpg")
+    _wait(page, "localized", "localized")
+    heading = 90.0 - page.evaluate(AHEAD)
+
+    def look_in_the_first_then_open_the_second(off, how):
+        page.evaluate(f"location.hash = '#photo=living_room.jpg&view={heading + off:.1f},0,80'")
+        page.wait_for_selector('#viewer[data-shown="0"]')
+        how()
+        page.wait_for_selector('#viewer[data-shown="1"]')
+        page.wait_for_timeout(500)
+        view = page.evaluate("new URLSearchParams(location.hash.slice(1)).get('view')")
+        return (float(view.split(",")[0]) - heading + 180.0) % 360.0 - 180.0
+
+    by_click = partial(page.click, "#row-1")
+    assert abs(look_in_the_first_then_open_the_second(180.0, by_click)) < 3.0
+    assert abs(look_in_the_first_then_open_the_second(-100.0, by_click)) < 3.0
+    assert look_in_the_first_then_open_the_second(10.0, by_click) == pytest.approx(10.0, abs=0.2)
+    link = f"location.hash = '#photo=phone.jpg&view={heading + 170:.1f},0,80'"
+    told = look_in_the_first_then_open_the_second(180.0, partial(page.evaluate, link))
+    assert told == pytest.approx(170.0, abs=0.2)  # a link leads where it says
+
+
+LATE = '{"error": "found a part of the body after 60 s"}'
+
+
+def test_a_slow_upload_is_not_called_unreadable(visit):
+    page = visit()
+    with _answering(page, lambda route: route.fulfill(status=408, body=LATE)):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector("#facts .verdict >> text=Sent too slowly")
+    assert page.locator(".count.unreadable").count() == 0
+    page.click('.copy:has-text("Try again")')
+    _wait(page, "localized")
+    assert page.inner_text("#row-0 .row-status") == "Localized"
 
 
 def test_a_place_is_told_whole_or_given_up(visit):
@@ -386,7 +473,7 @@ def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit):
     page = visit()
     page.evaluate("PICCOLO_REPORT.scanSha256 = '0'.repeat(64)")  # as if it was loaded before
     _choose(page, FLAT / "images" / "bedroom.jpg")
-    _wait(page, "unreadable")
+    page.wait_for_selector("#row-0 >> text=The scan was replaced")
     assert "The scan was replaced after this page was loaded" in page.inner_text("#note")
     page.click("text=load the page again")
     page.wait_for_selector("body.no-photos")

@@ -1,6 +1,7 @@
 /** A place for photos: they stand in the list at once, are sent two at a time, and become what was found. */
 import { byId, h, icon, iconButton } from "./dom";
 import { section } from "./facts";
+import { verdictOf } from "./marks";
 import type { Model } from "./model";
 import { OptionsDialog } from "./options";
 import type { Plan } from "./plan";
@@ -8,7 +9,7 @@ import { labelOf } from "./plan_painter";
 import { save } from "./table";
 import { text } from "./text";
 import type { Photo } from "./types";
-import { asJson, type Found, LOST, NO_PICTURE, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
+import { asJson, type Found, LOST, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
 
 const AT_ONCE = 2;
 const STEP = 5; // percent
@@ -16,7 +17,7 @@ const TRIES = 6; // of a photo that a busy service sends away
 const FOV = "65"; // degrees, of most phones
 const NARROW = "(max-width: 860px)";
 const ENDING = /\.[A-Za-z0-9]{3,4}( \(\d+\))?$/;
-const NONE = ["probabilityNone", "scan", "captured", "size", "walk", "time", "pose", "storey", "height", "evidence", "spread"];
+const NONE = ["probabilityNone", "scan", "captured", "size", "walk", "time", "contradiction", "pose", "storey", "height", "evidence", "spread"];
 const words = text.drop;
 
 /** A photo that was dropped; it rests while a busy service is left alone. */
@@ -191,7 +192,9 @@ export class Drop {
     const isOlder = (other: Photo) => other.name === name && !this.jobs.some((one) => one.photo === other);
     this.model.report.photos.filter(isOlder).forEach((older) => this.model.remove(older));
     job.result = result;
-    this.replace(job, { ...photo, name, short, thumb });
+    const contradicts = photo.pose ? words.contradictsPlace : words.noPlace;
+    const verdict = photo.contradiction && hasPlace(job) ? contradicts : undefined;
+    this.replace(job, { ...photo, name, short, thumb, verdict });
     this.finish(job);
   }
 
@@ -203,14 +206,15 @@ export class Drop {
       setTimeout(() => job.state === "resting" && this.queue(job), 1000 * refusal.seconds);
       return;
     }
-    const error = refusal.message.replace(`${job.file.name}: `, "");
-    this.replace(job, { error, status: refusal.mayPass ? "waiting" : "unreadable" });
+    const error = refusal.needsField ? words.needsFieldWhy : refusal.message.replace(`${job.file.name}: `, "");
+    if (refusal.isUnreadable) this.replace(job, { error, status: "unreadable" });
+    else this.replace(job, { error, verdict: refusal.needsField ? words.needsField : (words.verdicts[refusal.status] ?? words.notYet) });
     this.finish(job);
   }
 
   private finish(job: Job): void {
     job.state = "done";
-    byId("announce").textContent = text.opened(labelOf(job.photo), text.status[job.photo.status]);
+    byId("announce").textContent = text.opened(labelOf(job.photo), verdictOf(job.photo));
     if (!this.last?.result || job.result) this.last = job;
     this.openLast();
   }
@@ -231,7 +235,7 @@ export class Drop {
     job.state = "queued";
     job.refusal = undefined;
     job.result = undefined;
-    this.replace(job, { ...this.blank(job.file, job.photo.thumb), name: job.photo.name, short: job.photo.short });
+    this.replace(job, { ...this.blank(job.file, job.photo.thumb), verdict: undefined, name: job.photo.name, short: job.photo.short });
     this.next();
   }
 
@@ -252,9 +256,8 @@ export class Drop {
     if (matchMedia(NARROW).matches && photo.status !== "localized") document.body.classList.add("showing-facts");
     const { refusal, result, state } = job;
     const isUnsure = result && photo.status !== "localized";
-    const isLensUnknown = refusal?.status === NO_PICTURE && isImage(job.file);
-    const known = isLensUnknown ? { fov: FOV, ...job.options } : job.options;
-    const advice = isUnsure ? words.notSure : refusal && (words.remedies[refusal.status] ?? words.otherRemedy);
+    const known = refusal?.needsField ? { fov: FOV, ...job.options } : job.options;
+    const advice = isUnsure ? words.notSure : refusal && adviceOn(refusal);
     const retry = (options: Options) => {
       job.options = options;
       job.tries = 0;
@@ -263,11 +266,23 @@ export class Drop {
     const buttons = h(
       "div",
       { class: "copies" },
-      isUnsure || isLensUnknown ? action("tune", words.tell, () => this.dialog.open(known, retry)) : null,
+      isUnsure && hasPlace(job) ? action("search", words.everywhere, () => retry(this.withoutPlace(job.options)), "main") : null,
+      isUnsure || refusal?.needsField ? action("tune", words.tell, () => this.dialog.open(known, retry)) : null,
       state === "done" && refusal?.mayPass ? action("again", words.again, () => retry(job.options)) : null,
       action("close", words.remove, () => this.remove(job)),
     );
-    return advice ? section(words.remedy, h("p", {}, advice), buttons) : h("section", {}, buttons);
+    if (!advice) return h("section", {}, buttons);
+    if (photo.contradiction && hasPlace(job)) return section(`${words.everywhere}?`, h("p", {}, words.everywhereHelp), buttons);
+    return section(words.remedy, h("p", {}, advice), buttons);
+  }
+
+  /** Options without the place, which then is not told of photos to come either. */
+  private withoutPlace(options: Options): Options {
+    const { x, y } = this.options;
+    const isSame = x === options.x && y === options.y;
+    const none = { x: "", y: "", radius: "" };
+    if (isSame) this.options = { ...this.options, ...none };
+    return { ...options, ...none };
   }
 
   /** Save the results as localize.py writes them, of which tools/report.py makes a report; a form changes quotes in names. */
@@ -279,6 +294,14 @@ export class Drop {
 
 function action(drawing: string, label: string, onclick: () => void, kind = ""): HTMLElement {
   return h("button", { type: "button", class: `copy ${kind}`, onclick }, icon(drawing), label);
+}
+
+function adviceOn({ status, needsField }: Refusal): string {
+  return needsField ? words.tellField : (words.remedies[status] ?? words.otherRemedy);
+}
+
+function hasPlace({ options: { x, y } }: Job): boolean {
+  return Boolean(x && y);
 }
 
 function isImage(file: File): boolean {

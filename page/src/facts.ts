@@ -1,9 +1,9 @@
 /** What was measured of the photo that is opened, in words. */
 import { h, icon } from "./dom";
 import { length, percent } from "./list";
-import { badge } from "./marks";
+import { badge, verdictOf } from "./marks";
 import type { Model } from "./model";
-import { text } from "./text";
+import { plain, text } from "./text";
 import type { Photo, Pose } from "./types";
 
 /** Put a text on the clipboard, also where a page on disk may not ask the browser to. */
@@ -44,10 +44,11 @@ export class Facts {
     const { photo, alternative } = this.model;
     if (!photo) return this.box.replaceChildren();
     const pose = alternative === null ? photo.pose : photo.alternatives[alternative].pose;
+    const notes = photo.warnings.filter((warning) => warning !== photo.contradiction);
     this.box.replaceChildren(
       ...[
         this.heading(photo),
-        photo.error && this.tells(photo) ? h("p", { class: `error ${photo.status}` }, photo.error) : null,
+        photo.error && this.tells(photo) ? h("p", { class: `error ${photo.status}` }, plain(photo.error)) : null,
         photo.status === "localized" ? null : this.remedies(photo),
         pose ? this.place(photo, pose) : null,
         photo.spread && alternative === null ? this.spread(photo) : null,
@@ -55,7 +56,7 @@ export class Facts {
         photo.evidence ? this.evidence(photo) : null,
         this.about(photo),
         photo.status === "localized" ? this.remedies(photo) : null,
-        photo.warnings.length ? section(text.warnings, h("ul", { class: "notes" }, ...photo.warnings.map((w) => h("li", {}, w)))) : null,
+        notes.length ? section(text.warnings, h("ul", { class: "notes" }, ...notes.map((note) => h("li", {}, plain(note))))) : null,
       ].filter((part) => part !== null),
     );
   }
@@ -68,16 +69,23 @@ export class Facts {
   private heading(photo: Photo): HTMLElement {
     const meter = h("div", { class: `meter ${photo.status}` }, h("span", { class: "meter-fill" }));
     (meter.firstElementChild as HTMLElement).style.width = `${100 * photo.confidence}%`;
+    const hasConfidence = photo.pose && !photo.contradiction; // else it is that of what was told
     return h(
       "section",
       { class: "facts-head" },
-      h("p", { class: `verdict ${photo.status}` }, badge(photo.status), text.status[photo.status]),
-      h("p", { class: "meaning" }, photo.pose && !photo.isOnPlan ? text.hopeless : text.statusMeaning[photo.status]),
-      photo.pose
+      h("p", { class: `verdict ${photo.status}` }, badge(photo.status), verdictOf(photo)),
+      h("p", { class: "meaning" }, this.meaning(photo)),
+      photo.contradiction ? h("p", {}, sentence(photo.contradiction)) : null,
+      hasConfidence
         ? h("div", { class: "confidence", title: text.confidenceHelp }, h("span", {}, text.confidence), h("b", {}, percent(photo.confidence)))
         : null,
-      photo.pose ? meter : null,
+      hasConfidence ? meter : null,
     );
+  }
+
+  private meaning(photo: Photo): string {
+    if (photo.contradiction) return photo.pose ? text.contradictsPose : text.contradictsAll;
+    return photo.pose && !photo.isOnPlan ? text.hopeless : text.statusMeaning[photo.status];
   }
 
   private place(photo: Photo, pose: Pose): HTMLElement {
@@ -188,6 +196,11 @@ export class Facts {
 
 function chunked(rows: number[]): number[][] {
   return [rows.slice(0, 3), rows.slice(3, 6), rows.slice(6, 9)];
+}
+
+/** Words on what was found, as a sentence. */
+function sentence(words: string): string {
+  return `${words[0].toUpperCase()}${plain(words.slice(1))}.`;
 }
 
 export function section(title: string, ...children: (Node | null)[]): HTMLElement {

@@ -1,6 +1,6 @@
 /** The list of photos: only rows in sight are elements, so that thousands stay smooth. */
 import { h } from "./dom";
-import { badge } from "./marks";
+import { badge, verdictOf } from "./marks";
 import type { Model } from "./model";
 import { labelOf } from "./plan_painter";
 import { text } from "./text";
@@ -93,7 +93,7 @@ export class List {
         "div",
         { class: "row-text" },
         h("div", { class: "row-name", title: photo.name }, labelOf(photo)),
-        h("div", { class: `row-status ${photo.status}` }, badge(photo.status), text.status[photo.status]),
+        h("div", { class: `row-status ${photo.status}` }, badge(photo.status), verdictOf(photo)),
         h("div", { class: "row-facts" }, this.facts(photo)),
       ),
     );
@@ -105,7 +105,7 @@ export class List {
   private facts(photo: Photo): string {
     if (this.model.report.service && photo.error) return photo.error;
     const storey = this.model.report.storeys.length > 1 && photo.pose ? this.model.report.storeys[photo.storey ?? 0].name : null;
-    const sure = photo.pose ? `${percent(photo.confidence)}` : null;
+    const sure = photo.pose && !photo.contradiction ? `${percent(photo.confidence)}` : null;
     const spread = photo.spread ? `±${length(photo.spread.largest)}` : null;
     return [sure, spread, storey].filter(Boolean).join(" · ");
   }

@@ -4,7 +4,7 @@ import { Drop } from "./drop";
 import { Facts } from "./facts";
 import { follow, linkOf } from "./link";
 import { List } from "./list";
-import { badge } from "./marks";
+import { badge, verdictOf } from "./marks";
 import { type Mode, Model, type Sort } from "./model";
 import { Plan } from "./plan";
 import { labelOf } from "./plan_painter";
@@ -315,7 +315,7 @@ function onSelected(): void {
     if (wasViewing) byId("plan").focus();
     return;
   }
-  byId("announce").textContent = text.opened(labelOf(photo), text.status[photo.status]);
+  byId("announce").textContent = text.opened(labelOf(photo), verdictOf(photo));
   if (wasViewing) plan.reveal(photo);
 }
 

@@ -1,6 +1,7 @@
 /** A status as a colour and a shape: circle, diamond, triangle, square, hourglass. The same in list, plan and print. */
 import { svg } from "./dom";
-import type { Status } from "./types";
+import { text } from "./text";
+import type { Photo, Status } from "./types";
 
 /** Corners on a circle of radius 1, clockwise from the top; none is a circle. */
 const CORNERS: Record<Status, [number, number][]> = {
@@ -28,7 +29,12 @@ export function shape(status: Status, x = 0, y = 0, radius = 1): SVGElement {
   return svg("polygon", { points, class: `mark ${status}` });
 }
 
-/** The same for lines of text. */
+/** What is said first of a photo. */
+export function verdictOf({ verdict, contradiction, status }: Photo): string {
+  return verdict ?? (contradiction ? text.contradicts : text.status[status]);
+}
+
+/** The shape for lines of text. */
 export function badge(status: Status): SVGElement {
   return svg("svg", { viewBox: "-1.4 -1.4 2.8 2.8", class: "badge", "aria-hidden": "true" }, shape(status));
 }

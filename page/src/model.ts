@@ -26,6 +26,8 @@ export class Model {
   /** Between which it is measured, none to two, of any photos. */
   spots: Spot[] = [];
   view: View = { yaw: 0, pitch: 0, fov: FOV };
+  /** True if a link told the view, which then stays as it is. */
+  isViewTold = false;
   search = "";
   statuses = new Set<Status>(STATUSES);
   onlyStorey: number | null = null;
@@ -116,6 +118,7 @@ export class Model {
     this.alternative = null;
     const photo = this.photo;
     if (photo?.pose && view === null && before === null) this.view = { ...this.view, ...ahead(photo), pitch: 0, fov: FOV };
+    this.isViewTold = view !== null;
     if (view) this.view = { ...this.view, ...view };
     if (photo && !photo.pose) this.view = { ...this.view, ...(view ?? { yaw: 0, pitch: 0 }) };
     if (photo && photo.storey !== null) this.storey = photo.storey;

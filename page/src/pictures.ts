@@ -1,6 +1,6 @@
 /** The pictures of a photo: from a script beside the page, asked for when needed, or from within the page. */
 import type { Depth } from "./measure";
-import type { Photo, Pictures } from "./types";
+import type { Photo, Pictures, Vector } from "./types";
 
 export interface Images {
   sphere: ImageBitmap;
@@ -8,11 +8,15 @@ export interface Images {
   mask: ImageBitmap | null;
   alternatives: (ImageBitmap | null)[];
   depth: Depth | null;
+  /** Directions of the camera's frame in which the photo shows something. */
+  lit: Vector[];
 }
 
 const KEPT = 4; // photos whose pictures stay in memory
 const DEPTH_FROM = 0.05; // m, as in piccolo/report/pictures.py
 const DEPTH_STEP = 0.001;
+const COARSE = 96; // px, the width at which it is asked where a photo is black
+const DARK = 24; // of 3 * 255, as JPEG writes black
 const kept = new Map<string, Promise<Images>>();
 
 /** The pictures of a photo, drawn; at most `most` px wide, as the graphics allow. */
@@ -44,7 +48,23 @@ async function decoded(key: string, most: number): Promise<Images> {
     picture(pictures.mask, "image/png"),
     ...(pictures.alternatives ?? []).map((data) => picture(data)),
   ]);
-  return { sphere, scan, mask, alternatives, depth };
+  return { sphere, scan, mask, alternatives, depth, lit: litOf(sphere) };
+}
+
+/** The directions of a sphere's pixels that are not black, coarsely. */
+function litOf(sphere: ImageBitmap): Vector[] {
+  const [width, height] = [COARSE, COARSE / 2];
+  const context = new OffscreenCanvas(width, height).getContext("2d")!;
+  context.drawImage(sphere, 0, 0, width, height);
+  const { data } = context.getImageData(0, 0, width, height);
+  const pixels = Array.from({ length: width * height }, (_, k) => k);
+  const isLit = (k: number) => data[4 * k] + data[4 * k + 1] + data[4 * k + 2] > DARK;
+  return pixels.filter(isLit).map((k) => {
+    const azimuth = (0.5 - ((k % width) + 0.5) / width) * 2 * Math.PI;
+    const elevation = (0.5 - (Math.floor(k / width) + 0.5) / height) * Math.PI;
+    const level = Math.cos(elevation);
+    return [level * Math.cos(azimuth), level * Math.sin(azimuth), Math.sin(elevation)];
+  });
 }
 
 function bytesOf(data: string): Uint8Array<ArrayBuffer> {

@@ -6,6 +6,24 @@ const plural = (count: number, one: string, many: string): string => (count === 
 /** Of a length [m], by its deviation. */
 const digits = (deviation: number | null): number => (deviation !== null && deviation < 0.0995 ? 3 : 2);
 
+/** Parameters of the API, which messages have in backticks. */
+const PARAMETERS: Record<string, string> = {
+  camera: "a calibration file",
+  cube_order: "the order of its faces",
+  focal_px: "a focal length in pixels",
+  fov_deg: "a field of view in degrees",
+  gravity_vector: "the direction of gravity",
+  heading: "the heading",
+  height: "the height",
+  mask: "a mask",
+  near: "the place",
+  refine_focal: "to be refined",
+  within: "the scan",
+};
+
+/** A message in words for those who never see the API. */
+export const plain = (words: string): string => words.replace(/`(\w+)`/g, (_, name: string) => PARAMETERS[name] ?? name);
+
 export const text = {
   skip: "Skip to the list of photos",
   photos: (count: number) => `${count} ${plural(count, "photo", "photos")}`,
@@ -24,6 +42,9 @@ export const text = {
     unreadable: "The photo could not be used, for the reason below.",
     waiting: "It is not localized yet.",
   } satisfies Record<Status, string>,
+  contradicts: "Contradicts what was told",
+  contradictsPose: "It is shown where the photo fits the scan. If that is right, what was told is wrong.",
+  contradictsAll: "Where it was told to be, the scan has no place for a camera, so that nothing was searched.",
   note: (words: string) => `Careful: ${words}.`,
   hopeless: "Most likely not of this scan: its best guess is not on the plan.",
   guess: (name: string) => `${name}, a guess`,
@@ -160,13 +181,29 @@ export const text = {
     replacedNote: "The scan was replaced after this page was loaded. Export the results that you need, then ",
     reload: "load the page again",
     remedy: "What would help",
+    needsField: "Needs its field of view",
+    needsFieldWhy: "It is no 360° photo, and its file does not say how wide it looks.",
+    tellField: "Tell its field of view; for phone photos that are not zoomed about 65° will do.",
+    contradictsPlace: "Contradicts the place you told",
+    noPlace: "The place you told is not in the scan",
+    everywhere: "Search everywhere",
+    everywhereHelp: "Localizes the photo again without the place. Photos to come are not told it either.",
+    verdicts: {
+      0: "Not sent",
+      401: "Not let in",
+      403: "Not let in",
+      408: "Sent too slowly",
+      409: "The scan was replaced",
+      413: "Too large",
+    } as Record<number, string>,
+    notYet: "Not localized yet",
     remedies: {
       0: "See that the service runs and that you are connected to it, then try again.",
       401: "Open the page by the address that the service printed: it has the token.",
       403: "Open the page by the address that the service printed.",
       409: "Load the page again, then drop the photo again.",
       413: "Save the photo smaller: 4096 pixels of width are enough for a 360° photo.",
-      422: "Drop a JPEG, PNG, TIFF, WebP or HEIC picture that other programs can open. If it is a phone photo without focal length, tell its field of view; about 65° will do.",
+      422: "Drop a JPEG, PNG, TIFF, WebP or HEIC picture that other programs can open.",
       408: "Try again where the network is better.",
       502: "The service does not run behind its proxy. Tell who runs it, then try again.",
       503: "Try again when fewer photos are waiting.",

@@ -54,6 +54,10 @@ export interface Photo {
   probabilityNone: number | null;
   error: string | null;
   warnings: string[];
+  /** That of them by which what was told of the photo can't be right; of one that is localized none. */
+  contradiction: string | null;
+  /** In place of the words for its status, if these are too wide. */
+  verdict?: string;
   scan: string | null;
   captured: string | null;
   size: [number, number] | null;

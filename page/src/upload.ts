@@ -5,7 +5,7 @@ import type { Photo, Pictures } from "./types";
 export const LOST = 0; // the network, in place of a status of HTTP
 export const REPLACED = 409;
 export const TOO_LARGE = 413;
-export const NO_PICTURE = 422;
+const NO_PICTURE = 422;
 const LATE = 408;
 const DONE = 200;
 const BUSY = 503;
@@ -29,6 +29,15 @@ export class Refusal extends Error {
     readonly seconds: number | null = null,
   ) {
     super(words);
+  }
+
+  get isUnreadable(): boolean {
+    return this.status === NO_PICTURE && !this.needsField;
+  }
+
+  /** True of a picture that is no sphere, and says nothing of its lens. */
+  get needsField(): boolean {
+    return this.status === NO_PICTURE && this.message.includes("`fov_deg`");
   }
 
   get mayPass(): boolean {

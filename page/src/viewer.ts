@@ -17,6 +17,7 @@ const FAR = 25; // m, of what was not scanned
 const SLACK = 0.4; // m
 const HERE = 0.3; // m, to photos of the same place
 const CLICK = 6; // px, of a pointer that does not turn the view
+const SEEN = 0.3; // of the canvas, from its middle: a photo farther out is out of sight
 const FOOT = 1.5; // m, height of a camera where no floor is known
 
 interface Way {
@@ -208,6 +209,7 @@ export class Viewer {
       const scan = alternative === null ? images.scan : images.alternatives[alternative] ?? null;
       const rotation = this.pose?.rotation ?? [1, 0, 0, 0, 1, 0, 0, 0, 1];
       this.looked();
+      if (alternative === null && !this.model.isViewTold) this.turnTo(images.lit, rotation);
       this.sphere.show({ photo: images.sphere, scan, mask: alternative === null ? images.mask : null, rotation }, true);
       this.say(photo.pose ? "" : text.noScan, false);
       this.findWays(images.depth);
@@ -219,6 +221,20 @@ export class Viewer {
     } finally {
       clearTimeout(late);
     }
+  }
+
+  /** Turn to a photo of which nothing is in sight, as of a phone's after one looked elsewhere. */
+  private turnTo(lit: Vector[], rotation: number[]): void {
+    const [width, height] = [this.canvas.clientWidth, this.canvas.clientHeight];
+    const inPlan = lit.map((ray) => [0, 1, 2].map((k) => ray.reduce((sum, value, row) => sum + value * rotation[3 * row + k], 0)));
+    const isSeen = (ray: number[]) => {
+      const at = this.sphere!.project(ray as Vector);
+      return at !== null && Math.abs(at.x - width / 2) < SEEN * width && Math.abs(at.y - height / 2) < SEEN * height;
+    };
+    if (!lit.length || inPlan.some(isSeen)) return;
+    const [x, y, z] = [0, 1, 2].map((k) => inPlan.reduce((sum, ray) => sum + ray[k], 0));
+    Object.assign(this.model.view, { yaw: Math.atan2(y, x), pitch: Math.atan2(z, Math.hypot(x, y)) });
+    this.model.changed("view");
   }
 
   private say(words: string, isAll: boolean): void {

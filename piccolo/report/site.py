@@ -41,6 +41,8 @@ POLICY = (
 OWN = "'self' file:"
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
+# beginnings of warnings of localization/prior.py and judge.py
+CONTRADICTIONS = "the pose found is", "the pose found looks", "no position is left", "the picture has a focal"
 ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations
 EVIDENCE = ("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction", "num_matches")
@@ -94,7 +96,9 @@ def shorten_names(names: Sequence[str]) -> list[str]:
 def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> dict[str, Any]:
     """Return what the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
-    is_hopeless = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
+    contradiction = find_contradiction(result)
+    is_unlikely = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
+    is_hopeless = is_unlikely and not contradiction
     return {
         "name": name,
         "key": key,
@@ -103,6 +107,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
         "probabilityNone": _round(result.probability_none, 5),
         "error": result.error and _below(result.error, result.pano, name),
         "warnings": [_below(warning, result.pano, name) for warning in result.warnings],
+        "contradiction": contradiction,
         "isOnPlan": result.best_pose is not None and not is_hopeless,
         "scan": result.scan,
         "captured": result.source.capture_time,
@@ -112,6 +117,13 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
         "gap": bool(result.walk and result.walk.gap),
         **(document_of_found(result, result.best_pose, scan_map) if result.best_pose else NOTHING_FOUND),
     }
+
+
+def find_contradiction(result: Result) -> str | None:
+    """Return the warning that what was told of a photo that is not localized does not fit it."""
+    if result.status != NOT_LOCALIZED:
+        return None
+    return next((warning for warning in result.warnings if warning.startswith(CONTRADICTIONS)), None)
 
 
 def document_of_found(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:
