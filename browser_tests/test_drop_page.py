@@ -241,10 +241,18 @@ def test_a_place_is_shown_on_the_plan(visit):
     assert x == pytest.approx(origin[0] + e + a * plan["width"] / 2, abs=0.05)
     assert y == pytest.approx(origin[1] + f + d * plan["height"] / 2, abs=0.05)
     page.click(".options .main")
+    told = f"Told of the next photos: taken within 5 m of {x:.2f}, {y:.2f}"
+    assert page.inner_text(".told span") == told
     page.evaluate(LISTEN)
     _choose(page, FLAT / "images" / "bedroom.jpg")
     _wait(page, "localized")
     assert page.evaluate("told") == {"prior": {"near": [x, y, None], "radius": 5}}
+    assert page.locator(f".told >> text={told}").is_visible()  # it is told of the next ones too
+    page.click(".told >> text=Clear")
+    assert not page.locator(".told").is_visible()
+    _choose(page, FLAT / "images" / "bedroom.jpg")
+    _wait(page, "localized", "localized")
+    assert page.evaluate("told") == {}
 
 
 def _tell_place(page, x, y, radius):
@@ -451,7 +459,7 @@ def test_what_is_kept_is_there_again_and_links_open_it(browser, cache, tmp_path,
         _wait(page, "localized", "localized")
         page.click("#row-1")
         page.wait_for_selector('#viewer[data-shown="1"]')
-        assert page.locator("#facts .copy:has-text('Copy link')").is_visible()
+        assert page.locator(".copy:has-text('Copy link')").count() == 1
         link = page.evaluate("location.href")
         page.reload()  # it asks nothing
         assert _names(page) == ["bedroom", "living_room"]
@@ -498,6 +506,8 @@ def test_a_phone(visit, shoot):
     page = visit(**PHONE)
     page.wait_for_timeout(400)
     shoot(page, "drop-phone-empty")
+    assert page.locator(".drop >> text=Tap to choose 360° photos").is_visible()
+    assert "Drop photos" not in page.inner_text(".drop")
     assert page.evaluate("document.documentElement.scrollWidth") <= PHONE["width"]
     for label in ("Choose photos", "Take a photo"):
         assert page.locator(f".drop >> text={label}").is_visible()

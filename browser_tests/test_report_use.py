@@ -8,6 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
+from piccolo.panorama.cameras import GUESS, HOW
+from piccolo.panorama.read import CHOICES
 from piccolo.result import read_results
 
 DOWNLOAD = "Download as a table (CSV)"
@@ -271,3 +273,26 @@ def test_the_clipboard_gets_what_the_buttons_say(demo, open_page):
     result = read_results([demo[0] / "poses.jsonl"])[0]
     np.testing.assert_allclose(pose["center_world"], result.pose.center_world, atol=1e-6)
     np.testing.assert_allclose(pose["R_cam_from_world"], result.pose.R_cam_from_world, atol=1e-9)
+
+
+def test_messages_say_in_plain_words_what_the_api_calls_by_name(demo, open_page):
+    page = open_page(demo[1])
+    notes = [f"read as a pinhole photo{HOW}", CHOICES.format(65), f"{GUESS}: `cube_order`"]
+    page.evaluate("notes => { PICCOLO_REPORT.photos[0].warnings = notes; }", notes)
+    page.click("#row-0")
+    said = page.locator(".notes li").all_inner_texts()
+    assert not any(
+        name in " ".join(said) for name in ("`", "focal_px", "fov_deg", "cube_order", "refine_focal")
+    )
+    assert said[0].endswith(
+        "; a calibration file, a focal length in pixels, or a field of view in degrees "
+        "with the projection pinhole set it exactly"
+    )
+    assert "unknown, a field of view of about 65°. If it" in said[1]
+
+
+def test_a_deviation_is_the_same_wherever_it_is_told(demo, open_page):
+    page = open_page(demo[1])
+    row = re.search(r"±(\S+ mm)", page.inner_text("#row-0 .row-facts"))[1]
+    page.click("#row-0")
+    assert re.search(r"(\S+ mm) and \S+° \(one standard deviation", page.inner_text("#facts"))[1] == row

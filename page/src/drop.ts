@@ -39,6 +39,7 @@ export class Drop {
   private opened: Photo | null = null;
   private last: Job | null = null;
   private count = 0;
+  private readonly told = h("div", { class: "told", role: "status" });
   private readonly dialog: OptionsDialog;
 
   constructor(
@@ -67,29 +68,40 @@ export class Drop {
     const files = chooser({ multiple: true });
     const camera = chooser({ capture: "environment" });
     const choose = () => files.click();
-    const ask = () => this.dialog.open(this.options, (told) => (this.options = told));
+    const ask = () => this.dialog.open(this.options, (told) => this.use(told));
     const buttons = [
       action("photos", words.choose, choose, "main"),
       action("camera", words.take, () => camera.click(), "touch-only"),
       action("tune", words.options, ask),
     ];
+    const isTouched = matchMedia("(pointer: coarse)").matches;
     const box = h(
       "section",
       { class: "drop" },
       h("span", { class: "drop-mark" }, icon("pin")),
       h("h2", {}, words.title),
-      h("p", {}, words.lead(words.megabytes(maxBytes))),
+      h("p", {}, (isTouched ? words.leadOfTouch : words.lead)(words.megabytes(maxBytes))),
       h("div", { class: "copies" }, ...buttons),
+      this.told,
       h("p", { class: "quiet" }, this.keeps ? words.kept : words.notKept),
       files,
       camera,
     );
     byId("filters").before(box);
     const add = iconButton("plus", words.choose, choose);
-    add.classList.add("narrow-only");
+    add.classList.add("narrow-only", "add");
     byId("actions").prepend(add);
     byId("filters").lastElementChild!.append(iconButton("results", words.export, () => this.export()));
     document.body.append(h("div", { class: "veil", "aria-hidden": "true" }, icon("pin"), words.here));
+  }
+
+  /** Take what is told of the photos to come, and show it beside where they are dropped. */
+  private use(told: Options): void {
+    this.options = told;
+    const said = words.toldOf(told);
+    const clear = h("button", { type: "button", class: "link", onclick: () => this.use({}) }, words.forget);
+    this.told.replaceChildren(...(said ? [h("span", {}, words.toldNext(said)), clear] : []));
+    document.body.classList.toggle("tells", Boolean(said));
   }
 
   private get keeps(): boolean {
@@ -281,7 +293,7 @@ export class Drop {
     const { x, y } = this.options;
     const isSame = x === options.x && y === options.y;
     const none = { x: "", y: "", radius: "" };
-    if (isSame) this.options = { ...this.options, ...none };
+    if (isSame) this.use({ ...this.options, ...none });
     return { ...options, ...none };
   }
 

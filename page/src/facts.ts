@@ -111,11 +111,11 @@ export class Facts {
   }
 
   private spread(photo: Photo): HTMLElement {
-    const { mm, deg, direction, ellipse } = photo.spread!;
+    const { largest, deg, direction, ellipse } = photo.spread!;
     const isEven = direction.startsWith("much the same");
     return section(
       text.uncertainty,
-      h("p", {}, text.spread(Math.max(...mm).toFixed(1), Math.max(...deg).toFixed(2))),
+      h("p", {}, text.spread(length(largest), Math.max(...deg).toFixed(2))),
       h("p", { class: "quiet" }, isEven ? text.spreadSame : text.spreadMost(direction)),
       h("p", { class: "quiet" }, text.ellipse((2000 * ellipse[0]).toFixed(1), (2000 * ellipse[1]).toFixed(1))),
     );

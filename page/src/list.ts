@@ -3,7 +3,7 @@ import { h } from "./dom";
 import { badge, verdictOf } from "./marks";
 import type { Model } from "./model";
 import { labelOf } from "./plan_painter";
-import { text } from "./text";
+import { plain, text } from "./text";
 import type { Photo } from "./types";
 
 const ROW = 76; // px
@@ -103,7 +103,7 @@ export class List {
   }
 
   private facts(photo: Photo): string {
-    if (this.model.report.service && photo.error) return photo.error;
+    if (this.model.report.service && photo.error) return plain(photo.error);
     const storey = this.model.report.storeys.length > 1 && photo.pose ? this.model.report.storeys[photo.storey ?? 0].name : null;
     const sure = photo.pose && !photo.contradiction ? `${percent(photo.confidence)}` : null;
     const spread = photo.spread ? `±${length(photo.spread.largest)}` : null;

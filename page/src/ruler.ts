@@ -1,7 +1,6 @@
 /** Measuring on the photo that is opened: points are picked, and their distance is drawn over the sphere. */
 import { h, icon, svg } from "./dom";
 import { copyButton } from "./facts";
-import { linkOf } from "./link";
 import { distanceBetween, inCamera, pointAt, type Point, type Spot } from "./measure";
 import type { Model } from "./model";
 import { imagesOf } from "./pictures";
@@ -30,8 +29,7 @@ export class Ruler {
   ) {
     this.button = h("button", { type: "button", class: "toggle", title: text.measureHelp, onclick: () => this.toggle() }, icon("ruler"), text.measure);
     const names = () => this.points.map(({ spot }) => model.report.photos[spot.photo].name).join(", ");
-    const link = () => location.href.replace(/#.*|$/, linkOf(model));
-    this.copies = h("div", { class: "copies" }, copyButton("copy", text.copyDistance, () => `${this.told()} (${names()})`), model.hasLinks ? copyButton("link", text.copyLink, link) : null);
+    this.copies = h("div", { class: "copies" }, copyButton("copy", text.copyDistance, () => `${this.told()} (${names()})`));
     this.panel = h("div", { class: "ruler-panel" }, this.words, this.copies);
     box.append(this.drawing, h("div", { class: "reticle", "aria-hidden": "true" }), this.label);
     model.on("measure selected alternative", () => void this.find());

@@ -6,6 +6,8 @@ const plural = (count: number, one: string, many: string): string => (count === 
 /** Of a length [m], by its deviation. */
 const digits = (deviation: number | null): number => (deviation !== null && deviation < 0.0995 ? 3 : 2);
 
+export const RADIUS = 5; // m around a place, unless another is told
+
 /** Parameters of the API, which messages have in backticks. */
 const PARAMETERS: Record<string, string> = {
   camera: "a calibration file",
@@ -17,12 +19,16 @@ const PARAMETERS: Record<string, string> = {
   height: "the height",
   mask: "a mask",
   near: "the place",
-  refine_focal: "to be refined",
+  projection: "the projection",
+  refine_focal: "refining the focal length",
   within: "the scan",
 };
 
 /** A message in words for those who never see the API. */
-export const plain = (words: string): string => words.replace(/`(\w+)`/g, (_, name: string) => PARAMETERS[name] ?? name);
+export const plain = (words: string): string =>
+  words
+    .replace(/`projection` pinhole `fov_deg` (\d+) `refine_focal`/, "a field of view of about $1°")
+    .replace(/`(\w+)`/g, (_, name: string) => PARAMETERS[name] ?? name);
 
 export const text = {
   skip: "Skip to the list of photos",
@@ -111,7 +117,7 @@ export const text = {
   angles: "Heading, pitch, roll",
   height: "Above the floor",
   uncertainty: "Uncertainty",
-  spread: (mm: string, deg: string) => `${mm} mm and ${deg}° (one standard deviation)`,
+  spread: (length: string, deg: string) => `${length} and ${deg}° (one standard deviation, where it is largest)`,
   spreadSame: "about the same in all directions",
   spreadMost: (direction: string) => `least certain: ${direction}`,
   ellipse: (a: string, b: string) => `95 % ellipse on the plan: ${a} × ${b} mm`,
@@ -160,11 +166,19 @@ export const text = {
     ["/", "search"],
   ] as [string, string][],
   download: "Download as a table (CSV)",
-  table: ["Photo", "Status", "Confidence", "Storey", "x [m]", "y [m]", "z [m]", "Heading [°]", "1 σ [mm]"],
+  table: ["Photo", "Status", "Confidence", "Storey", "x [m]", "y [m]", "z [m]", "Heading [°]", "Deviation [mm]"],
   madeBy: (version: string) => `Made by PICCOLO ${version}`,
   drop: {
     title: "Where was it taken?",
     lead: (size: string) => `Drop photos anywhere on this page: 360° photos and phone photos, several at once, up to ${size} each.`,
+    leadOfTouch: (size: string) => `Tap to choose 360° photos and phone photos, several at once, up to ${size} each.`,
+    toldOf: ({ fov, focal, x, y, radius }: Record<string, string>) => {
+      const lens = focal ? `focal length ${focal} pixels` : fov ? `field of view ${fov}°` : "";
+      const place = x && y ? `taken within ${radius || RADIUS} m of ${x}, ${y}` : "";
+      return [lens, place].filter(Boolean).join("; ");
+    },
+    toldNext: (said: string) => `Told of the next photos: ${said}`,
+    forget: "Clear",
     kept: "The service keeps the photos and what it finds.",
     notKept: "The service keeps no photo. What it finds stays in this page until you close it.",
     here: "Drop to localize",

@@ -29,7 +29,6 @@ export interface Spread {
   ellipse: Vector;
   /** Of the turn about the camera's axes [rad] and the position on the plan [m]: rows from the diagonal on. */
   covariance: number[];
-  mm: Vector;
   deg: Vector;
   largest: number;
   direction: string;

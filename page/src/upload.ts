@@ -1,5 +1,5 @@
 /** Sends a photo to the service that served the page, and reads its answer line by line. */
-import { text } from "./text";
+import { RADIUS, text } from "./text";
 import type { Photo, Pictures } from "./types";
 
 export const LOST = 0; // the network, in place of a status of HTTP
@@ -9,7 +9,6 @@ const NO_PICTURE = 422;
 const LATE = 408;
 const DONE = 200;
 const BUSY = 503;
-const RADIUS = 5; // m around a place, unless another is told
 
 /** What a person knows that a photo's file does not say, by the names of the dialog's fields; "" is unknown. */
 export type Options = Record<string, string>;

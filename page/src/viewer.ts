@@ -6,7 +6,7 @@ import { imagesOf } from "./pictures";
 import { labelOf } from "./plan_painter";
 import { Ruler } from "./ruler";
 import { Sphere } from "./sphere";
-import { text } from "./text";
+import { plain, text } from "./text";
 import type { Photo, Pose, Vector } from "./types";
 
 const MODES: Mode[] = ["photo", "blend", "split", "scan"];
@@ -193,7 +193,7 @@ export class Viewer {
     this.combine();
     if (!photo) return;
     const isTold = photo.status === "unreadable" && this.model.report.service; // by the facts, with a remedy
-    if (!photo.hasPictures) return this.say(isTold ? text.noPicture : (photo.error ?? text.noPictures), true);
+    if (!photo.hasPictures) return this.say(isTold ? text.noPicture : plain(photo.error ?? text.noPictures), true);
     if (!this.sphere) {
       try {
         this.ruler.sphere = this.sphere = new Sphere(this.canvas);

@@ -182,7 +182,6 @@ def spread_document(covariance: PoseCovariance, R_map_from_world: Array) -> dict
     return {
         "ellipse": [*_list(half[::-1]), round(math.degrees(math.atan2(axes[1, 1], axes[0, 1])), 2)],
         "covariance": [float(f"{value:.4g}") for value in in_plan[np.triu_indices(6)]],
-        "mm": _list(covariance.std_mm, 2),
         "deg": _list(covariance.std_deg, 4),
         "largest": round(1000.0 * covariance.largest_std, 2),
         "direction": covariance.least_constrained_direction,
