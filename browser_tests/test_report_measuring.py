@@ -1,5 +1,6 @@
 """Measuring in a report: against the scan, by mouse, keys, fingers, links; what else the page says."""
 
+import csv
 import json
 import math
 import re
@@ -131,6 +132,58 @@ def test_keys_measure_and_a_link_leads_back(demo, scan, open_page, shoot, scheme
     broken = open_page(demo[1], f"#photo={scan[2]}&at=1,2,x,{scan[2]}&at=999,0,1,{scan[2]}&at=0,0,1,gone.jpg")
     broken.wait_for_selector("#viewer[data-shown]")
     assert not broken.locator(".ruler-panel").is_visible()
+
+
+def _measure(page, *places):
+    page.keyboard.press("m")
+    for place in places:
+        page.mouse.click(*_at(page, *place))
+        page.wait_for_timeout(150)
+    return _read(page)
+
+
+def test_distances_are_listed_saved_and_downloaded(demo, scan, open_page, shoot, find_barriers):
+    page = _open(open_page, demo[1], scan[2])
+    assert not page.locator(".ruler-panel >> text=List").is_visible()
+    places = [(0.3, 0.35), (0.6, 0.8)]
+    measured = [_measure(page, *places)]
+    page.click("text=Keep")
+    page.keyboard.press("Escape")
+    measured.append(_measure(page, (0.35, 0.4), (0.6, 0.7)))
+    page.click("text=Keep")
+    page.click("text=List (2)")
+    page.fill("[aria-label='Note on measurement 1']", "=door")
+    page.keyboard.press("Tab")
+    assert find_barriers(page) == []
+    shoot(page, "measurements")
+    with page.expect_download() as saved:
+        page.click(".measurements >> text=Download")
+    assert saved.value.suggested_filename == "Demo room measurements.csv"
+    with saved.value.path().open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["note"] for row in rows] == ["'=door", ""]
+    for row, (metres, deviation, level, upright) in zip(rows, measured, strict=True):
+        found = [float(row[name]) for name in ("distance_m", "std_m", "horizontal_m", "vertical_m")]
+        assert found == pytest.approx([metres, deviation, level, upright], abs=0.0006)
+        ends = [[float(row[f"{axis}_{k}"]) for axis in "xyz"] for k in (1, 2)]
+        assert math.dist(*ends) == pytest.approx(metres, abs=0.001)
+        assert row["photo_1"] == row["photo_2"] == scan[2]
+    for k, place in enumerate(places, 1):
+        point = [float(rows[0][f"{axis}_{k}"]) for axis in "xyz"]
+        np.testing.assert_allclose(point, _scanned(scan, page, *place), atol=0.03)
+    page.click("[aria-label='Remove measurement 2']")
+    page.reload()  # the browser has saved them
+    page.wait_for_selector(".ruler-panel >> text=List (1)")
+    page.keyboard.press("Escape")
+    page.keyboard.press("m")
+    page.click("text=List (1)")
+    assert page.input_value("[aria-label='Note on measurement 1']") == "=door"
+    page.click("[aria-label='Show measurement 1']")
+    assert _read(page) == measured[0]
+    page.click("text=List (1)")
+    page.click("[aria-label='Remove measurement 1']")
+    page.wait_for_selector(".measurements", state="hidden")
+    assert not page.locator(".ruler-panel >> text=List").is_visible()
 
 
 def test_fingers_measure_on_a_phone(demo, scan, open_page, shoot):

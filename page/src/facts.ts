@@ -20,14 +20,19 @@ async function copy(words: string): Promise<void> {
   }
 }
 
-export function copyButton(name: string, label: string, words: () => string): HTMLElement {
+/** A button that says for a moment that it was done. */
+export function doingButton(name: string, label: string, done: string, act: () => unknown): HTMLElement {
   const caption = h("span", {}, label);
   const onclick = () =>
-    void copy(words()).then(() => {
-      caption.textContent = text.copied;
+    void Promise.resolve(act()).then(() => {
+      caption.textContent = done;
       setTimeout(() => (caption.textContent = label), 1600);
     });
   return h("button", { type: "button", class: "copy", onclick }, icon(name), caption);
+}
+
+export function copyButton(name: string, label: string, words: () => string): HTMLElement {
+  return doingButton(name, label, text.copied, () => copy(words()));
 }
 
 export class Facts {

@@ -1,7 +1,9 @@
 /** Measuring on the photo that is opened: points are picked, and their distance is drawn over the sphere. */
 import { h, icon, svg } from "./dom";
-import { copyButton } from "./facts";
+import { copyButton, doingButton } from "./facts";
+import { linkOf } from "./link";
 import { distanceBetween, inCamera, pointAt, type Point, type Spot } from "./measure";
+import { type Measurement, Measurements } from "./measurements";
 import type { Model } from "./model";
 import { imagesOf } from "./pictures";
 import type { Sphere } from "./sphere";
@@ -29,8 +31,10 @@ export class Ruler {
   ) {
     this.button = h("button", { type: "button", class: "toggle", title: text.measureHelp, onclick: () => this.toggle() }, icon("ruler"), text.measure);
     const names = () => this.points.map(({ spot }) => model.report.photos[spot.photo].name).join(", ");
-    this.copies = h("div", { class: "copies" }, copyButton("copy", text.copyDistance, () => `${this.told()} (${names()})`));
-    this.panel = h("div", { class: "ruler-panel" }, this.words, this.copies);
+    const measurements = new Measurements(model.report);
+    const keep = doingButton("plus", text.keepDistance, text.keptDistance, () => measurements.add(this.measurement()));
+    this.copies = h("div", { class: "copies" }, copyButton("copy", text.copyDistance, () => `${this.told()} (${names()})`), keep);
+    this.panel = h("div", { class: "ruler-panel" }, this.words, this.copies, measurements.button);
     box.append(this.drawing, h("div", { class: "reticle", "aria-hidden": "true" }), this.label);
     model.on("measure selected alternative", () => void this.find());
   }
@@ -85,6 +89,18 @@ export class Ruler {
   private told(): string {
     const { gap, metres, deviation } = distanceBetween(this.points[0], this.points[1], this.model.report.photos);
     return text.distance(metres, deviation) + text.parts(Math.hypot(gap[0], gap[1]), Math.abs(gap[2]), deviation);
+  }
+
+  /** The distance that is shown, with what a list of them needs. */
+  private measurement(): Measurement {
+    const { model, points } = this;
+    const { photos, R, origin } = model.report;
+    const { gap, metres, deviation } = distanceBetween(points[0], points[1], photos);
+    const inWorld = ({ at }: Point) => origin.map((value, k) => value + R[k] * at[0] + R[3 + k] * at[1] + R[6 + k] * at[2]) as Vector;
+    return {
+      ...{ note: "", metres, deviation, horizontal: Math.hypot(gap[0], gap[1]), vertical: Math.abs(gap[2]) },
+      ...{ photos: points.map(({ spot }) => photos[spot.photo].name), points: points.map(inWorld), link: linkOf(model) },
+    };
   }
 
   /** Pick the point under a place of the canvas [px]; the third one begins anew. */

@@ -11,8 +11,13 @@ export function download({ listed, report }: Model): void {
     const where = pose ? [...pose.world, ...pose.angles] : Array<string>(6).fill("");
     return [name, status, confidence, storey === null ? "" : report.storeys[storey].name, ...where, spread?.largest ?? ""];
   });
-  const text = [COLUMNS, ...rows].map((row) => row.map(cell).join(",")).join("\r\n");
-  save(`${report.title}.csv`, `${text}\r\n`, "text/csv");
+  saveTable(report.title, COLUMNS, rows);
+}
+
+/** Save rows under their heads as CSV. */
+export function saveTable(name: string, columns: string[], rows: (string | number)[][]): void {
+  const text = [columns, ...rows].map((row) => row.map(cell).join(",")).join("\r\n");
+  save(`${name}.csv`, `${text}\r\n`, "text/csv");
 }
 
 /** Save a text as a file. */
