@@ -17,7 +17,7 @@ ROOT = Path(__file__).resolve().parents[1]
 FLAT = ROOT / "examples" / "flat"
 SLOW_MS = 120_000  # for a photo, on a machine that does much else
 CHOOSER = "input[type=file][multiple]"
-PHONE = {"width": 360, "height": 740, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
+PHONE = {"width": 390, "height": 844, "device_scale_factor": 2, "has_touch": True, "is_mobile": True}
 # a file as a person drops it, put together in the page
 DROP = """([name, type, content]) => {
   const data = new DataTransfer();
@@ -487,19 +487,63 @@ def test_the_answer_of_another_scan_is_not_shown_on_old_plans(visit):
     page.wait_for_selector("body.no-photos")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_axe_finds_nothing(visit, shoot, find_barriers, scheme):
-    page = visit(color_scheme=scheme)
-    for state in ("empty", "options", "refused"):
-        if state == "options":
-            page.click(".drop >> text=Options")
-        if state == "refused":
-            page.keyboard.press("Escape")
-            page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
-            page.wait_for_selector("#facts >> text=What would help")
+SCREENS = {"light": {"color_scheme": "light"}, "dark": {"color_scheme": "dark"}, "phone": PHONE}
+
+
+@pytest.fixture(params=SCREENS)
+def screen(request, visit, find_barriers, shoot):
+    """The page on a screen, and a function that looks for barriers in a state of it."""
+    page = visit(**SCREENS[request.param])
+
+    def look(state):
         page.wait_for_timeout(400)
         assert find_barriers(page) == [], state
-        shoot(page, f"drop-axe-{scheme}-{state}")
+        assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), state
+        shoot(page, f"drop-axe-{request.param}-{state}")
+
+    return page, look
+
+
+def test_axe_finds_nothing_before_an_answer(screen):
+    page, look = screen
+    look("empty")
+    page.click(".drop >> text=Options")
+    look("options")
+    page.keyboard.press("Escape")
+    _tell_place(page, 29.0, -7.5, 1.0)
+    look("told")
+    busy = {"status": 503, "headers": {"Retry-After": "600"}, "body": '{"error": "found 32 photos"}'}
+    with _answering(page, lambda route: route.fulfill(**busy)):
+        _choose(page, FLAT / "images" / "bedroom.jpg")
+        page.wait_for_selector("#row-0 >> text=The service is busy", state="attached")
+        look("waiting")
+    page.evaluate("document.body.classList.add('showing-list')")
+    with _answering(page, lambda route: route.fulfill(status=408, body=LATE)):
+        _choose(page, FLAT / "images" / "living_room.jpg")
+        page.wait_for_selector("#row-1 >> text=Sent too slowly")
+    look("slow")
+
+
+def test_axe_finds_nothing_in_answers(screen):
+    page, look = screen
+    _tell_place(page, 29.0, -7.5, 1.0)
+    _choose(page, FLAT / "images" / "living_room.jpg")
+    page.wait_for_selector("#facts .verdict >> text=Contradicts the place")
+    look("contradicts")
+    page.click('.copy:has-text("Search everywhere")')
+    page.wait_for_selector(".row-status.localized", state="attached")
+    page.evaluate("document.body.classList.remove('showing-facts')")
+    page.wait_for_selector('#viewer[data-shown="0"]')
+    look("found")
+    page.keyboard.press("m")
+    look("measuring")
+    page.keyboard.press("Escape")
+    page.keyboard.press("Escape")
+    page.evaluate(DROP, ["notes.txt", "text/plain", "bm90IGEgcGhvdG8="])
+    page.wait_for_selector("#row-1 .row-status.unreadable", state="attached")
+    page.evaluate("location.hash = '#photo=notes.txt'")
+    page.wait_for_selector("#facts >> text=What would help")
+    look("refused")
 
 
 def test_a_phone(visit, shoot):
