@@ -423,7 +423,8 @@ def test_a_slow_upload_shows_how_far_it_is(visit, tmp_path):
     large = tmp_path / "large.jpg"
     large.write_bytes((FLAT / "images" / "bedroom.jpg").read_bytes() + bytes(1_500_000))
     _choose(page, large)
-    page.wait_for_selector(r"text=/Being sent, [1-9]\d? %/", state="attached")
+    page.wait_for_selector(r".progress >> text=/large: Being sent, [1-9]\d? %/")  # in sight
+    page.wait_for_selector(".progress >> text=large: Being localized")
     page.wait_for_selector("#viewer[data-shown]")
 
 
@@ -517,6 +518,7 @@ def test_axe_finds_nothing_before_an_answer(screen):
         _choose(page, FLAT / "images" / "bedroom.jpg")
         page.wait_for_selector("#row-0 >> text=The service is busy", state="attached")
         look("waiting")
+        assert page.locator(".progress >> text=The service is busy").count() == 1
     page.evaluate("document.body.classList.add('showing-list')")
     with _answering(page, lambda route: route.fulfill(status=408, body=LATE)):
         _choose(page, FLAT / "images" / "living_room.jpg")

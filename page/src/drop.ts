@@ -1,13 +1,13 @@
 /** A place for photos: they stand in the list at once, are sent two at a time, and become what was found. */
 import { byId, h, icon, iconButton } from "./dom";
 import { section } from "./facts";
-import { verdictOf } from "./marks";
+import { badge, verdictOf } from "./marks";
 import type { Model } from "./model";
 import { OptionsDialog } from "./options";
 import type { Plan } from "./plan";
 import { labelOf } from "./plan_painter";
 import { save } from "./table";
-import { text } from "./text";
+import { plain, text } from "./text";
 import type { Photo } from "./types";
 import { asJson, type Found, LOST, type Options, Refusal, REPLACED, send, TOO_LARGE } from "./upload";
 
@@ -40,6 +40,8 @@ export class Drop {
   private last: Job | null = null;
   private count = 0;
   private readonly told = h("div", { class: "told", role: "status" });
+  /** Of the photos at work, where the list is out of sight. */
+  private readonly progress = h("div", { class: "progress" });
   private readonly dialog: OptionsDialog;
 
   constructor(
@@ -52,7 +54,11 @@ export class Drop {
     model.on("selected", () => {
       if (model.photo !== this.opened) this.opened = null;
     });
-    model.on("list", () => document.body.classList.toggle("no-photos", !model.report.photos.length));
+    model.on("list", () => {
+      document.body.classList.toggle("no-photos", !model.report.photos.length);
+      this.fillProgress();
+    });
+    byId("plan").after(this.progress);
   }
 
   private fill(): void {
@@ -158,6 +164,11 @@ export class Drop {
     job.photo = { ...before, ...more };
     if (this.opened === before) this.opened = job.photo;
     this.model.put(job.photo, before);
+  }
+
+  private fillProgress(): void {
+    const atWork = this.jobs.filter(({ state }) => state !== "done");
+    this.progress.replaceChildren(...atWork.map(({ photo }) => h("p", {}, badge(photo.status), h("span", {}, `${labelOf(photo)}: ${plain(photo.error ?? "")}`))));
   }
 
   private next(): void {
