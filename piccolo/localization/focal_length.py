@@ -137,10 +137,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     assert prior is not None
     claim = make_claim(prior, camera)
     near, far = descend_lens(query, pose, claim, is_first)
-    estimate = add_matches(
-        widen_by_edges(query, estimate_corrections(near)), fit_matches(query, pose, FOCAL_WIDTHS)
-    )
-    free = widen_by_edges(query, estimate_corrections(far))
+    by_matches = fit_matches(query, pose, FOCAL_WIDTHS)
+    estimate = add_matches(estimate_lens(query, pose, near), by_matches)
+    free = estimate_lens(query, pose, far)
     values, information, motion = estimate
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
@@ -272,8 +271,14 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def widen_by_edges(query: Query, estimate: Estimate) -> Estimate:
-    """Add errors of the picture's edge that all blocks may have in common."""
+def estimate_lens(query: Query, pose: Pose, end: FreeEnd) -> Estimate:
+    """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
+
+    Errors of the picture's edge that all blocks may have in common are added.
+    """
+    estimate = estimate_corrections(end)
+    if end.pose.distance(pose) > FAR:
+        return estimate._replace(information=np.zeros_like(estimate.information))
     camera = query.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
     covariance = invert(estimate.information)
