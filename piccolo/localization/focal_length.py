@@ -217,8 +217,8 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
     The first descents begin as the photo was taken last and, at first, with other focal lengths; the others
-    at their end, and as matches have it. Each goes on with the points that are seen from where it ended: of
-    those that are seen from elsewhere more agree with the pose there.
+    at their end, and as matches have it. The focal length goes on with the points that are seen from where it
+    ended: of those that are seen from elsewhere more agree with the pose there.
     """
     shown = mask_occluders(query, compare(query, pose))
     corrections = Corrections(query.given.cameras[0])
@@ -243,23 +243,19 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
             key=lambda end: end.loss,
         )
 
-    def follow(freedom: Freedom, end: FreeEnd) -> FreeEnd:
-        for _ in range(NUM_VIEWS):
-            if end.pose.distance(pose) > FAR:
-                break
-            end = find_lowest(freedom, end.pose, [end.start])
-        return end
-
     others = query.workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
     first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
     motion = estimate_corrections(first).motion[:, FOCAL]
     unit = np.eye(len(LENS))[FOCAL]
     beside = [(add(first.pose, motion * change), first.values + unit * change) for change in BESIDE]
-    near = follow(of_focal, find_lowest(of_focal, pose, [first.start, *beside]))
+    near = find_lowest(of_focal, pose, [first.start, *beside])
+    for _ in range(NUM_VIEWS):
+        if near.pose.distance(pose) > FAR:
+            break
+        near = find_lowest(of_focal, near.pose, [near.start])
     by_matches = fit_matches(query, pose, ALL_WIDTHS)
     starts = [near.start, (by_matches.pose, by_matches.values)]
-    far = find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
-    return near, follow(of_all, far)
+    return near, find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
