@@ -140,6 +140,12 @@ def test_rays_behind_and_outside_are_not_in_the_picture():
     assert is_in.tolist() == [True, False, True, True, False]
 
 
+def test_rows_beyond_the_poles_and_columns_beyond_the_seam_show_nothing():
+    part = Camera("PARTIAL_EQUIRECTANGULAR", 64, 48, (8.0, 12.0, 32.0, 24.0))
+    _, is_seen = part.rays(np.array([[32.0, 24.0], [6.0, 24.0], [8.0, 24.0], [32.0, 4.0], [32.0, 6.0]]))
+    assert is_seen.tolist() == [True, False, True, False, True]
+
+
 def test_scaled_keeps_rays():
     for model in MODELS:
         this = camera(model)

@@ -311,6 +311,7 @@ class Camera:
         is_found = np.ones(x.shape, np.bool_)
         if self.lens == PARTIAL_SPHERE:
             is_found = (u >= 0.0) & (u <= self.width) & (v >= 0.0) & (v <= self.height)
+            is_found &= (np.abs(x) <= math.pi) & (np.abs(y) <= 0.5 * math.pi)
             flat = np.cos(y)
             return np.stack([flat * np.cos(x), -flat * np.sin(x), -np.sin(y)], axis=-1), is_found
         if self.distortion != Distortion():

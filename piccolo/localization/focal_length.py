@@ -52,7 +52,7 @@ FITTED = [FOCAL, LENS.index("radial")]  # corrections that the camera takes; the
 CALIBRATED = (0.002, 0.003, 0.003, 0.005)
 NOT_CALIBRATED = (0.002, 0.005, 0.005, 0.008)
 OTHERS_WRONG = (0.05, 0.05, 0.05, 0.2)  # chosen: if they are wrong
-OTHERS_SHARES = (0.02, 0.02, 0.02, 0.02)  # chosen: of those that are wrong
+OTHERS_SHARES = (0.01, 0.01, 0.01, 0.01)  # chosen: of those that are wrong
 FIRST_CHANGES = (-0.1, 0.1)  # of the focal length's logarithm, from which first fits begin too
 BESIDE = (-0.03, 0.03)  # and from which descents begin once more: the loss is rough
 NUM_VIEWS = 2  # of the points, from where a descent ended
@@ -137,10 +137,9 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
     assert prior is not None
     claim = make_claim(prior, camera)
     near, far = descend_lens(query, pose, claim, is_first)
-    estimate = add_matches(
-        widen_by_edges(query, estimate_corrections(near)), fit_matches(query, pose, FOCAL_WIDTHS)
-    )
-    free = widen_by_edges(query, estimate_corrections(far))
+    by_matches = fit_matches(query, pose, FOCAL_WIDTHS)
+    estimate = add_matches(estimate_lens(query, pose, near), by_matches)
+    free = estimate_lens(query, pose, far)
     values, information, motion = estimate
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
@@ -218,8 +217,8 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
     The first descents begin as the photo was taken last and, at first, with other focal lengths; the others
-    at their end, and as matches have it. Each goes on with the points that are seen from where it ended: of
-    those that are seen from elsewhere more agree with the pose there.
+    at their end, and as matches have it. The focal length goes on with the points that are seen from where it
+    ended: of those that are seen from elsewhere more agree with the pose there.
     """
     shown = mask_occluders(query, compare(query, pose))
     corrections = Corrections(query.given.cameras[0])
@@ -244,23 +243,19 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
             key=lambda end: end.loss,
         )
 
-    def follow(freedom: Freedom, end: FreeEnd) -> FreeEnd:
-        for _ in range(NUM_VIEWS):
-            if end.pose.distance(pose) > FAR:
-                break
-            end = find_lowest(freedom, end.pose, [end.start])
-        return end
-
     others = query.workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
     first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
     motion = estimate_corrections(first).motion[:, FOCAL]
     unit = np.eye(len(LENS))[FOCAL]
     beside = [(add(first.pose, motion * change), first.values + unit * change) for change in BESIDE]
-    near = follow(of_focal, find_lowest(of_focal, pose, [first.start, *beside]))
+    near = find_lowest(of_focal, pose, [first.start, *beside])
+    for _ in range(NUM_VIEWS):
+        if near.pose.distance(pose) > FAR:
+            break
+        near = find_lowest(of_focal, near.pose, [near.start])
     by_matches = fit_matches(query, pose, ALL_WIDTHS)
     starts = [near.start, (by_matches.pose, by_matches.values)]
-    far = find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
-    return near, follow(of_all, far)
+    return near, find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
 
 
 def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
@@ -272,8 +267,14 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def widen_by_edges(query: Query, estimate: Estimate) -> Estimate:
-    """Add errors of the picture's edge that all blocks may have in common."""
+def estimate_lens(query: Query, pose: Pose, end: FreeEnd) -> Estimate:
+    """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
+
+    Errors of the picture's edge that all blocks may have in common are added.
+    """
+    estimate = estimate_corrections(end)
+    if end.pose.distance(pose) > FAR:
+        return estimate._replace(information=np.zeros_like(estimate.information))
     camera = query.given.cameras[0].camera
     per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
     covariance = invert(estimate.information)

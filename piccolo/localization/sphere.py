@@ -51,7 +51,7 @@ COARSE = Limits(1.2, 10, 5e-3)
 MIDDLE = Limits(1.2, 12, 1e-3)
 FINE = Limits(1.0, 15, 1e-3)
 FULL = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
-HERE = Limits(0.7, 0, 1e-4)  # and where it does, which tells how exact it is
+HERE = Limits(0.7, 1, 1e-4)  # and where it does, which tells how exact it is
 MOST_ROUNDS = 3
 
 
@@ -124,7 +124,7 @@ def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, 
         return other
     conflict = CLAIM.conflict(estimate.values, estimate.information)
     doubt = CLAIM.doubt(estimate.values, estimate.information)
-    return query, found, SphereFit(camera, here._replace(values=estimate.values), True, conflict, doubt)
+    return query, found, SphereFit(camera, here, True, conflict, doubt)
 
 
 def retake_as_found(
