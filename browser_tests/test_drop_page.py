@@ -456,7 +456,9 @@ def test_what_is_kept_is_there_again_and_links_open_it(browser, cache, tmp_path,
     with _keeping(browser, cache, tmp_path) as (address, visit):
         page = visit(address, 1400, 860)
         page.set_default_timeout(SLOW_MS)
-        _choose(page, *photos)
+        _choose(page, photos[0])  # one after the other, as they are kept in the order of their answers
+        _wait(page, "localized")
+        _choose(page, photos[1])
         _wait(page, "localized", "localized")
         page.click("#row-1")
         page.wait_for_selector('#viewer[data-shown="1"]')
