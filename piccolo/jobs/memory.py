@@ -83,6 +83,17 @@ def limit_of_process() -> float:
     return float("inf") if soft == psutil.RLIM_INFINITY else float(soft)
 
 
+def allow_files(wanted: int) -> int:
+    """Let this process open `wanted` files at once, as far as `ulimit -n` can be raised; return how many."""
+    if not hasattr(psutil, "RLIMIT_NOFILE"):
+        return wanted
+    soft, hard = this_process().rlimit(psutil.RLIMIT_NOFILE)
+    most = wanted if hard == psutil.RLIM_INFINITY else min(wanted, hard)
+    if psutil.RLIM_INFINITY != soft < most:
+        this_process().rlimit(psutil.RLIMIT_NOFILE, (most, hard))
+    return most
+
+
 def free_of_process() -> float:
     """Bytes of address space that `ulimit -v` leaves; infinite without."""
     limit = limit_of_process()

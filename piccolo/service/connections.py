@@ -8,7 +8,6 @@ import asyncio
 import json
 import logging
 import socket
-import sys
 from collections import deque
 from time import monotonic
 from typing import Any
@@ -16,6 +15,8 @@ from typing import Any
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.h11_impl import H11Protocol
+
+from ..jobs.memory import allow_files
 
 STALL_S = 20.0  # [s] for the headers of a request, and for each step of its body
 STEP = 1 << 14  # [byte] of a body
@@ -124,16 +125,7 @@ def listen(host: str, port: int) -> socket.socket:
 
 def most_connections(num_jobs: int) -> int:
     """Return how many connections the limit of open files leaves room for."""
-    if sys.platform == "win32":
-        return MAX_CONNECTIONS
-    import resource  # noqa: PLC0415  # not on Windows
-
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = FILES + FILES_OF_JOB * num_jobs + FILES_OF_CONNECTION * MAX_CONNECTIONS
-    num_files = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-    soft = resource.getrlimit(resource.RLIMIT_NOFILE)[0]
-    if soft < num_files:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (num_files, hard))
+    num_files = allow_files(FILES + FILES_OF_JOB * num_jobs + FILES_OF_CONNECTION * MAX_CONNECTIONS)
     room = num_files - FILES - FILES_OF_JOB * num_jobs
     return max(room // FILES_OF_CONNECTION, MIN_CONNECTIONS)
 
