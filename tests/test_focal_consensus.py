@@ -120,7 +120,7 @@ def test_a_batch_finds_the_focal_length_of_its_camera(tmp_path):
     photos = tmp_path / "photos"
     photos.mkdir()
     poses = []
-    for k in range(8):
+    for k in range(6):
         turned = yaw_rotation(0.25 * k) @ pose.R_cam_from_world
         poses.append(Pose(turned, pose.center_world + np.array([0.02 * k, 0.03, 0.0])))
         picture = render_picture(Mount(pinhole(320, 240, TRUE)), room, poses[k], Workers(2))
