@@ -35,7 +35,8 @@ def pytest_collection_modifyitems(items):
 def contradictions():
     """What contradicts itself in results that are made or written, since it was last taken out."""
     found = []
-    make, write = Result.__post_init__, Result.to_json
+    make = Result.__post_init__
+    write = Result.to_json
     is_checking = threading.local()
 
     def make_and_check(result):

@@ -189,7 +189,8 @@ def test_files_of_one_unit_are_told_of_once_and_each_is_read_in_its_own(tmp_path
     paths = sorted(tmp_path.iterdir())
     cloud = open_cloud(paths)
     assert (cloud.scale, open_cloud(paths[:3]).scale) == (1.0, US)
-    low, high = RAW.points_world.min(axis=0), RAW.points_world.max(axis=0)
+    low = RAW.points_world.min(axis=0)
+    high = RAW.points_world.max(axis=0)
     (told,) = [line for line in cloud.voxels(np.eye(3)).warnings if "US survey" in line]
     assert told.startswith(f"{paths[0]} and 2 more: read in US survey feet, as")
     ends = np.minimum(low, low * US), np.maximum(high, high * US)

@@ -118,14 +118,15 @@ def access_from(a: Arguments) -> Access:
 
 def check_url(name: str, url: str, is_page: bool) -> str:
     """Return the address of a page, ending in /, or of a site without a path; InputError for another."""
+    wanted = "http(s)://HOST/PATH/" if is_page else "http(s)://HOST"
+    refusal = f"`{name}`: found {printable(url)!r}, wanted {wanted}"
     try:
         scheme, host, path, query, fragment = urlsplit(url)
-    except ValueError:
-        scheme = host = path = query = fragment = ""
-    wanted = "http(s)://HOST/PATH/" if is_page else "http(s)://HOST"
+    except ValueError as error:
+        raise InputError(refusal) from error
     has_more = query or fragment or "@" in host or not (is_page or path in ("", "/"))
     if scheme not in ("http", "https") or not host or has_more or not url.isprintable():
-        raise InputError(f"`{name}`: found {printable(url)!r}, wanted {wanted}")
+        raise InputError(refusal)
     return f"{scheme}://{host.lower()}{path.rstrip('/')}{'/' if is_page else ''}"
 
 

@@ -249,5 +249,6 @@ def refine(patches: Patches, motion: Array) -> Array:
         moved = np.asarray(np.linalg.solve(normal_matrix, rows.T @ (weights * gaps)))
         found = score(patches, patches.by_motion, moved[None])[0]
         if found >= best:
-            motion, best = moved, found
+            motion = moved
+            best = found
     return motion

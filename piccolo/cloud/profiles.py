@@ -71,9 +71,11 @@ def find_around(tree: Octree, place: Array, reach: float, found: Array) -> int:
 def write_adjugate(matrix: Array, adjugate: Array) -> None:
     """Write the adjugate of a symmetric matrix (3, 3)."""
     for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
+        j = (i + 1) % 3
+        k = (i + 2) % 3
         for m in range(3):
-            n, o = (m + 1) % 3, (m + 2) % 3
+            n = (m + 1) % 3
+            o = (m + 2) % 3
             adjugate[i, m] = matrix[j, n] * matrix[k, o] - matrix[j, o] * matrix[k, n]
 
 

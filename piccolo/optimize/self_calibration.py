@@ -65,7 +65,9 @@ def write_free_equations(
                 loaded = weights[lo + i] * is_valid(t00, t10, t01, t11)
                 if loaded <= F0:
                     continue
-                x, y, z = p.x[i], p.y[i], p.z[i]
+                x = p.x[i]
+                y = p.y[i]
+                z = p.z[i]
                 e0, u0, v0 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 0)
                 e1, u1, v1 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 8)
                 e2, u2, v2 = blend_with_gradient(t00, t10, t01, t11, p.fu[i], p.fv[i], 16)
@@ -82,12 +84,22 @@ def write_free_equations(
                 bu = w * (u0 * e0 + u1 * e1 + u2 * e2)
                 bv = w * (v0 * e0 + v1 * e1 + v2 * e2)
                 ux, uy, vx, vy, vz = pixel_jacobian(x, y, z, x * x + y * y, np.float32(width))
-                of_u[0], of_u[1], of_u[2] = -z * uy, z * ux, x * uy - y * ux
-                of_u[3], of_u[4], of_u[5] = -ux, -uy, F0
-                of_v[0], of_v[1], of_v[2] = y * vz - z * vy, z * vx - x * vz, x * vy - y * vx
-                of_v[3], of_v[4], of_v[5] = -vx, -vy, -vz
+                of_u[0] = -z * uy
+                of_u[1] = z * ux
+                of_u[2] = x * uy - y * ux
+                of_u[3] = -ux
+                of_u[4] = -uy
+                of_u[5] = F0
+                of_v[0] = y * vz - z * vy
+                of_v[1] = z * vx - x * vz
+                of_v[2] = x * vy - y * vx
+                of_v[3] = -vx
+                of_v[4] = -vy
+                of_v[5] = -vz
                 for j in range(len(moves)):
-                    mx, my, mz = moves[j, 0, lo + i], moves[j, 1, lo + i], moves[j, 2, lo + i]
+                    mx = moves[j, 0, lo + i]
+                    my = moves[j, 1, lo + i]
+                    mz = moves[j, 2, lo + i]
                     of_u[NUM_OF_POSE + j] = ux * mx + uy * my
                     of_v[NUM_OF_POSE + j] = vx * mx + vy * my + vz * mz
                 for a in range(n):
