@@ -24,7 +24,7 @@ from .localization.beside import SurePhoto, localize_beside, place_sure
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
-from .localization.query import prepare_query
+from .localization.problem import prepare_problem
 from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
@@ -97,8 +97,9 @@ class OpenedScan:
             digest = read_photo_facts(photo).sha256
         if digest != result.source.pano_sha256 or result.best_pose is None:
             return None
-        query = prepare_query(picture, prepared, settings, self.workers)
-        return place_sure(query, result.best_pose, result.covariance, result.confidence)
+        problem = prepare_problem(picture, prepared, settings.prior, settings.gravity)
+        pose = result.best_pose
+        return place_sure(problem, pose, result.covariance, result.confidence, self.workers)
 
     def localize_again(
         self,

@@ -14,7 +14,7 @@ from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose, check_pose
 from .jobs.threads import Progress, Stopwatch, Workers, no_progress
-from .localization.query import Query
+from .localization.problem import Problem
 from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
@@ -35,7 +35,7 @@ class Prepared(NamedTuple):
     photo: Photo
     blank: Result  # without a pose
     panorama: Panorama | None  # None of one that can't be read
-    query: Query | None
+    problem: Problem | None
 
 
 class Walk:
@@ -110,14 +110,14 @@ class Walk:
                 failed = make_failed_result(self.scan, photo, error, settings, name)
                 return Prepared(photo, failed, None, None)
         with watch.stage("prepare"):
-            query = self.tracker.prepare(panorama)
+            problem = self.tracker.prepare(panorama)
         blank = self.scan.make_blank(photo, panorama, facts, settings, watch.seconds)
-        return Prepared(photo, replace(blank, pano=name), panorama, query)
+        return Prepared(photo, replace(blank, pano=name), panorama, problem)
 
     def follow(self, prepared: Prepared, time: float | None = None, odometry: Pose | None = None) -> Result:
         """Localize a prepared frame, as `add` does."""
         number = len(self.blanks)
-        photo, blank, panorama, query = prepared
+        photo, blank, panorama, problem = prepared
         odometry = None if odometry is None else check_pose(odometry, "`odometry`")
         if number and self.has_times != (time is not None):
             raise InputError(f"`time`: found {time} at frame {number}, wanted it of all frames or of none")
@@ -127,11 +127,11 @@ class Walk:
             check_times([self.tracker.frames[-1].time, when])
         elif time is None:
             self.tracker.forget_times()
-        if panorama is None or query is None:
+        if panorama is None or problem is None:
             self.tracker.accept(Frame(when, odometry=odometry))
         else:
             with Stopwatch(blank.seconds).stage("track"):
-                self.tracker.add(panorama, query, when, odometry)
+                self.tracker.add(panorama, problem, when, odometry)
         self.photos.append(photo)
         self.blanks.append(replace(blank, settings=self.settings_of(photo)))
         belief = believe(self.tracker.frames, self.tracker.lattice.filter_path(), number)

@@ -1,8 +1,8 @@
 """Hypotheses, and the choice of those that are different answers."""
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -17,15 +17,31 @@ class Hypothesis:
     """A pose that may be right."""
 
     pose: Pose
-    score: float  # more is better; in the end the part of the panorama that it explains, as in `Evidence`
+    score: float  # more is better
+    is_climbed: bool = False  # no perturbation improves it
 
 
-def sort_by_score(poses: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Sort hypotheses by falling score; those of equal score keep their order."""
+class Scored(Protocol):
+    """A pose with a score, of which more is better."""
+
+    @property
+    def pose(self) -> Pose:
+        """The pose."""
+
+    @property
+    def score(self) -> float:
+        """The score."""
+
+
+One = TypeVar("One", bound=Scored)
+
+
+def sort_by_score(poses: Sequence[One]) -> list[One]:
+    """Sort poses by falling score; those of equal score keep their order."""
     return sorted(poses, key=lambda p: -p.score)
 
 
-def suppress_near(ranked: Sequence[Hypothesis], count: int, near: Nearness) -> list[Hypothesis]:
+def suppress_near(ranked: Sequence[One], count: int, near: Nearness) -> list[One]:
     """Return the first `count` poses that are not near an earlier one."""
     if not ranked:
         return []
@@ -34,14 +50,11 @@ def suppress_near(ranked: Sequence[Hypothesis], count: int, near: Nearness) -> l
     return [ranked[k] for k in non_maximum_suppression(rotations, centers, count, near)]
 
 
-def best_distinct(poses: Sequence[Hypothesis], count: int, near: Nearness) -> list[Hypothesis]:
+def best_distinct(poses: Sequence[One], count: int, near: Nearness) -> list[One]:
     """Return at most `count` poses, best first, none near a better one."""
     return suppress_near(sort_by_score(poses), count, near)
 
 
-def alternative_poses(
-    best: Pose, hypotheses: Sequence[Hypothesis], count: int = MAX_ALTERNATIVES
-) -> list[Hypothesis]:
-    """Return the `count` best-scoring hypotheses that are distinct from `best` and from each other."""
-    ranked = [Hypothesis(best, math.inf), *sort_by_score(hypotheses)]
-    return suppress_near(ranked, count + 1, ONE_ANSWER)[1:]
+def alternative_poses(best: One, poses: Sequence[One], count: int = MAX_ALTERNATIVES) -> list[One]:
+    """Return the `count` best-scoring poses that are distinct from `best` and from each other."""
+    return suppress_near([best, *sort_by_score(poses)], count + 1, ONE_ANSWER)[1:]

@@ -5,26 +5,30 @@ features show that a photo is mirrored, so the first look briefly searches its m
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose
-from ..jobs.threads import Once, Stopwatch
+from ..jobs.threads import Once, Stopwatch, Workers
 from ..local_features.hypotheses import count_matches, propose_poses
+from ..local_features.keypoints import Keypoints, join_keypoints
+from ..local_features.matching import Matches, join_matches
 from ..photo import NOTHING_KNOWN
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
-from .beam import brief_query, refine_matches, refine_starts, score_mirror, score_starts
-from .comparison import score_pose
-from .query import Query
+from .beam import refine_matches, refine_starts, score_mirror, score_starts
+from .candidate import Candidate
+from .examine import check_prior, choose, choose_among, examine
+from .problem import Problem
+from .profile import Beam
 from .search import Tilts, search_poses
-from .selection import is_clear, is_sure, rank
-from .settings import Beam
-from .verification import CHANCE_MATCHES, verify
+from .selection import CHANCE_MATCHES, FAINT_SCORE, is_clear, is_sure, rank
+from .settings import Effort
+from .verification import Verified, draw_near, verify
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_BEAM = Beam(100, 12, 4, 1)
@@ -34,13 +38,26 @@ ENOUGH_MATCHES = 40  # of a part of the features: if the pose is sure, the other
 NUM_MATCHED = 6  # poses from matches that are refined
 COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
 
-Poses = tuple[list[Hypothesis], bool]  # hypotheses, and whether they make further attempts needless
-# one search with its refinement, which adds to the known hypotheses
-Attempt = Callable[[Query, list[Hypothesis], Stopwatch], Poses]
+
+class Means(NamedTuple):
+    """With what a photo is searched."""
+
+    effort: Effort
+    workers: Workers
+    watch: Stopwatch
 
 
-def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
-    """Return the searches for a photo in order, each with the query of the evidence that it uses.
+class Attempt(Protocol):
+    """One search with its refinement."""
+
+    def __call__(
+        self, problem: Problem, known: list[Candidate], means: Means
+    ) -> tuple[list[Candidate], bool]:
+        """Return the known candidates with further ones; True if these make later attempts needless."""
+
+
+def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
+    """Return the searches for a photo in order, each with the problem of the evidence that it uses.
 
     A first look by whole views, or the scan drawn at its poses, may settle a whole upright sphere, and a look
     along walls a photo of edges. Then come searches by whole views: with gravity `auto` as known, then as
@@ -49,140 +66,178 @@ def plan_attempts(query: Query) -> list[tuple[Query, Attempt]]:
     any tilt, ask them first. Partial photos are mostly taken about level: with a tilt that is not known
     exactly, "known" searches about level.
     """
-    looks_first = bool(query.features) and is_whole(query)
-    first: list[tuple[Query, Attempt]] = []
+    looks_first = bool(problem.features) and is_whole(problem)
+    first: list[tuple[Problem, Attempt]] = []
     if looks_first:
-        first = [(query.by_views(), look_first), (query.without_features(), draw_found)]
-    if query.rotations is not None:
-        first.append((query, look_along_walls))
-    parts = [query.features[: k + 1] for k in range(len(query.features))]
-    by_features: list[tuple[Query, Attempt]] = [
-        (replace(query, features=part), search_matches if part is parts[-1] else search_part)
+        first = [(problem.by_views(), look_first), (problem.without_features(), draw_found)]
+    if problem.rotations is not None:
+        first.append((problem, look_along_walls))
+    parts = [problem.features[: k + 1] for k in range(len(problem.features))]
+    by_features: list[tuple[Problem, Attempt]] = [
+        (replace(problem, features=part), search_matches if part is parts[-1] else search_part)
         for part in parts
     ]
-    by_views: list[tuple[Query, Attempt]] = []
-    asked = query.without_features() if looks_first else query
-    is_partial = query.photo.is_partial
-    if is_partial or query.settings.gravity != "unknown":
-        upright: Tilts = "level" if is_partial and not query.photo.has_tilt else "known"
+    by_views: list[tuple[Problem, Attempt]] = []
+    asked = problem.without_features() if looks_first else problem
+    is_partial = problem.profile.is_partial
+    if is_partial or problem.gravity != "unknown":
+        upright: Tilts = "level" if is_partial and not problem.photo.has_tilt else "known"
         by_views.append((asked, partial(search_views, tilts=upright)))
-    if query.settings.gravity != "known":
+    if problem.gravity != "known":
         by_views.append((asked, partial(search_views, tilts="any", is_brief=looks_first)))
     return [*first, *by_views, *by_features] if looks_first else [*first, *by_features, *by_views]
 
 
-def look_first(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
-    first = brief_query(query)
-    of_mirror = Once(score_mirror, query)
-    with query.workers.beside(of_mirror):
+    effort, workers, watch = means
+    of_mirror = Once(score_mirror, problem, effort, workers)
+    with workers.beside(of_mirror):
         with watch.stage("search"):
-            starts = search_poses(first, "known")
+            starts = search_poses(problem, "known", effort.brief(), workers)
         with watch.stage("refine"):
-            found = known + refine_starts(first, starts, FIRST_BEAM)
-            return found, is_clear(query, found) and score_starts(first, starts) >= MIRROR_RATIO * of_mirror()
+            found = known + refine_starts(problem, starts, FIRST_BEAM, workers)
+            if not is_clear(problem.profile, choose_among(problem, found, workers)):
+                return found, False
+            return found, score_starts(problem, starts, workers) >= MIRROR_RATIO * of_mirror()
 
 
-def draw_found(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+def draw_found(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Draw the scan at the poses that were found; True if the best is sure."""
-    with watch.stage("refine"):
-        return known, is_sure(query, known)
+    with means.watch.stage("refine"):
+        return end_search(problem, known, means.workers)
 
 
-def look_along_walls(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+def look_along_walls(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search the few rotations of a photo whose lines lie along walls; True if one pose alone is clear."""
-    refined = search_and_refine(query, "known", FIRST_BEAM, watch)
-    with watch.stage("refine"):
+    refined = search_and_refine(problem, "known", FIRST_BEAM, means)
+    with means.watch.stage("refine"):
         found = known + refined
-        return found, is_clear(query, found)
+        return found, is_clear(problem.profile, choose_among(problem, found, means.workers))
 
 
-def search_part(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+def search_part(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search by a part of the features; its poses are dropped unless they are sure: all find better ones."""
-    poses = match_poses(query, watch)
-    if not poses or count_matches(query.matches, poses[0]) < ENOUGH_MATCHES:
+    poses, matches = match_poses(problem, means)
+    if not poses or count_matches(matches, poses[0]) < ENOUGH_MATCHES:
         return known, False
-    found, is_enough = refine_matched(query, poses, known, watch)
-    return found if is_enough else known, is_enough
+    found, is_enough = refine_matched(problem, poses, known, means)
+    return (found, True) if is_enough else (known, False)
 
 
-def search_matches(query: Query, known: list[Hypothesis], watch: Stopwatch) -> Poses:
+def search_matches(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Refine the poses that feature matches vote for; True if the result is sure."""
-    return refine_matched(query, match_poses(query, watch), known, watch)
+    poses, _ = match_poses(problem, means)
+    return refine_matched(problem, poses, known, means)
 
 
-def refine_matched(query: Query, poses: list[Pose], known: list[Hypothesis], watch: Stopwatch) -> Poses:
+def refine_matched(
+    problem: Problem, poses: Sequence[Pose], known: list[Candidate], means: Means
+) -> tuple[list[Candidate], bool]:
     """Add poses from matches, refined; True if the best is sure."""
-    with watch.stage("match"):
-        found = known + add_verified(query, refine_matches(query, poses))
-        return found, is_sure(query, found)
+    workers = means.workers
+    with means.watch.stage("match"):
+        found = known + add_verified(problem, refine_matches(problem, poses, workers), workers)
+        return end_search(problem, found, workers)
 
 
 def search_views(
-    query: Query, known: list[Hypothesis], watch: Stopwatch, tilts: Tilts, is_brief: bool = False
-) -> Poses:
+    problem: Problem, known: list[Candidate], means: Means, tilts: Tilts, is_brief: bool = False
+) -> tuple[list[Candidate], bool]:
     """Search by whole views and refine; True if the result is sure."""
-    asked = thin_query(query) if is_brief else query
-    refined = search_and_refine(asked, tilts, FIRST_BEAM if is_brief else query.beam, watch)
-    with watch.stage("refine"):
-        found = known + add_verified(query, refined)
-        return found, is_sure(query, found)
+    if is_brief:
+        thin = means._replace(effort=thin_effort(means.effort))
+        refined = search_and_refine(thin_out(problem), tilts, FIRST_BEAM, thin)
+    else:
+        refined = search_and_refine(problem, tilts, problem.profile.beam, means)
+    with means.watch.stage("refine"):
+        found = known + add_verified(problem, refined, means.workers)
+        return end_search(problem, found, means.workers)
 
 
-def search_and_refine(query: Query, tilts: Tilts, beam: Beam, watch: Stopwatch) -> list[Hypothesis]:
+def end_search(problem: Problem, found: list[Candidate], workers: Workers) -> tuple[list[Candidate], bool]:
+    """Return the candidates with what was drawn at them; True if the best is sure."""
+    ranked = rank(found)
+    if ranked.best.score < FAINT_SCORE:
+        return found, False
+    chosen = choose(problem, ranked, workers)
+    drawn = {id(candidate.pose): candidate for candidate in chosen.ranked}
+    return [drawn.get(id(one.pose), one) for one in found], is_sure(problem.profile, chosen)
+
+
+def search_and_refine(problem: Problem, tilts: Tilts, beam: Beam, means: Means) -> list[Candidate]:
     """Search by whole views, and refine the starts to a few poses."""
-    with watch.stage("search"):
-        starts = search_poses(query, tilts)
-    with watch.stage("refine"):
-        return refine_starts(query, starts, beam)
+    with means.watch.stage("search"):
+        starts = search_poses(problem, tilts, means.effort, means.workers)
+    with means.watch.stage("refine"):
+        return refine_starts(problem, starts, beam, means.workers)
 
 
-def add_verified(query: Query, hypotheses: list[Hypothesis]) -> list[Hypothesis]:
-    """Verify the hypotheses of a photo of a part of the sphere; add poses refined on many matches."""
-    if not query.photo.is_partial or not hypotheses:
-        return hypotheses
-    found = rank(hypotheses)
-    poses = [h.pose for h in (found.best, *found.alternatives)]
-    verified = query.workers.map(partial(verify, query), poses, "verify")
-    refined = [v.pose for v in verified if v.num_matches > CHANCE_MATCHES]
-    return [*hypotheses, *query.workers.map(partial(score_pose, query), refined, "compare")]
+def add_verified(problem: Problem, candidates: list[Candidate], workers: Workers) -> list[Candidate]:
+    """Verify the candidates of a photo of a part of the sphere; add poses refined on many matches."""
+    if not problem.profile.is_partial or not candidates:
+        return candidates
+
+    def verify_one(candidate: Candidate) -> tuple[Candidate, Verified]:
+        drawn = draw_near(problem, candidate.pose, candidate.drawn, workers)
+        return replace(candidate, drawn=drawn), verify(problem, candidate.pose, drawn.matches)
+
+    verified = workers.map(verify_one, rank(candidates).ranked, "verify")
+    drawn = {id(candidate.pose): candidate for candidate, _ in verified}
+    matched = [(near, found.pose) for near, found in verified if found.num_matches > CHANCE_MATCHES]
+    refined = workers.map(lambda pair: examine(problem, pair[1], pair[0]), matched, "compare")
+    return [*(drawn.get(id(one.pose), one) for one in candidates), *refined]
 
 
-def search_beyond_prior(query: Query, scan_map: ScanMap, watch: Stopwatch) -> list[Hypothesis]:
+def search_beyond_prior(problem: Problem, scan_map: ScanMap, means: Means) -> list[Candidate]:
     """Search a whole photo without the prior: poses that agree with it must beat those that it excludes."""
-    is_asked = not query.settings.prior.is_empty and is_whole(query)
+    is_asked = not problem.prior.is_empty and is_whole(problem)
     if not is_asked:
         return []
-    settings = replace(query.settings, prior=NOTHING_KNOWN)
-    anywhere = brief_query(replace(query, scan_map=scan_map, settings=settings))
-    return search_and_refine(anywhere, "known", FIRST_BEAM, watch)
+    anywhere = replace(problem, scan_map=scan_map, prior=NOTHING_KNOWN)
+    brief = means._replace(effort=means.effort.brief())
+    found = search_and_refine(anywhere, "known", FIRST_BEAM, brief)
+    return [check_prior(problem, candidate) for candidate in found]
 
 
-def match_poses(query: Query, watch: Stopwatch) -> list[Pose]:
-    """Return poses from feature matches, best first."""
-    if query.scan_map.awaits_features:
-        with watch.stage("prepare"):
-            query.scan_map.features_now(query.workers)
-    is_level = query.settings.gravity == "known" and (query.photo.has_tilt or not query.photo.is_partial)
-    up_cam = query.photo.R_cam_from_level[:, 2]
-    with watch.stage("match"):
-        poses = [f.pose for f in propose_poses(query.matches, NUM_MATCHED, query.workers)]
-    return [pose for pose in poses if not is_level or pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
+def match_poses(problem: Problem, means: Means) -> tuple[list[Pose], Matches]:
+    """Return poses from feature matches, best first, and the matches."""
+    workers = means.workers
+    if problem.scan_map.awaits_features:
+        with means.watch.stage("prepare"):
+            problem.scan_map.features_now(workers)
+    is_level = problem.gravity == "known" and (problem.photo.has_tilt or not problem.profile.is_partial)
+    up_cam = problem.photo.R_cam_from_level[:, 2]
+    with means.watch.stage("match"):
+        matches = join_features(problem, workers)[1]
+        poses = [f.pose for f in propose_poses(matches, NUM_MATCHED, workers)]
+    kept = [pose for pose in poses if not is_level or pose.R_cam_from_world[:, 2] @ up_cam >= COS_TILT]
+    return kept, matches
 
 
-def is_whole(query: Query) -> bool:
+def join_features(problem: Problem, workers: Workers) -> tuple[Keypoints, Matches]:
+    """Return the keypoints of all views of a photo, and their matches with features of the map."""
+    parts = [part(workers) for part in problem.features]
+    keypoints = join_keypoints([part.keypoints for part in parts])
+    return keypoints, join_matches([p.matches for p in parts], [len(p.keypoints.rays) for p in parts])
+
+
+def is_whole(problem: Problem) -> bool:
     """Return True if the photo shows nearly the whole sphere, upright or at a known tilt."""
-    return query.settings.gravity != "unknown" and not query.photo.is_partial
+    return problem.gravity != "unknown" and not problem.profile.is_partial
 
 
-def thin_query(query: Query) -> Query:
-    """Return a brief query with any tilt, for a whole photo that was searched as upright.
+def thin_out(problem: Problem) -> Problem:
+    """Return the problem with every other cell of the grid, for a whole photo that was searched as upright.
 
-    It searches every other cell of the grid, with few rotations. That finds tilted photos without occluders;
-    features find the others.
+    With few rotations (`thin_effort`) that finds tilted photos without occluders; features find the others.
     """
-    brief = brief_query(query)
-    cells = np.floor(query.scan_map.centers[query.scan_map.sparse] / COARSE_SPACING).astype(np.int64)
+    m = problem.scan_map
+    cells = np.floor(m.centers[m.sparse] / COARSE_SPACING).astype(np.int64)
     is_even = (cells.sum(axis=1) % 2 == 0) | (len(cells) < FEW_CELLS)
-    settings = replace(brief.settings, num_rotations=min(FIRST_ROTATIONS, query.settings.num_rotations))
-    return replace(brief, scan_map=query.scan_map.narrow(is_even), settings=settings)
+    return replace(problem, scan_map=m.narrow(is_even))
+
+
+def thin_effort(effort: Effort) -> Effort:
+    """Return the effort of a brief search with any tilt."""
+    return effort.brief()._replace(num_rotations=min(FIRST_ROTATIONS, effort.num_rotations))

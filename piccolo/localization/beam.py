@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,23 +11,26 @@ from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, 
 from ..geometry.cone import Cone
 from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
+from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..views.candidate_views import SEARCH_VIEW, Views
 from ..views.view import ViewArrays
-from .comparison import compare, score_pose
+from .candidate import Candidate
 from .cone import find_cone, select_cells
-from .ladder import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage, climb, refine
-from .query import Query
+from .examine import examine
+from .ladder import climb, refine
+from .problem import Problem
+from .profile import Beam
 from .search import Starts, search_poses
-from .settings import Beam
+from .settings import Effort
+from .stages import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage
 
 BATCH = 16  # starts that a thread takes at a time
 NUM_FOUND = 12  # poses of a search, at most
 FAINT_PART = 0.25  # of the best score: poses with less are dropped
-FIRST_STARTS = 300  # of a brief search: few are enough for a clear photo
 NUM_SCORED = 64  # starts, if only the best score is needed
 
 
@@ -44,36 +46,36 @@ class Ends(NamedTuple):
         return float(self.scores.max(initial=0.0))
 
 
-def refine_starts(query: Query, starts: Starts, beam: Beam) -> list[Hypothesis]:
+def refine_starts(problem: Problem, starts: Starts, beam: Beam, workers: Workers) -> list[Candidate]:
     """Refine the starts by successive halving to a few distinct poses, best first."""
-    workers = query.workers
-    coarse = keep_ends(descend_prepared(query, starts, first_stage(query)), beam.num_coarse)
-    coarse = keep_ends(descend_prepared(query, coarse, SECOND), beam.num_middle)
-    middle = workers.map(partial(refine, query, first=MIDDLE), coarse.poses(), "descend")
-    narrowed = narrow(middle, beam.num_fine)
-    perturbed = workers.map(partial(refine, query, first=AROUND_MIDDLE), narrowed, "descend")
-    fine = workers.map(partial(refine, query, first=FINE), narrow(perturbed, beam.num_fine), "descend")
+    coarse = keep_ends(descend_prepared(problem, starts, problem.profile.first, workers), beam.num_coarse)
+    coarse = keep_ends(descend_prepared(problem, coarse, SECOND, workers), beam.num_middle)
+    middle = refine_each(problem, coarse.poses(), MIDDLE, workers)
+    perturbed = refine_each(problem, narrow(middle, beam.num_fine), AROUND_MIDDLE, workers)
+    fine = refine_each(problem, narrow(perturbed, beam.num_fine), FINE, workers)
     best = best_distinct(fine, beam.num_perturbed, DESCENDED)
-    others = keep_comparable(keep_distinct(fine, middle))[len(best) :]  # these most likely stay
-    with workers.beside(*(partial(compare, query, f.pose) for f in others)):
-        ends = workers.map(partial(climb, query), best, "descend")
-    poses = [f.pose for f in keep_comparable(keep_distinct([*ends, *fine], middle))]
-    return sort_by_score(workers.map(partial(score_pose, query), poses, "descend"))
+    ends = workers.map(lambda h: climb(problem, h.pose, workers), best, "descend")
+    kept = keep_comparable(keep_distinct([*ends, *fine], middle))
+
+    def examine_end(end: Hypothesis) -> Candidate:
+        return replace(examine(problem, end.pose), is_climbed=end.is_climbed)
+
+    return sort_by_score(workers.map(examine_end, kept, "descend"))
 
 
-def refine_matches(query: Query, poses: Sequence[Pose]) -> list[Hypothesis]:
+def refine_each(problem: Problem, poses: Sequence[Pose], stage: Stage, workers: Workers) -> list[Hypothesis]:
+    """Refine several poses on one stage."""
+    return workers.map(lambda pose: refine(problem, pose, workers, stage), poses, "descend")
+
+
+def refine_matches(problem: Problem, poses: Sequence[Pose], workers: Workers) -> list[Candidate]:
     """Descend on fine cells from poses of matches; keep the better of each start and end, best first."""
 
-    def refine_match(pose: Pose) -> Hypothesis:
-        end = refine(query, pose, FINE).pose
-        return max(score_pose(query, pose), score_pose(query, end), key=lambda h: h.score)
+    def refine_match(pose: Pose) -> Candidate:
+        end = refine(problem, pose, workers, FINE).pose
+        return max(examine(problem, pose), examine(problem, end), key=lambda h: h.score)
 
-    return sort_by_score(query.workers.map(refine_match, poses, "descend"))
-
-
-def first_stage(query: Query) -> Stage:
-    """Return the stage of the first descents; a partial photo needs more iterations."""
-    return SECOND if query.photo.is_partial else FIRST
+    return sort_by_score(workers.map(refine_match, poses, "descend"))
 
 
 def keep_ends(ends: Ends, count: int) -> Starts:
@@ -112,39 +114,34 @@ def keep_comparable(ranked: Sequence[Hypothesis]) -> list[Hypothesis]:
     return [f for f in ranked if f.score >= least]
 
 
-def brief_query(query: Query, most: int = FIRST_STARTS) -> Query:
-    """Return the query with fewer starts, at most so many."""
-    settings = replace(query.settings, max_starts=min(most, FIRST_STARTS, query.settings.max_starts))
-    return replace(query, settings=settings)
-
-
-def descend_briefly(query: Query) -> Ends:
+def descend_briefly(problem: Problem, effort: Effort, workers: Workers) -> Ends:
     """Search at the photo's tilt, and descend a few steps."""
-    return descend_prepared(query, search_poses(query, "known"), first_stage(query))
+    starts = search_poses(problem, "known", effort, workers)
+    return descend_prepared(problem, starts, problem.profile.first, workers)
 
 
-def score_briefly(query: Query) -> float:
+def score_briefly(problem: Problem, effort: Effort, workers: Workers) -> float:
     """Return the best score of a brief search."""
-    return descend_briefly(query).best_score
+    return descend_briefly(problem, effort, workers).best_score
 
 
-def score_mirror(query: Query) -> float:
+def score_mirror(problem: Problem, effort: Effort, workers: Workers) -> float:
     """Return the best score of a brief search with the photo mirrored."""
-    return score_briefly(brief_query(query.mirror(), NUM_SCORED))
+    return score_briefly(problem.mirror(), effort.brief(NUM_SCORED), workers)
 
 
-def score_near(query: Query, pose: Pose) -> float:
+def score_near(problem: Problem, pose: Pose, workers: Workers) -> float:
     """Return the score a few steps from a pose, on the prepared view of the candidate nearest to it."""
-    distances = np.linalg.norm(query.scan_map.centers - pose.center_world, axis=1)
+    distances = np.linalg.norm(problem.scan_map.centers - pose.center_world, axis=1)
     nearest = np.array([distances.argmin()])
     start = Starts(pose.R_cam_from_world[None], pose.center_world[None], nearest)
-    return descend_prepared(query, start, first_stage(query)).best_score
+    return descend_prepared(problem, start, problem.profile.first, workers).best_score
 
 
-def score_starts(query: Query, starts: Starts) -> float:
+def score_starts(problem: Problem, starts: Starts, workers: Workers) -> float:
     """Return the best score after short descents from the best starts."""
     best = starts.take(np.arange(min(NUM_SCORED, len(starts.candidate))))
-    return descend_prepared(query, best, FIRST).best_score
+    return descend_prepared(problem, best, FIRST, workers).best_score
 
 
 @kernel
@@ -199,14 +196,14 @@ def descend_starts(
             t[k, i] += centers[c, i]
 
 
-def descend_prepared(query: Query, starts: Starts, stage: Stage) -> Ends:
+def descend_prepared(problem: Problem, starts: Starts, stage: Stage, workers: Workers) -> Ends:
     """Descend from each start on its candidate's prepared view."""
     R = starts.R_cam_from_map.copy()
     t = starts.center_map.copy()
     scores = np.empty(len(t))
-    row, views = query.scan_map.views.at(starts.candidate, query.workers)
+    row, views = problem.scan_map.views.at(starts.candidate, workers)
     view = SEARCH_VIEW.arrays
-    image = query.photo.image(stage.image)
+    image = problem.photo.image(stage.image)
     limits = stage.limits
     scale = limits.loss_scale * LEVELS_PER_UNIT
     cone = find_cone(image)
@@ -227,6 +224,6 @@ def descend_prepared(query: Query, starts: Starts, stage: Stage) -> Ends:
             scores[part],
         )
 
-    query.workers.map(run, range(0, len(t), BATCH), "descend")
+    workers.map(run, range(0, len(t), BATCH), "descend")
     order = np.argsort(-scores, kind="stable")
     return Ends(Starts(R, t, starts.candidate).take(order), scores[order])

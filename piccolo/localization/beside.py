@@ -20,16 +20,18 @@ from ..local_features.matching import Matches
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
-from .comparison import score_pose
 from .covariance import split_errors
+from .examine import examine
 from .focal_length import FocalFit
-from .judge import judge, reconsider, take_pose
+from .judge import reconsider, take_pose
+from .judging import Found, judge
 from .last_descent import refine_best
-from .localize import Found, fit_camera
+from .localize import fit_camera
 from .prior import apply_prior, contradictions
-from .query import Query, prepare_query
+from .problem import Problem, prepare_problem
+from .selection import SURE_MATCHES
 from .settings import CoarseToFineSettings
-from .verification import SURE_MATCHES, Located, match_beside, match_covariance, place_keypoints
+from .verification import Located, match_beside, match_covariance, place_keypoints
 
 MOST_BESIDE = 3  # photos whose matches count, those with the most
 
@@ -53,15 +55,19 @@ class Neighbor(NamedTuple):
 
 @one_blas_thread()
 def place_sure(
-    query: Query, pose_world: Pose, covariance: PoseCovariance | None, confidence: float
+    problem: Problem,
+    pose_world: Pose,
+    covariance: PoseCovariance | None,
+    confidence: float,
+    workers: Workers,
 ) -> SurePhoto:
     """Return the keypoints of a photo that is localized, and its pose with its errors."""
-    pose = query.scan_map.from_world(pose_world)
+    pose = problem.scan_map.from_world(pose_world)
     gaussian = None
     if covariance is not None:
-        in_map = turn_positions(covariance.matrix, query.scan_map.R_map_from_world)
-        gaussian = split_errors(query, pose, in_map)
-    return SurePhoto(place_keypoints(query, pose), confidence, gaussian)
+        in_map = turn_positions(covariance.matrix, problem.scan_map.R_map_from_world)
+        gaussian = split_errors(problem, pose, in_map)
+    return SurePhoto(place_keypoints(problem, pose, workers), confidence, gaussian)
 
 
 @one_blas_thread()
@@ -81,23 +87,22 @@ def localize_beside(
     """
     allowed_map = apply_prior(scan_map, settings.prior)
     with watch.stage("match"):
-        query = prepare_query(panorama, allowed_map, settings, workers)
-        is_asked = query.is_narrow and len(allowed_map.sparse) > 0
+        problem = prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
+        is_asked = problem.profile.is_narrow and len(allowed_map.sparse) > 0
         asked = list(pictures.items()) if is_asked else []
-        matched = filter(None, workers.map(partial(match_picture, query), asked, "match"))
+        matched = filter(None, workers.map(partial(match_picture, problem, workers), asked, "match"))
         found = [other for other, _ in sorted(matched, key=lambda pair: -pair[1])[:MOST_BESIDE]]
     if not found:
         return Localization(), ()
     with watch.stage("refine"):
-        query = replace(query, beside=tuple(other.matches for other in found))
+        problem = replace(problem, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
-        hypotheses = add_verified(query, [score_pose(query, pose) for pose in poses])
-        ended = fit_camera(query, refine_best(query, hypotheses))
-        fit = ended.fit
-        if isinstance(fit, FocalFit):  # the photo beside confirms the pose
-            fit = fit._replace(of_picture=None)
-        judged = judge(ended.query, ended.selection, fit)
-        kept = list_agreeing(judged, found, ended.query.beside, scan_map)
+        candidates = add_verified(problem, [examine(problem, pose) for pose in poses], workers)
+        ended = fit_camera(problem, refine_best(problem, candidates, workers), workers)
+        if isinstance(ended.fit, FocalFit):  # the photo beside confirms the pose
+            ended = ended._replace(fit=ended.fit._replace(of_picture=None))
+        judged = judge(ended, settings, workers)
+        kept = list_agreeing(judged, found, ended.problem.beside, scan_map)
         if not kept:
             return Localization(), ()
         factor = max(other.picture.confidence for other in kept)
@@ -138,23 +143,25 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
     expected = of_photo.attach(other_from_cam, match_covariance(other.matches, other.pose))
     if ended.fit is not None:
         expected = expected.widen(ended.fit.pose_covariance)
-    return fuse_allowed(ended.query, expected, own)
+    return fuse_allowed(ended.problem, expected, own)
 
 
-def match_picture(query: Query, named: tuple[str, SurePhoto]) -> tuple[Neighbor, int] | None:
+def match_picture(
+    problem: Problem, workers: Workers, named: tuple[str, SurePhoto]
+) -> tuple[Neighbor, int] | None:
     """Match a photo with another, given with its name; None if fewer agree than a sure pose has.
 
     Returns also the number of those that agree.
     """
     name, picture = named
-    matches = match_beside(query, picture.located)
-    found = propose_poses(matches, 1, query.workers) if len(matches.query) >= SURE_MATCHES else []
+    matches = match_beside(problem, picture.located, workers)
+    found = propose_poses(matches, 1, workers) if len(matches.query) >= SURE_MATCHES else []
     if not found or found[0].num_matches < SURE_MATCHES:
         return None
     return Neighbor(name, picture, matches, found[0].pose), found[0].num_matches
 
 
-def fuse_allowed(query: Query, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
+def fuse_allowed(problem: Problem, one: PoseGaussian, other: PoseGaussian) -> PoseGaussian | None:
     """Return the mean of two estimates of a pose in the map; None if it contradicts the prior."""
     fused = one.fuse(other)
-    return None if contradictions(query.scan_map, fused.pose, query.settings.prior) else fused
+    return None if contradictions(problem.scan_map, fused.pose, problem.prior) else fused

@@ -42,12 +42,11 @@ from .bundle_search import (
     propose_bundles,
     weigh_bundles,
 )
-from .comparison import score_pose
+from .candidate import Selection
+from .examine import complete, examine
 from .focal_length import FocalFit, calibrate
-from .judge import Fit, judge, judge_together
-from .localize import find, find_by_edges, prepare_search
-from .query import Query
-from .selection import Selection
+from .judging import Found, judge, judge_together
+from .localize import explain_nothing, find_alone
 from .settings import CoarseToFineSettings
 
 EVEN = 0.5
@@ -71,6 +70,14 @@ class Agreed(NamedTuple):
     warnings: tuple[str, ...]
 
 
+class Placed(NamedTuple):
+    """The pose of a photo in a bundle that is believed."""
+
+    gaussian: PoseGaussian  # in the map
+    probabilities: Array  # (K + 1,) of it, of the bundle's other poses, and of none
+    warnings: tuple[str, ...]
+
+
 @one_blas_thread()
 def localize_bundle(
     scan_map: ScanMap,
@@ -89,14 +96,11 @@ def localize_bundle(
     members: dict[int, Member] = {}
 
     def localize_alone(k: int, panorama: Panorama) -> Localization:
-        with watch.stage("search"):
-            query = prepare_search(scan_map, panorama, settings, workers)
-        if isinstance(query, Localization):
-            return query
-        search = find_by_edges if query.evidence == "shape" else find
-        query, selection, fit = search(query, scan_map, watch)
-        judged = judge(query, selection, fit, may_promote=False)
-        members[k] = Member(query.forget(), selection, fit, judged, cams_from_bundle[k])
+        found = find_alone(scan_map, panorama, settings, workers, watch)
+        if found is None:
+            return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
+        judged = judge(found, settings, workers, may_promote=False)
+        members[k] = Member(found.forget(), judged, cams_from_bundle[k])
         return judged
 
     alone = [localize_alone(k, panorama) for k, panorama in enumerate(panoramas)]
@@ -105,7 +109,7 @@ def localize_bundle(
         alone[k] = localize_alone(k, panorama)
     members = dict(sorted(members.items()))
     with watch.stage("refine"):
-        together = judge_members(members, errors)
+        together = judge_members(members, errors, settings, workers)
     return [together.get(k, one) for k, one in enumerate(alone)]
 
 
@@ -128,14 +132,16 @@ def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -
     return expected
 
 
-def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[int, Localization]:
+def judge_members(
+    members: dict[int, Member], errors: RelativeErrors, settings: CoarseToFineSettings, workers: Workers
+) -> dict[int, Localization]:
     """Return the results of photos together, or each by itself with the reason."""
     bundles = propose_bundles(list(members.values()), errors)
     tested = [dict[int, Support]() for _ in bundles]
     for k, member in members.items():
-        query = member.query.forget()
+        problem = member.found.problem.forget()
         for bundle, supports in zip(bundles, tested, strict=True):
-            supports[k] = find_support(member, query, bundle)
+            supports[k] = find_support(member, problem, bundle, workers)
     probabilities = weigh_bundles([list(supports.values()) for supports in tested], list(members.values()))
     best = int(probabilities[:-1].argmax()) if bundles else 0
     if not bundles or probabilities[best] < EVEN:
@@ -147,7 +153,9 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
     if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
         near = agreed.adjusted.bundle
         supports |= {
-            k: find_support(members[k], members[k].query.forget(), near, list_neighbors(members, k))
+            k: find_support(
+                members[k], members[k].found.problem.forget(), near, workers, list_neighbors(members, k)
+            )
             for k, support in supports.items()
             if not support.is_found
         }
@@ -158,7 +166,16 @@ def judge_members(members: dict[int, Member], errors: RelativeErrors) -> dict[in
     others = [i for i in range(len(bundles)) if i != best]
     ranked = probabilities[[best, *others, -1]]
     elsewhere = [bundles[i] for i in others]
-    return {k: judge_member(members[k], k, supports[k], agreed, elsewhere, ranked) for k in members}
+    results = {}
+    for k, member in members.items():
+        placed = place_member(member, k, supports[k], agreed, ranked)
+        if isinstance(placed, Localization):
+            results[k] = placed
+            continue
+        found = recalibrate_at(member, supports[k], placed.gaussian.pose, elsewhere, workers)
+        one = judge_together(found, placed.gaussian, placed.probabilities, settings, workers)
+        results[k] = replace(one, warnings=one.warnings + placed.warnings)
+    return results
 
 
 def list_neighbors(members: dict[int, Member], k: int) -> list[Pose]:
@@ -243,17 +260,12 @@ def judge_apart(member: Member, reason: str) -> Localization:
     return replace(alone, warnings=(*alone.warnings, reason))
 
 
-def judge_member(
-    member: Member,
-    number: int,
-    support: Support,
-    agreed: Agreed,
-    elsewhere: Sequence[Bundle],
-    probabilities: Array,
-) -> Localization:
-    """Return the result of a photo in a bundle that is believed.
+def place_member(
+    member: Member, number: int, support: Support, agreed: Agreed, probabilities: Array
+) -> Placed | Localization:
+    """Return the pose of a photo in a bundle that is believed, or its own result if it does not belong there.
 
-    `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
+    `probabilities` (K + 1,) are of all poses of the bundle, the one believed first, and of none.
     """
     if member.alone.is_ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
@@ -286,12 +298,8 @@ def judge_member(
         confidence = max(confidence, member.alone.confidence / (1.0 - doubt) * min(gain, 1.0))
     others = probabilities[1:-1] * min(1.0, (1.0 - confidence) / max(1.0 - probabilities[0], LEAST_NONE))
     p = np.array([confidence, *others, max(1.0 - confidence - others.sum(), 0.0)])
-    query, fit = recalibrate_at(member, support)
-    placed = [score_pose(query, bundle.place(member.cam_from_bundle)) for bundle in elsewhere]
-    selection = Selection(score_pose(query, gaussian.pose), tuple(placed))
-    result = judge_together(query, selection, fit, gaussian, p)
     doubts = (UNSEEN,) if right < EVEN else ()
-    return replace(result, warnings=result.warnings + doubts + agreed.warnings)
+    return Placed(gaussian, p, doubts + agreed.warnings)
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
@@ -308,10 +316,17 @@ def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:
     return math.exp(min(logs[0] - logs[1], MOST_GAIN))
 
 
-def recalibrate_at(member: Member, support: Support) -> tuple[Query, Fit | None]:
-    """Return the query, and the focal length fitted at a photo's own pose, if it is not exact."""
-    query = member.query.forget()
-    if not isinstance(member.fit, FocalFit) or support.own is member.selection.best:
-        return query, member.fit
-    query, _, fit = calibrate(query, Selection(support.own, ()))
-    return query, fit
+def recalibrate_at(
+    member: Member, support: Support, pose: Pose, elsewhere: Sequence[Bundle], workers: Workers
+) -> Found:
+    """Return a photo's poses by all photos: `pose`, and those that other poses of the bundle give it.
+
+    The focal length, if it is not exact, is fitted at the photo's own pose.
+    """
+    problem, selection, fit = member.found
+    problem = problem.forget()
+    if isinstance(fit, FocalFit) and support.own.pose is not selection.best.pose:
+        own = complete(problem, Selection(support.own, ()), workers)
+        problem, _, fit = calibrate(problem, own, workers)
+    placed = [examine(problem, bundle.place(member.cam_from_bundle)) for bundle in elsewhere]
+    return Found(problem, Selection(examine(problem, pose), tuple(placed)), fit)

@@ -9,22 +9,24 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import CONTRADICTED, posterior
 from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..jobs.threads import Workers
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
-from .comparison import score_pose
+from .candidate import Candidate, Selection
 from .covariance import Errors, estimate_errors
-from .judge import Fit
-from .ladder import FINE, refine
+from .examine import complete, count_agreeing, examine
+from .judging import Found
+from .ladder import refine
 from .last_descent import HOPELESS_SCORE
-from .query import Query
-from .selection import Selection, assess_poses
-from .verification import verify
+from .problem import Problem
+from .selection import assess
+from .stages import FINE
+from .verification import draw_near, verify
 
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
@@ -41,33 +43,31 @@ NUM_LIKELY = 2  # poses of a photo that propose a scale, those with the most pro
 class Member:
     """A photo of the bundle, found by itself."""
 
-    query: Query  # without what takes memory
-    selection: Selection
-    fit: Fit | None
+    found: Found  # without what takes memory
     alone: Localization
     cam_from_bundle: Pose
 
     @property
     def is_misplaced(self) -> bool:
         """True if its focal length contradicts that of the other photos, as at a wrong place."""
-        prior = self.query.given.focal_prior
-        has_conflict = self.fit is not None and self.fit.conflict > MOST_CONFLICT
+        prior = self.found.problem.given.focal_prior
+        fit = self.found.fit
+        has_conflict = fit is not None and fit.conflict > MOST_CONFLICT
         return has_conflict and prior is not None and prior.is_measured
 
     @property
-    def own_poses(self) -> list[tuple[Hypothesis, float]]:
+    def own_poses(self) -> list[tuple[Candidate, float]]:
         """Poses in the map with their probabilities, best first; none if the best one is ruled out."""
         if self.alone.pose is None or self.alone.is_ruled_out:
             return []
-        hypotheses = [self.selection.best, *self.selection.alternatives]
         own = [self.alone.confidence, *(a.probability or 0.0 for a in self.alone.alternatives)]
-        return list(zip(hypotheses, own, strict=False))
+        return list(zip(self.found.selection.ranked, own, strict=False))
 
 
 class Support(NamedTuple):
     """Evidence of a photo for a pose of the bundle."""
 
-    own: Hypothesis  # its own pose there
+    own: Candidate  # its own pose there
     gaussian: PoseGaussian | None  # that pose with its covariance; None where the points do not fix it
     is_found: bool  # by the photo alone
     odds: float  # of that pose, against that none of the photo's poses is right
@@ -170,42 +170,50 @@ def vote(member: Member, bundle: Bundle) -> float:
     return max((p for own, p in member.own_poses if ONE_IN_BUNDLE.holds(own.pose, expected)), default=0.0)
 
 
-def find_support(member: Member, query: Query, bundle: Bundle, exchanged: Sequence[Pose] = ()) -> Support:
+def find_support(
+    member: Member, problem: Problem, bundle: Bundle, workers: Workers, exchanged: Sequence[Pose] = ()
+) -> Support:
     """Return a photo's evidence for a bundle pose: its best own pose near the prediction.
 
     `exchanged` are relative poses of other photos, one of which may be its own.
     """
     expected = bundle.place(member.cam_from_bundle)
-    poses = [own for own, _ in member.own_poses]
-    own = next((h for h in poses if ONE_IN_BUNDLE.holds(h.pose, expected)), None)
-    found = own or max(list_near(query, expected), key=lambda h: h.score)
+    ranked = [own for own, _ in member.own_poses]
+    own = next((h for h in ranked if ONE_IN_BUNDLE.holds(h.pose, expected)), None)
+    found = own or max(list_near(problem, expected, workers), key=lambda h: h.score)
     if own is None:
-        poses.append(found)
+        ranked.append(found)
     places = [place for place in map(bundle.place, exchanged) if not ONE_IN_BUNDLE.holds(place, expected)]
-    poses += [score_pose(query, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in poses)]
+    ranked += [examine(problem, p) for p in places if not any(ONE_IN_BUNDLE.holds(h.pose, p) for h in ranked)]
+    k = next(k for k, h in enumerate(ranked) if h is found)
+    selection = complete(problem, Selection(ranked[0], tuple(ranked[1:])), workers)
+    ranked = selection.ranked
     errors = Errors(member.alone.gaussian, member.alone.std_of_fit)
-    if found is not member.selection.best and found.score > HOPELESS_SCORE:
-        errors = estimate_errors(query, found.pose)
-        errors = errors.widen(member.fit.pose_covariance) if member.fit else errors
+    fit = member.found.fit
+    if found.pose is not member.found.selection.best.pose and found.score > HOPELESS_SCORE:
+        is_counted = not problem.profile.is_narrow or ranked[k].num_matches is not None
+        counted = ranked[k] if is_counted else count_agreeing(problem, ranked[k], workers)
+        errors = estimate_errors(problem, counted, workers)
+        errors = errors.widen(fit.pose_covariance) if fit else errors
     within = probability_within(errors.gaussian)
-    p = posterior(assess_poses(query, poses[0], poses[1:]), errors.std_of_fit, within)
-    k = next(k for k, h in enumerate(poses) if h is found)
+    p = posterior(assess(problem.profile, selection), errors.std_of_fit, within)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
-    num_places = len(query.scan_map.sparse)
-    is_there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in poses]
+    num_places = len(problem.scan_map.sparse)
+    is_there = [any(ONE_IN_BUNDLE.holds(h.pose, place) for place in places) for h in ranked]
     odds_there = float(p[:-1][is_there].sum()) / none / max(len(places), 1)
     odds = float(p[k]) / none
-    return Support(found, errors.gaussian, own is not None, odds, odds_elsewhere, num_places, odds_there)
+    return Support(ranked[k], errors.gaussian, own is not None, odds, odds_elsewhere, num_places, odds_there)
 
 
-def list_near(query: Query, expected: Pose) -> list[Hypothesis]:
+def list_near(problem: Problem, expected: Pose, workers: Workers) -> list[Candidate]:
     """Return a photo's poses near the one expected: by whole views, by matches, and that itself."""
-    poses = [refine(query, expected, FINE).pose]
-    if query.photo.is_partial:
-        poses.append(verify(query, expected).pose)
+    poses = [refine(problem, expected, workers, FINE).pose]
+    if problem.profile.is_partial:
+        drawn = draw_near(problem, expected, None, workers).matches
+        poses.append(verify(problem, expected, drawn).pose)
     near = [pose for pose in poses if ONE_IN_BUNDLE.holds(pose, expected)]
-    return [score_pose(query, pose) for pose in (*near, expected)]
+    return [examine(problem, pose) for pose in (*near, expected)]
 
 
 def weigh_bundles(tested: Sequence[Sequence[Support]], members: Sequence[Member]) -> Array:

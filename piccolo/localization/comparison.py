@@ -6,65 +6,25 @@ at all, a wrong one explains all of them a little.
 
 import math
 from functools import lru_cache
-from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Array, Array32, Int32s, Mask
-from ..confidence.alternatives import Hypothesis
+from ..arrays import Array, Array32, Int32s
 from ..geometry.pose import Pose
 from ..geometry.sphere import BLOCK_RINGS, find_cell, make_grid, pixel_rays
 from ..kernels.jit import F0, copy_to, kernel
-from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
+from ..optimize.channel_loss import NUM_BLOCKS
 from ..panorama.local_normalization import opponent, zscore
 from ..panorama.texels import CHUNK, Texels, make_chunk, project, sample
 from ..views.points_around import round_position
 from ..views.view import ViewArrays, ViewConfig, average_colors, cell_statistics, empty_cells, locate
-from .query import Query
-from .settings import VIEWS
+from .candidate import CONTRADICTS, Comparison, Unoccluded
+from .problem import Problem
+from .profile import VIEWS
 
-CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
-DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
-LEAST_SHARED = 0.3  # fraction of what the poorer view shows
 FINE_VIEW = VIEWS["fine"]
 MASK_WIDTH = 256  # [px] of the mask of blocks that contradict
 PER_LEVEL = np.float32(1.0 / 255.0)
-
-
-class Comparison(NamedTuple):
-    """Agreement of photo and scan at a pose, by blocks of the photo."""
-
-    correlation: Array  # (blocks,) of locally normalised colours, 0 where nothing is shared
-    area: Array  # (blocks,) fractions of the sphere that both show and do not contradict
-    visible_area: Array  # (blocks,) that both show
-    valid_area: float  # of the sphere that the photo shows
-
-    @property
-    def score(self) -> float:
-        """Area explained beyond chance, divided by the area that the photo shows, in [0, 1]."""
-        return self.score_beyond(CHANCE)
-
-    def score_beyond(self, chance: float) -> float:
-        """Return the score where chance explains as much of a block as `chance`."""
-        beyond = np.maximum(self.correlation - chance, 0.0) / (1.0 - chance)
-        return float(beyond @ self.area) / max(self.valid_area, 1e-9)
-
-    @property
-    def contradicts(self) -> Mask:
-        """Mask (blocks,) of those that contradict the scan: an occluder, or the wrong pose."""
-        return (self.correlation < CONTRADICTS) & (self.visible_area > 0.0)
-
-    def compute_ratio(self, other: "Comparison") -> float:
-        """Return the ratio of the area explained by this pose to another's, over blocks that both views show.
-
-        Over all blocks, a pose from which more was scanned would gain by that alone. 0 if hardly any block
-        is shared.
-        """
-        shared = np.minimum(self.visible_area, other.visible_area)
-        if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
-            return 0.0
-        mine, others = (np.maximum(c.correlation - CHANCE, 0.0) @ shared for c in (self, other))
-        return float(mine / max(others, 1e-9))
 
 
 @kernel
@@ -186,27 +146,23 @@ def compare_cells(
                     kept[i] = F0
 
 
-def compare(query: Query, pose: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
-    """Compare the scan at a pose with the photo, by blocks, by default on fine cells; kept with the query."""
-    kept: dict[tuple[bytes, ViewConfig], Comparison] = query.cache.comparisons
-    key = (pose.key, config)
-    if key not in kept:
-        kept[key] = compare_from(query, pose, pose, config)
-    return kept[key]
+def compare(problem: Problem, pose: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
+    """Compare the scan at a pose with the photo, by blocks, by default on fine cells."""
+    return compare_from(problem, pose, pose, config)
 
 
-def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
+def compare_from(problem: Problem, pose: Pose, seen_from: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
     """Compare the scan at a pose with the photo, by blocks, by default on fine cells.
 
     `seen_from` is a pose so near that it sees the same, whose view may be known.
     """
     view = config.arrays
     place = round_position(seen_from)
-    sums = query.averages_at(pose, place, config)
+    sums = problem.averages_at(pose, place, config)
     offsets, colors, weights, center = empty_cells(len(sums), place)
     moments = np.empty((view.num_stats, 8), np.float32)
     average_colors(sums, view, np.ones(len(sums), np.bool_), offsets, colors, weights, moments)
-    photo = query.photo.small
+    photo = problem.photo.small
     grid = make_grid(BLOCK_RINGS)
     by_block = np.empty((3, NUM_BLOCKS))
     compare_cells(
@@ -226,19 +182,17 @@ def compare_from(query: Query, pose: Pose, seen_from: Pose, config: ViewConfig =
     return Comparison(by_block[0], by_block[1], by_block[2], photo.valid_share)
 
 
-def score_pose(query: Query, pose: Pose) -> Hypothesis:
-    """Score a pose by comparing the scan with the photo, as for selection."""
-    return Hypothesis(pose, compare(query, pose).score)
+def mask_occluders(problem: Problem, seen: Comparison, known: Unoccluded | None = None) -> Unoccluded:
+    """Return the photo without the blocks that contradict the scan at a pose; all of it if there are none.
 
-
-def mask_occluders(query: Query, seen: Comparison) -> Query:
-    """Mask the photo's blocks that contradict the scan at a pose; the query itself if there are none."""
+    `known` is a photo that was masked at a pose nearby, perhaps in the same way.
+    """
     if not seen.contradicts.any():
-        return query
+        return Unoccluded(b"", problem.photo)
     key = seen.contradicts.tobytes()
-    if key not in query.cache.masked:
-        query.cache.masked[key] = query.mask(seen.contradicts[pixel_blocks()])
-    return query.cache.masked[key]
+    if known is not None and known.contradicts == key:
+        return known
+    return Unoccluded(key, problem.photo.mask(seen.contradicts[pixel_blocks()]))
 
 
 @lru_cache(maxsize=1)

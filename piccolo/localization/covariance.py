@@ -11,19 +11,24 @@ from ..arrays import Array, Int64s, Mask
 from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
+from ..jobs.threads import Workers
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..views.view import Cells
-from .comparison import Comparison, compare, mask_occluders
-from .ladder import LAST, to_levels
+from .candidate import Candidate
+from .comparison import mask_occluders
+from .ladder import to_levels
+from .photo_images import PhotoImages
 from .prior import contradictions
-from .query import Query
+from .problem import Problem
+from .profile import Profile
 from .scan_errors import layer_covariance, scan_covariance
-from .settings import ImageName
-from .verification import SURE_MATCHES, count_agreeing, place_by_matches
+from .selection import SURE_MATCHES
+from .stages import LAST, ImageName
+from .verification import draw_near, place_by_matches
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
 LEAST_INFORMATION = 1e-12  # of the greatest, in any direction
@@ -260,7 +265,7 @@ def split_by_planes(points: Cells, begins: Int64s) -> Mask:
     return np.asarray((NORMALS[:-1] @ middles.T > limits[..., None]).reshape(-1, len(middles)))
 
 
-def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> Array:
+def disagreement(photo: PhotoImages, points: Cells, pose: Pose, covariance: Array, workers: Workers) -> Array:
     """Return what parts that disagree about the pose of a whole photo add to its `covariance` (6, 6).
 
     Lenses stitched with an error and scans out of shape leave a pose between those of the halves, far from
@@ -271,7 +276,7 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     points, begins = sort_by_block(points)
     blocks_map = make_grid(ERROR_RINGS).directions[: len(begins) - 1]
     is_ahead = NORMALS @ pose.R_cam_from_world @ blocks_map.T > 0.0
-    images = shown.photo.image("fine"), shown.photo.image("full")
+    images = photo.image("fine"), photo.image("full")
     sums = sum_by_block(make_problem(points, images[-1]), pose, begins)
 
     def separate(is_part: Mask) -> tuple[float, Array]:
@@ -283,7 +288,7 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     scores = score_halves(sums, is_ahead)
     tried = [k for k in np.argsort(-scores)[:NUM_TRIED] if scores[k] > MOST_SCORE]
     if tried:
-        ends = shown.workers.map(separate, list(is_ahead[tried]), "covariance")
+        ends = workers.map(separate, list(is_ahead[tried]), "covariance")
         steps = min(ends, key=lambda end: end[0])[1]
         added += (1.0 - (MOST_SCORE / scores[tried[0]]) ** 2) * (covariance + 0.5 * steps.T @ steps)
     is_beyond = split_by_planes(points, begins)
@@ -295,13 +300,15 @@ def disagreement(shown: Query, points: Cells, pose: Pose, covariance: Array) -> 
     return added
 
 
-def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool) -> Array | None:
+def compute_covariance(
+    photo: PhotoImages, points: Cells, pose: Pose, profile: Profile, workers: Workers
+) -> Array | None:
     """Return the covariance (6, 6) [rad, m] in the camera's frame.
 
     Noise and stitching roughen the loss in the finest image; the next one is smoother. Those that are not too
-    rough count alike; if both are, a third is used. `is_partial` says that the photo shows a part of the
-    sphere, even without occluders: then the covariance is larger, as few blocks tell it
-    (`few_blocks_factor`). The points are around the pose.
+    rough count alike; if both are, a third is used. `photo` may be without occluders. If it shows a part of
+    the sphere even with them, the covariance is larger, as few blocks tell it (`few_blocks_factor`). The
+    points are around the pose.
     """
     if points.offsets.shape[1] == 0:
         return None
@@ -309,84 +316,93 @@ def compute_covariance(shown: Query, points: Cells, pose: Pose, is_partial: bool
     points, begins = sort_by_block(points)
 
     def by(steps: DifferenceSteps) -> Array | None:
-        problem = make_problem(points, shown.photo.image(steps.image))
+        problem = make_problem(points, photo.image(steps.image))
         hessian = compute_hessian(problem, pose, steps.turn, median_range)
         gradients = block_gradients(sum_by_block(problem, pose, begins))
         covariance = sandwich_covariance(hessian, gradients)
         if covariance is None:
             return None
-        factor = few_blocks_factor(len(gradients)) if is_partial else 1.0
+        factor = few_blocks_factor(len(gradients)) if profile.is_partial else 1.0
         return steps.inflation * factor * covariance
 
-    has_shape = shown.scan_map.has_shape
-    steps = SHAPE_STEPS if has_shape else STEPS
-    found = [c for c in shown.workers.map(by, steps, "covariance") if c is not None]
-    return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if has_shape else ROUGH_STEPS)
+    steps = SHAPE_STEPS if profile.has_shape else STEPS
+    found = [c for c in workers.map(by, steps, "covariance") if c is not None]
+    return merge_covariances(found) if found else by(ROUGH_SHAPE_STEPS if profile.has_shape else ROUGH_STEPS)
 
 
-def split_errors(query: Query, pose: Pose, covariance: Array) -> PoseGaussian:
+def split_errors(problem: Problem, pose: Pose, covariance: Array) -> PoseGaussian:
     """Return a pose in the map with its covariance (6, 6), of which the errors of the scan are in common."""
-    median_range = compute_median_range(query.view_at(pose, "points"))
-    common = scan_covariance(query.scan_map, median_range)
-    common += layer_covariance(query.scan_map, pose, median_range)
+    median_range = compute_median_range(problem.view_at(pose, "points"))
+    common = scan_covariance(problem.scan_map, median_range)
+    common += layer_covariance(problem.scan_map, pose, median_range)
     variances, axes = np.linalg.eigh(covariance - common)
     return PoseGaussian(pose, (axes * np.maximum(variances, TINY)) @ axes.T, common)
 
 
-def estimate_errors(query: Query, pose: Pose) -> Errors:
-    """Estimate the errors of a pose in the map that a photo has by itself.
+def estimate_errors(problem: Problem, candidate: Candidate, workers: Workers) -> Errors:
+    """Estimate the errors of a candidate's pose that a photo has by itself.
 
     The pose of a photo of a part of the sphere becomes the mean with that by its matches with the drawn scan,
     unless that contradicts the prior. Where the points do not fix it, many matches do.
     """
-    errors = estimate_covariance(query, pose, compare(query, pose))
-    by_matches = place_by_matches(query, pose) if query.is_narrow else None
+    pose = candidate.pose
+    errors = estimate_covariance(problem, candidate, workers)
+    if not problem.profile.is_narrow:
+        return errors
+    drawn = draw_near(problem, pose, candidate.drawn, workers)
+    by_matches = place_by_matches(pose, drawn.matches)
     if by_matches is None:
         return errors
-    median_range = compute_median_range(query.view_at(pose, "points"))
-    of_layers = layer_covariance(query.scan_map, pose, median_range)
+    median_range = compute_median_range(problem.view_at(pose, "points"))
+    of_layers = layer_covariance(problem.scan_map, pose, median_range)
     if errors.gaussian is not None:
         found = errors.gaussian.fuse(PoseGaussian(*by_matches, errors.gaussian.common))
-    elif count_agreeing(query, pose) >= SURE_MATCHES:
-        found = PoseGaussian(*by_matches, scan_covariance(query.scan_map, median_range) + of_layers)
+    elif (candidate.num_matches or 0) >= SURE_MATCHES:
+        found = PoseGaussian(*by_matches, scan_covariance(problem.scan_map, median_range) + of_layers)
     else:
         return errors
-    if contradictions(query.scan_map, found.pose, query.settings.prior):
+    if contradictions(problem.scan_map, found.pose, problem.prior):
         return errors
     return Errors(found, largest_std(found.covariance - of_layers))
 
 
-def estimate_covariance(query: Query, pose: Pose, seen: Comparison, seen_from: Pose | None = None) -> Errors:
-    """Estimate the covariance of a pose in the map.
+def estimate_covariance(
+    problem: Problem, candidate: Candidate, workers: Workers, seen_from: Pose | None = None
+) -> Errors:
+    """Estimate the covariance of a candidate's pose in the map.
 
     Photos have the errors of the scan in common, and of a scan without colours most errors: edges lie beside
-    those of the photos in the same way. `seen` is the comparison at the pose, `seen_from` a pose so near
-    that it sees the same points; of a whole photo those behind occluders are then left out, which takes less
-    time than to normalise a masked photo.
+    those of the photos in the same way. `seen_from` is a pose so near that it sees the same points; of a
+    whole photo those behind occluders are then left out, which takes less time than to normalise a masked
+    photo.
     """
-    is_partial = query.photo.is_partial
-    masked = mask_occluders(query, seen)
-    leaves_out = seen_from is not None and not is_partial
-    points = masked.view_at(pose, "points") if seen_from is None else query.view_at(seen_from, "points")
+    pose = candidate.pose
+    profile = problem.profile
+    leaves_out = seen_from is not None and not profile.is_partial
+    masked = mask_occluders(problem, candidate.seen, candidate.unoccluded).photo
+    if seen_from is None:
+        points = problem.show(masked).view_at(pose, "points")
+    else:
+        points = problem.view_at(seen_from, "points")
     points = remove_poles(points.around(pose.center_world), pose)
-    if leaves_out and seen.contradicts.any():
-        points = remove_hidden(points, masked.photo.panorama.is_valid, pose)
-    shown = query if leaves_out else masked
-    covariance = compute_covariance(shown, points, pose, is_partial)
+    if leaves_out and candidate.seen.contradicts.any():
+        points = remove_hidden(points, masked.panorama.is_valid, pose)
+    photo = problem.photo if leaves_out else masked
+    covariance = compute_covariance(photo, points, pose, profile, workers)
     if covariance is None:
         return UNKNOWN_ERRORS
     turned = pose.R_cam_from_world.T  # R_map_from_cam
     median_range = compute_median_range(points)
-    prior = query.given.focal_prior
+    prior = problem.given.focal_prior
     is_calibrated = prior is None or prior.deviation < UNCALIBRATED
-    turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * query.pixel
+    turn = (PIXEL_SHARE if is_calibrated else UNCALIBRATED_SHARE) * problem.pixel
     of_grid = np.diag(np.repeat([turn**2, (turn * median_range) ** 2], 3))  # and of stitching, in all blocks
     own = turn_positions(covariance, turned) + of_grid
-    common = scan_covariance(query.scan_map, median_range)
-    if query.scan_map.has_shape:
+    common = scan_covariance(problem.scan_map, median_range)
+    if profile.has_shape:
         own, common = ALONE * own, common + (1.0 - ALONE) * own
     std_of_fit = largest_std(own + common)
-    if not (is_partial or query.scan_map.has_shape):
-        own = own + turn_positions(disagreement(shown, points, pose, covariance), turned)
-    common = common + layer_covariance(query.scan_map, pose, median_range)
+    if not (profile.is_partial or profile.has_shape):
+        own = own + turn_positions(disagreement(photo, points, pose, covariance, workers), turned)
+    common = common + layer_covariance(problem.scan_map, pose, median_range)
     return Errors(PoseGaussian(pose, own, common), std_of_fit)

@@ -25,17 +25,18 @@ from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, rotate_points
 from ..geometry.pose_gaussian import add
 from ..geometry.sphere import compute_indices
-from ..jobs.threads import Once
+from ..jobs.threads import Once, Workers
+from ..local_features.matching import NO_MATCHES, Matches
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior
 from ..views.view import Cells
-from .comparison import compare, mask_occluders, score_pose
+from .candidate import Candidate, Selection
+from .comparison import mask_occluders
 from .covariance import UNCALIBRATED
-from .ladder import Limits
+from .examine import examine_each
 from .last_descent import refine_best
-from .lens_matches import MOST, add_matches, fit_matches
-from .query import Features, Query, prepare_query
-from .selection import Selection
+from .lens_matches import MOST, MatchFit, add_matches, fit_matches
+from .problem import Features, Problem
 from .self_calibration import (
     Estimate,
     Freedom,
@@ -44,6 +45,8 @@ from .self_calibration import (
     estimate_corrections,
     invert,
 )
+from .stages import Limits
+from .verification import draw_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
 K1_DEVIATION = 0.05  # of k1 where the camera is a guess
@@ -127,19 +130,22 @@ class FocalFit(NamedTuple):
         return replace(found, doubt=self.doubt, picture_px=px, picture_std_px=std)
 
 
-def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
+def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: bool = True) -> FocalFit:
     """Fit the focal length of a photo with a focal_prior whose pose in the map is roughly known.
 
     Later fits (`is_first` false) begin from a focal length that is roughly known too.
     """
-    prior = query.given.focal_prior
-    camera = query.given.cameras[0].camera
+    prior = problem.given.focal_prior
+    mount = problem.given.cameras[0]
+    camera = mount.camera
     assert prior is not None
     claim = make_claim(prior, camera)
-    near, far = descend_lens(query, pose, claim, is_first)
-    by_matches = fit_matches(query, pose, FOCAL_WIDTHS)
-    estimate = add_matches(estimate_lens(query, pose, near), by_matches)
-    free = estimate_lens(query, pose, far)
+    matches = list_matches(problem, best, workers)
+    starts = fit_matches(mount, best.pose, matches, ALL_WIDTHS)
+    near, far = descend_lens(problem, best, claim, starts, workers, is_first)
+    by_matches = fit_matches(mount, best.pose, matches, FOCAL_WIDTHS)
+    estimate = add_matches(estimate_lens(problem, best.pose, near), by_matches)
+    free = estimate_lens(problem, best.pose, far)
     values, information, motion = estimate
     off, variance = marginal(values, information, claim, FOCAL)
     off -= claim.expected[FOCAL]
@@ -162,6 +168,13 @@ def fit_focal(query: Query, pose: Pose, is_first: bool = True) -> FocalFit:
         None if prior.is_measured or prior.deviation > WIDE else find_errors_of_picture(free, claim),
         LENS[int(worst.argmax())],
     )
+
+
+def list_matches(problem: Problem, candidate: Candidate, workers: Workers) -> Matches:
+    """Return the matches with the scan drawn near a candidate; none by whole views alone."""
+    if not problem.profile.uses_matches:
+        return NO_MATCHES
+    return draw_near(problem, candidate.pose, candidate.drawn, workers).matches
 
 
 def average(
@@ -213,15 +226,23 @@ def make_claim(prior: FocalPrior, camera: Camera) -> Claim:
     return Claim(expected, deviations, np.array([WRONG_DEVIATION, *OTHERS_WRONG]), shares)
 
 
-def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tuple[FreeEnd, FreeEnd]:
+def descend_lens(
+    problem: Problem,
+    best: Candidate,
+    claim: Claim,
+    by_matches: MatchFit,
+    workers: Workers,
+    is_first: bool,
+) -> tuple[FreeEnd, FreeEnd]:
     """Descend with the focal length free, then with all corrections of the lens; return both lowest ends.
 
     The first descents begin as the photo was taken last and, at first, with other focal lengths; the others
     at their end, and as matches have it. The focal length goes on with the points that are seen from where it
     ended: of those that are seen from elsewhere more agree with the pose there.
     """
-    shown = mask_occluders(query, compare(query, pose))
-    corrections = Corrections(query.given.cameras[0])
+    pose = best.pose
+    shown = problem.show(mask_occluders(problem, best.seen, best.unoccluded).photo)
+    corrections = Corrections(problem.given.cameras[0])
     wide = np.maximum(claim.wrong_deviations, claim.deviations)
     of_focal = Freedom(corrections, np.where(np.arange(len(wide)) == FOCAL, wide, claim.deviations), MOST)
     of_all = Freedom(corrections, wide, MOST)
@@ -233,17 +254,17 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
         return descend_freely(cells, shown.photo.image("fine"), of_focal, pose, values, NEAR)
 
     def find_lowest(freedom: Freedom, place: Pose, starts: Sequence[tuple[Pose, Array]]) -> FreeEnd:
-        points = mask_edge(shown.view_at(place, "points"), place, query.photo.panorama.is_valid)
+        points = mask_edge(shown.view_at(place, "points"), place, problem.photo.panorama.is_valid)
 
         def go_on(start: tuple[Pose, Array]) -> FreeEnd:
             return descend_freely(points, shown.photo.image("full"), freedom, *start, CLOSE)
 
         return min(
-            query.workers.map(go_on, starts, "fit the focal length"),
+            workers.map(go_on, starts, "fit the focal length"),
             key=lambda end: end.loss,
         )
 
-    others = query.workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
+    others = workers.map(begin, FIRST_CHANGES, "fit the focal length") if is_first else []
     first = find_lowest(of_focal, pose, [(pose, np.zeros(len(LENS))), *(end.start for end in others)])
     motion = estimate_corrections(first).motion[:, FOCAL]
     unit = np.eye(len(LENS))[FOCAL]
@@ -253,7 +274,6 @@ def descend_lens(query: Query, pose: Pose, claim: Claim, is_first: bool) -> tupl
         if near.pose.distance(pose) > FAR:
             break
         near = find_lowest(of_focal, near.pose, [near.start])
-    by_matches = fit_matches(query, pose, ALL_WIDTHS)
     starts = [near.start, (by_matches.pose, by_matches.values)]
     return near, find_lowest(of_all, near.pose, starts[: 1 + int(by_matches.values.any())])
 
@@ -267,7 +287,7 @@ def mask_edge(points: Cells, pose: Pose, is_valid: Mask) -> Cells:
     return points._replace(weights=points.weights * is_kept.astype(np.float32))
 
 
-def estimate_lens(query: Query, pose: Pose, end: FreeEnd) -> Estimate:
+def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd) -> Estimate:
     """Estimate the corrections of a lens at the end of a descent from a pose, which tells nothing if it left.
 
     Errors of the picture's edge that all blocks may have in common are added.
@@ -275,31 +295,32 @@ def estimate_lens(query: Query, pose: Pose, end: FreeEnd) -> Estimate:
     estimate = estimate_corrections(end)
     if end.pose.distance(pose) > FAR:
         return estimate._replace(information=np.zeros_like(estimate.information))
-    camera = query.given.cameras[0].camera
-    per_px = math.tau * camera.focal[0] / (0.5 * camera.width * query.photo.panorama.rgb.shape[1])
+    camera = problem.given.cameras[0].camera
+    per_px = math.tau * camera.focal[0] / (0.5 * camera.width * problem.photo.panorama.rgb.shape[1])
     covariance = invert(estimate.information)
     is_known = estimate.information.any(axis=1)
     errors = np.diag(is_known * (np.array(EDGE_ERRORS) * per_px) ** 2)
     return estimate._replace(information=invert(covariance + errors))
 
 
-def calibrate(query: Query, found: Selection) -> tuple[Query, Selection, FocalFit]:
+def calibrate(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection, FocalFit]:
     """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
 
     The last change is applied too, so that what is found lies between what was given and what the picture
     says.
     """
-    query, found = follow_matches(query, found)
-    fit = fit_focal(query, found.best.pose)
+    problem, found = follow_matches(problem, found, workers)
+    fit = fit_focal(problem, found.best, workers)
     for _ in range(MAX_CALIBRATIONS):
         if fit.is_at_rest:
             break
-        query, found = refine_with(query, found, fit.change, fit.move(found.best.pose))
-        fit = fit_focal(query, found.best.pose, is_first=False)
-    left = find_change_left(query.given, fit)
+        problem, found = refine_with(problem, found, fit.change, fit.move(found.best.pose), workers)
+        fit = fit_focal(problem, found.best, workers, is_first=False)
+    left = find_change_left(problem.given, fit)
     if left.any():
-        query, found = refine_with(query, found, left, add(found.best.pose, fit.motion @ left))
-    return query, found, fit._replace(change=fit.change - left)
+        moved = add(found.best.pose, fit.motion @ left)
+        problem, found = refine_with(problem, found, left, moved, workers)
+    return problem, found, fit._replace(change=fit.change - left)
 
 
 def find_change_left(panorama: Panorama, fit: FocalFit) -> Array:
@@ -314,39 +335,40 @@ def find_change_left(panorama: Panorama, fit: FocalFit) -> Array:
     return left
 
 
-def refine_with(query: Query, found: Selection, change: Array, best: Pose) -> tuple[Query, Selection]:
+def refine_with(
+    problem: Problem, found: Selection, change: Array, best: Pose, workers: Workers
+) -> tuple[Problem, Selection]:
     """Refine the poses with another calibration, of which the best is `best`."""
-    query = recalibrate(query, change)
+    problem = recalibrate(problem, change, workers)
     poses = [best, *(h.pose for h in found.alternatives)]
-    moved = query.workers.map(partial(score_pose, query), poses, "compare")
-    return query, refine_best(query, moved)
+    return problem, refine_best(problem, examine_each(problem, poses, workers), workers)
 
 
-def follow_matches(query: Query, found: Selection) -> tuple[Query, Selection]:
+def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:
     """Begin with the focal length by which most matches agree, if that is clearly another."""
-    by_matches = fit_matches(query, found.best.pose, FOCAL_WIDTHS)
+    matches = list_matches(problem, found.best, workers)
+    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
     change = float(by_matches.values[FOCAL])
     if abs(change) * math.sqrt(by_matches.information) < CLEARLY:
-        return query, found
-    other = refine_with(query, found, np.array([change]), by_matches.pose)
-    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (query, found)
+        return problem, found
+    other = refine_with(problem, found, np.array([change]), by_matches.pose, workers)
+    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (problem, found)
 
 
-def recalibrate(query: Query, change: Array) -> Query:
-    """Prepare the query again with another calibration; its matches stay, and their rays follow."""
-    given = query.given
+def recalibrate(problem: Problem, change: Array, workers: Workers) -> Problem:
+    """Prepare the problem again with another calibration; its matches stay, and their rays follow."""
+    given = problem.given
     before = given.cameras[0]
     after = before.with_camera(before.camera.change(*change))
     taken = given.resample(after.camera, given.rgb.shape[1])
-    fresh = prepare_query(taken, query.scan_map, query.settings, query.workers)
-    features = tuple(Once(_turn_features, part, before, after) for part in query.features)
-    beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in query.beside)
-    found = replace(fresh, features=features, beside=beside)
-    return found if query.uses_matches else found.by_views()
+    features = tuple(Once(partial(_turn_features, part, before, after)) for part in problem.features)
+    beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in problem.beside)
+    return replace(problem.retake(taken), features=features, beside=beside)
 
 
-def _turn_features(found: Features, before: Mount, after: Mount) -> Features:
+def _turn_features(part: Once[Features], before: Mount, after: Mount, workers: Workers) -> Features:
     """Give the features the rays that another calibration gives to their pixels."""
+    found = part(workers)
     keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
     return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
 

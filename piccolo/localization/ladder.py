@@ -1,13 +1,14 @@
-"""The ladder of stages on which a pose is refined: from coarse images and views to single points."""
+"""Poses refined on the ladder of stages: from coarse images and views to single points."""
 
 import math
-from typing import NamedTuple
+from dataclasses import replace
 
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s
 from ..confidence.alternatives import Hypothesis
 from ..geometry.pose import Pose, orthonormal
+from ..jobs.threads import Workers
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
@@ -15,9 +16,12 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
-from .comparison import Comparison, compare, mask_occluders, score_pose
-from .query import Query
-from .settings import VIEWS, ImageName, ViewName
+from .candidate import Candidate
+from .comparison import mask_occluders
+from .examine import examine
+from .problem import Problem
+from .profile import VIEWS
+from .stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, SOFT, Limits, Stage
 
 PERTURBED_DISTANCE = 0.25  # [m]
 PERTURBED_ANGLE = math.radians(8.0)
@@ -25,107 +29,61 @@ PERTURBED_BATCH = 3  # perturbed poses that a thread takes
 MAX_PERTURBATIONS = 5  # rounds
 MIN_GAIN = 0.02  # of the score in a round, relative; a round with less is the last
 MAX_UNOCCLUDED = 2  # rounds that mask occluders
-NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
 MIN_SCORE_LEFT = 0.9  # fraction of the score that a descent on points must keep
 
 
-class Limits(NamedTuple):
-    """The loss of a descent, and its end."""
-
-    loss_scale: float  # [standard deviations]
-    num_iterations: int  # at most
-    tolerance: float  # [rad + m] a shorter step ends the descent
-
-
-class Around(NamedTuple):
-    """Poses around the one that is given: each descends on a coarser image first, and the best end counts."""
-
-    image: ImageName
-    num_iterations: int  # on that
-    size: float  # of the perturbations, relative to PERTURBED_DISTANCE and PERTURBED_ANGLE
-
-
-class Rounds(NamedTuple):
-    """Repetitions of a descent, each on the points that are visible from the end of the one before."""
-
-    most: int
-    arrived: float  # [m] a smaller move ends them
-
-
-class Stage(NamedTuple):
-    """A descent from a pose: on which view of the scan from there, and in which image of the photo."""
-
-    view: ViewName
-    image: ImageName
-    limits: Limits
-    around: Around | None = None
-    rounds: Rounds = Rounds(1, 0.0)
-
-
-FIRST = Stage("prepared", "search", Limits(1.2, 5, 2e-3))
-SECOND = Stage("prepared", "search", Limits(1.2, 12, 2e-3))
-MIDDLE = Stage("middle", "middle", Limits(1.2, 12, 1e-3))
-AROUND_MIDDLE = Stage("middle", "middle", Limits(1.2, 8, 1e-3), Around("search", 6, 1.0))
-AROUND_FINE = Stage("fine", "fine", Limits(1.2, 8, 1e-3), Around("middle", 6, 0.4))
-FINE = Stage("fine", "fine", Limits(1.0, 12, 1e-4))
-SOFT = Stage("points", "fine", Limits(1.0, 12, 1e-4))  # of edges, before the next ones
-FULL = Stage("points", "full", Limits(0.7, 10, 1e-4), rounds=Rounds(2, NEARLY))
-LAST = Stage("points", "full", Limits(0.7, 30, 1e-7), rounds=Rounds(6, 1e-4))
-
-
-def refine(query: Query, start: Pose, first: Stage, then: Stage | None = None) -> Hypothesis:
+def refine(
+    problem: Problem, start: Pose, workers: Workers, first: Stage, then: Stage | None = None
+) -> Hypothesis:
     """Descend from a pose through one or two stages, each on what is seen from where it begins.
 
     The score of the end is that on the cells of the last view; nan on points.
     """
-    cells = query.view_at(start, first.view)
-    end = (descend_around if first.around else descend_on)(query, cells, start, first)
-    return end if then is None else refine(query, end.pose, then)
+    cells = problem.view_at(start, first.view)
+    if first.around is None:
+        end = descend_on(problem, cells, start, first)
+    else:
+        end = descend_around(problem, cells, start, first, workers)
+    return end if then is None else refine(problem, end.pose, workers, then)
 
 
-def descend_on(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
+def descend_on(problem: Problem, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
     """Descend from a pose on the cells or points that are seen from there, and score the end on the cells."""
-    image = query.photo.image(stage.image)
+    image = problem.photo.image(stage.image)
     end = descend(cells, image, pose, stage.limits)
     if stage.view == "points":
         return Hypothesis(end, math.nan)
     return score_on_cells(cells, VIEWS[stage.view].arrays.blocks, image, end)
 
 
-def climb(query: Query, start: Hypothesis) -> Hypothesis:
-    """Refine a pose on fine cells, and poses around it, for as long as its score rises.
-
-    A pose that has converged before is returned unchanged.
-    """
-    if start.pose.key in query.cache.ends:
-        return start
-    cells = query.view_at(start.pose, FINE.view)
+def climb(problem: Problem, start: Pose, workers: Workers) -> Hypothesis:
+    """Refine a pose on fine cells, and poses around it, for as long as its score rises."""
+    cells = problem.view_at(start, FINE.view)
     blocks = VIEWS[FINE.view].arrays.blocks
-    best = score_on_cells(cells, blocks, query.photo.image(FINE.image), start.pose)
+    best = score_on_cells(cells, blocks, problem.photo.image(FINE.image), start)
     for _ in range(MAX_PERTURBATIONS):
-        around = descend_around(query, cells, best.pose, AROUND_FINE)
-        refined = refine(query, around.pose, FINE)
+        around = descend_around(problem, cells, best.pose, AROUND_FINE, workers)
+        refined = refine(problem, around.pose, workers, FINE)
         gain = refined.score - best.score
         best = refined if gain > 0.0 else best
         if gain < MIN_GAIN * refined.score:
             break
-        cells = query.view_at(best.pose, FINE.view)
-    query.cache.ends.add(best.pose.key)
-    return best
+        cells = problem.view_at(best.pose, FINE.view)
+    return replace(best, is_climbed=True)
 
 
-def climb_from_afar(query: Query, start: Pose) -> tuple[Pose, Pose]:
+def climb_from_afar(problem: Problem, start: Pose, workers: Workers) -> tuple[Pose, Pose]:
     """Descend from a pose, and from poses around the end for as long as the score on fine cells rises.
 
     Nothing is gained if they all lead back to the end. Return also the pose from which its cells were seen.
     """
-    end = seen_from = refine(query, start, MIDDLE).pose
-    best = refine(query, end, FINE)
+    end = seen_from = refine(problem, start, workers, MIDDLE).pose
+    best = refine(problem, end, workers, FINE)
     for _ in range(MAX_PERTURBATIONS):
-        other = refine(query, end, AROUND_MIDDLE).pose
+        other = refine(problem, end, workers, AROUND_MIDDLE).pose
         if other.distance(end) < PLACE_SPACING:
             break
-        around = refine(query, other, FINE)
+        around = refine(problem, other, workers, FINE)
         gain = around.score - best.score
         if gain > 0.0:
             best = around
@@ -136,53 +94,68 @@ def climb_from_afar(query: Query, start: Pose) -> tuple[Pose, Pose]:
     return best.pose, seen_from
 
 
-def climb_unoccluded(query: Query, start: Pose) -> tuple[Query, Hypothesis]:
-    """Mask occluders and refine the pose, in rounds; return the masked query and the pose.
+def climb_unoccluded(problem: Problem, start: Candidate, workers: Workers) -> Candidate:
+    """Mask occluders and refine the pose, in rounds.
 
-    The score of the pose is that of the whole photo.
+    Its evidence is that of the whole photo; `unoccluded` is the photo as it was masked last.
     """
-    best = score_pose(query, start)
+    best = start
     for _ in range(MAX_UNOCCLUDED):
-        seen = compare(query, best.pose)
-        shown = mask_occluders(query, seen)
-        is_occluded = seen.contradicts.any()
-        first = refine(shown, best.pose, AROUND_MIDDLE, FINE) if is_occluded else best
-        refined = score_pose(query, climb(shown, first).pose)
-        gain = refined.score - best.score
-        best = refined if gain > 0.0 else best
-        if not is_occluded or gain < MIN_GAIN * refined.score:
+        before = best
+        best = replace(best, unoccluded=mask_occluders(problem, best.seen, best.unoccluded))
+        is_occluded = bool(best.seen.contradicts.any())
+        climbed = climb_masked(problem, best, workers) if is_occluded else climb_whole(problem, best, workers)
+        gain = climbed.score - before.score
+        best = climbed if gain > 0.0 or climbed.pose is before.pose else best
+        if not is_occluded or gain < MIN_GAIN * climbed.score:
             break
-    return shown, best
+    return best
 
 
-def climb_to_full(query: Query, start: Pose) -> Hypothesis:
+def climb_whole(problem: Problem, start: Candidate, workers: Workers) -> Candidate:
+    """Climb from a candidate; one that has climbed before is returned unchanged."""
+    if start.is_climbed:
+        return start
+    pose = climb(problem, start.pose, workers).pose
+    end = start if pose is start.pose else examine(problem, pose, start)
+    return replace(end, is_climbed=True)
+
+
+def climb_masked(problem: Problem, start: Candidate, workers: Workers) -> Candidate:
+    """Climb from a candidate, and from poses around it, with the photo that is masked there."""
+    assert start.unoccluded is not None
+    masked = problem.show(start.unoccluded.photo)
+    first = refine(masked, start.pose, workers, AROUND_MIDDLE, FINE)
+    return examine(problem, climb(masked, first.pose, workers).pose, start)
+
+
+def climb_to_full(problem: Problem, start: Candidate, workers: Workers) -> Candidate:
     """Mask occluders and refine the pose, then descend on the visible points in the finest image."""
-    shown, best = climb_unoccluded(query, start)
-    return converge(query, shown, best, FULL)
+    return converge(problem, climb_unoccluded(problem, start, workers), FULL, workers)
 
 
-def settle(query: Query, found: Hypothesis, seen: Comparison | None = None) -> Hypothesis:
-    """Descend until the pose converges, so that it does not depend on where the search began.
-
-    `seen` is how the pose was compared, if not as of `compare`.
-    """
-    shown = mask_occluders(query, seen or compare(query, found.pose))
-    return converge(query, shown, found, LAST)
+def settle(problem: Problem, found: Candidate, workers: Workers) -> Candidate:
+    """Descend until the pose converges, so that it does not depend on where the search began."""
+    shown = mask_occluders(problem, found.seen, found.unoccluded)
+    return converge(problem, replace(found, unoccluded=shown), LAST, workers)
 
 
-def converge(query: Query, shown: Query, found: Hypothesis, stage: Stage) -> Hypothesis:
+def converge(problem: Problem, found: Candidate, stage: Stage, workers: Workers) -> Candidate:
     """Descend on the points visible from the pose, in the rounds of a stage.
 
-    It descends on the masked query `shown`; an end below MIN_SCORE_LEFT of the photo's score is discarded.
+    It descends with the candidate's unoccluded photo; an end below MIN_SCORE_LEFT of its score is discarded.
     """
+    assert found.unoccluded is not None
+    shown = problem.show(found.unoccluded.photo)
     pose = found.pose
     for k in range(stage.rounds.most):
         center = pose.center_world
-        is_soft = k == 0 and query.evidence == "shape"
-        pose = (refine(shown, pose, SOFT, stage) if is_soft else refine(shown, pose, stage)).pose
+        is_soft = k == 0 and problem.profile.has_shape
+        stages = (SOFT, stage) if is_soft else (stage,)
+        pose = refine(shown, pose, workers, *stages).pose
         if math.dist(pose.center_world, center) < stage.rounds.arrived:
             break
-    end = score_pose(query, pose)
+    end = examine(problem, pose, found)
     return end if end.score > MIN_SCORE_LEFT * found.score else found
 
 
@@ -253,12 +226,12 @@ def score_on_cells(cells: Cells, blocks: Int32s, image: Texels, pose: Pose) -> H
     return Hypothesis(pose, float(value))
 
 
-def descend_around(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypothesis:
+def descend_around(problem: Problem, cells: Cells, pose: Pose, stage: Stage, workers: Workers) -> Hypothesis:
     """Return the best end of descents from a pose and around it, on the coarse image first."""
     assert stage.around is not None
     blocks = VIEWS[stage.view].arrays.blocks
-    coarse = query.photo.image(stage.around.image)
-    fine = query.photo.image(stage.image)
+    coarse = problem.photo.image(stage.around.image)
+    fine = problem.photo.image(stage.image)
     limits = stage.limits
     steps = perturbations(stage.around.size)
     R = np.repeat(pose.R_cam_from_world[None], len(steps), axis=0)
@@ -286,6 +259,6 @@ def descend_around(query: Query, cells: Cells, pose: Pose, stage: Stage) -> Hypo
             scores[part],
         )
 
-    query.workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
+    workers.map(run, range(0, len(steps), PERTURBED_BATCH), "descend")
     best = int(np.argmax(scores))
     return Hypothesis(Pose(orthonormal(R[best]), t[best] + cells.center_map), float(scores[best]))

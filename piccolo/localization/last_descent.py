@@ -1,63 +1,61 @@
-"""The best poses refined to the top of the ladder, until one stays the best."""
+"""The best candidates refined to the top of the ladder, until one stays the best."""
 
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
-from ..confidence.alternatives import Hypothesis
+from ..jobs.threads import Workers
+from .candidate import Candidate, Selection
+from .examine import choose, choose_among, complete
 from .ladder import climb_to_full, climb_unoccluded, settle
-from .query import Query
-from .selection import FAINT_SCORE, Selection, rank, select
-from .verification import CHANCE_MATCHES, SURE_MATCHES, count_each
+from .problem import Problem
+from .selection import SURE_MATCHES, count_matches, is_faint, rank
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
 NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best
 MAX_REFINED = 4  # alternatives
 
 
-def refine_best(query: Query, hypotheses: Sequence[Hypothesis]) -> Selection:
-    """Refine the best hypothesis and the alternatives that come near it, and select the best.
+def refine_best(problem: Problem, candidates: Sequence[Candidate], workers: Workers) -> Selection:
+    """Refine the best candidate and the alternatives that come near it, and select the best.
 
     If all are faint, only the best is refined first, on fine cells; if it stays faint, refinement ends.
     """
-    found = rank(hypotheses)
+    found = rank(candidates)
     if found.best.score < HOPELESS_SCORE:
         return found
-    if is_faint(query, found):
-        best = climb_unoccluded(query, found.best.pose)[1]
-        found = select(query, rank([best, *found.alternatives]))
-        if is_faint(query, found):
+    found = complete(problem, found, workers)
+    if is_faint(problem.profile, found):
+        best = climb_unoccluded(problem, found.best, workers)
+        found = choose_among(problem, [best, *found.alternatives], workers)
+        if is_faint(problem.profile, found):
             return found
-    _, *of_others = count_each(query, found.best, found.alternatives)
-    near: list[Hypothesis] = []
-    far: list[Hypothesis] = []
-    for h, count in zip(found.alternatives, of_others, strict=True):
+    near, far = part_near(found, count_matches(problem.profile, found.ranked)[1:])
+    if not near:
+        best = climb_unoccluded(problem, found.best, workers)
+        return settle_best(problem, rank([best, *found.alternatives]), workers)
+    refined = workers.map(partial(climb_to_full, problem, workers=workers), [found.best, *near], "descend")
+    return settle_best(problem, choose_among(problem, [*refined, *far], workers), workers)
+
+
+def part_near(found: Selection, counts: Sequence[int]) -> tuple[list[Candidate], list[Candidate]]:
+    """Part the alternatives, with their matches, in those that come near the best and others."""
+    near: list[Candidate] = []
+    far: list[Candidate] = []
+    for h, count in zip(found.alternatives, counts, strict=True):
         is_near = h.score > NEAR_SCORE * found.best.score or count >= SURE_MATCHES
         (near if is_near and len(near) < MAX_REFINED else far).append(h)
-    if not near:
-        best = climb_unoccluded(query, found.best.pose)[1]
-        return settle_best(query, rank([best, *found.alternatives]))
-    poses = [h.pose for h in (found.best, *near)]
-    ends = query.workers.map(partial(climb_to_full, query), poses, "descend")
-    return settle_best(query, select(query, rank([*ends, *far])))
+    return near, far
 
 
-def is_faint(query: Query, found: Selection) -> bool:
-    """Return True if all poses are faint and no more features agree than by chance: refinement soon ends."""
-    scores = [h.score for h in (found.best, *found.alternatives)]
-    if max(scores) >= FAINT_SCORE:
-        return False
-    return max(count_each(query, found.best, found.alternatives)) <= CHANCE_MATCHES
-
-
-def settle_best(query: Query, found: Selection) -> Selection:
+def settle_best(problem: Problem, found: Selection, workers: Workers) -> Selection:
     """Refine the best pose to convergence; repeat if another becomes the best."""
-    at_rest: list[Hypothesis] = []
-    with query.workers.beside(partial(query.surroundings_at, found.best.pose)):  # it hardly moves
+    at_rest: list[Candidate] = []
+    with workers.beside(partial(problem.surroundings_at, found.best.pose)):  # it hardly moves
         for _ in range(1 + len(found.alternatives)):
-            best = settle(query, found.best)
+            best = settle(problem, found.best, workers)
             at_rest.append(best)
-            found = select(query, replace(found, best=best))
-            if any(found.best is h for h in at_rest):
+            found = choose(problem, replace(found, best=best), workers)
+            if any(found.best.pose is h.pose for h in at_rest):
                 break
     return found

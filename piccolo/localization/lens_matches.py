@@ -5,14 +5,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array
+from ..camera import Mount
 from ..camera.corrections import FOCAL, LENS, Corrections
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
-from ..local_features.matching import NO_MATCHES
+from ..local_features.matching import Matches
 from ..optimize.self_calibration import NUM_OF_POSE
-from .query import Query
+from .selection import SURE_MATCHES
 from .self_calibration import Estimate, invert
-from .verification import LEAST_ERROR, SURE_MATCHES, matches_near
+from .verification import LEAST_ERROR
 
 MOST = np.array([0.5, 0.2, 0.3, 0.3, 0.6])  # corrections that are searched
 MATCH_SCALES = np.radians([3.0] * 4 + [1.0] * 3 + [0.5] * 3 + [0.25] * 5)  # of the loss of matches
@@ -39,18 +40,14 @@ def add_matches(estimate: Estimate, by_matches: MatchFit) -> Estimate:
     return estimate._replace(values=invert(both) @ goal, information=both)
 
 
-def fit_matches(query: Query, pose: Pose, widths: tuple[float, ...]) -> MatchFit:
+def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float, ...]) -> MatchFit:
     """Fit corrections of the lens and the pose to the matches with the scan drawn at a pose.
 
     `widths` (5,) are the deviations of the corrections. A match's loss becomes narrower from step to step.
     """
-    matches = matches_near(query, pose) if query.uses_matches else NO_MATCHES
     if len(matches.rays) < SURE_MATCHES:
         return MatchFit(np.zeros(len(LENS)), 0.0, pose)
-    known: MatchFit | None = query.cache.fits.get((pose.key, widths))
-    if known is not None:
-        return known
-    corrections = Corrections(query.given.cameras[0])
+    corrections = Corrections(camera)
     prior = np.diag([0.0] * NUM_OF_POSE + list((LEAST_ERROR / np.array(widths)) ** 2))
     end = pose
     values = np.zeros(len(LENS))
@@ -70,6 +67,4 @@ def fit_matches(query: Query, pose: Pose, widths: tuple[float, ...]) -> MatchFit
     of_focal = inverse[NUM_OF_POSE + FOCAL]
     variance = INFLATION * float(np.square(slopes @ of_focal).sum()) + MATCHED_DEVIATION**2
     is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(values[FOCAL]) < LIMIT
-    fit = MatchFit(values, float(is_known / variance), end)
-    query.cache.fits[pose.key, widths] = fit
-    return fit
+    return MatchFit(values, float(is_known / variance), end)

@@ -3,9 +3,8 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
-from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis
+from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.nearness import CONFIRMED
@@ -13,17 +12,20 @@ from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
+from ..photo import Prior
 from ..scan_map.scan_map import ScanMap
-from .attempts import plan_attempts, search_beyond_prior
-from .focal_length import WIDE, FocalFit, calibrate
-from .judge import judge, reconsider
-from .last_descent import is_faint, refine_best
+from .attempts import Means, plan_attempts, search_beyond_prior
+from .candidate import Candidate, Selection
+from .focal_length import WIDE, calibrate
+from .judge import reconsider
+from .judging import Found, judge
+from .last_descent import refine_best
 from .prior import apply_prior, nothing_allowed
-from .query import Query, prepare_query
-from .selection import Selection
+from .problem import Problem, prepare_problem
+from .selection import is_faint
 from .settings import CoarseToFineSettings
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
-from .sphere import SphereFit, calibrate_sphere
+from .sphere import calibrate_sphere
 
 GUESSES = (
     0.0,
@@ -32,14 +34,6 @@ GUESSES = (
 )  # added to the log of the focal length: one comes near enough to any that is 20 % off
 MOST_RANGE = 10.0  # [m] of what is seen: a pose moves by this times the change of the focal length's log
 NO_PIXEL = "the panorama: no pixel counts, all are masked"
-
-
-class Found(NamedTuple):
-    """The poses found for a photo, refined."""
-
-    query: Query
-    selection: Selection
-    fit: FocalFit | SphereFit | None  # None if the poses are faint, or nothing was fitted
 
 
 @one_blas_thread()
@@ -51,77 +45,86 @@ def localize(
     watch: Stopwatch,
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
-    with watch.stage("search"):
-        query = prepare_search(scan_map, panorama, settings, workers)
-        if isinstance(query, Localization):
-            return query
-        query.photo.images.search()  # each search begins with it
-    search = find_by_edges if query.evidence == "shape" else find
-    found = search(query, scan_map, watch)
+    found = find_alone(scan_map, panorama, settings, workers, watch)
+    if found is None:
+        return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
     with watch.stage("refine"):
-        return judge(found.query, found.selection, found.fit)
+        return judge(found, settings, workers)
 
 
-def prepare_search(
-    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, workers: Workers
-) -> Query | Localization:
-    """Prepare a panorama for the search where the prior allows; a result says why nothing is searched."""
-    allowed_map = apply_prior(scan_map, settings.prior)
-    if len(allowed_map.sparse) == 0:
-        return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
-    if not panorama.is_valid.any():
-        return Localization(warnings=(NO_PIXEL,))
-    return prepare_query(panorama, allowed_map, settings, workers)
+def find_alone(
+    scan_map: ScanMap,
+    panorama: Panorama,
+    settings: CoarseToFineSettings,
+    workers: Workers,
+    watch: Stopwatch,
+) -> Found | None:
+    """Find the poses of a photo by itself, refined; None if there is nothing to search."""
+    with watch.stage("search"):
+        allowed_map = apply_prior(scan_map, settings.prior)
+        if len(allowed_map.sparse) == 0 or not panorama.is_valid.any():
+            return None
+        problem = prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
+        problem.photo.images.search()  # each search begins with it
+    search = find_by_edges if problem.profile.has_shape else find
+    return search(problem, scan_map, Means(settings.effort, workers, watch))
 
 
-def find(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:
+def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> tuple[str, ...]:
+    """Return why there is nothing to search, as warnings."""
+    is_left = len(apply_prior(scan_map, prior).sparse) > 0
+    return (NO_PIXEL,) if is_left else (nothing_allowed(scan_map, prior),)
+
+
+def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     """Search until one attempt is sure, and refine the best poses to the end.
 
-    The query has the part of the map that its prior allows.
+    The problem has the part of the map that its prior allows.
     """
-    images = query.photo.images
+    images = problem.photo.images
+    workers = means.workers
     # idle cores prepare the images that later steps need
-    with query.workers.beside(images.middle, images.fine, images.full, query.colors):
-        hypotheses: list[Hypothesis] = []
-        asked = query
-        for asked, attempt in plan_attempts(query):
-            hypotheses, is_enough = attempt(asked, hypotheses, watch)
+    with workers.beside(images.middle, images.fine, images.full, problem.colors):
+        candidates: list[Candidate] = []
+        asked = problem
+        for asked, attempt in plan_attempts(problem):
+            candidates, is_enough = attempt(asked, candidates, means)
             if is_enough:
                 break
-        hypotheses += search_beyond_prior(asked, scan_map, watch)
-        with watch.stage("refine"):
-            return fit_camera(asked, refine_best(asked, hypotheses))
+        candidates += search_beyond_prior(asked, scan_map, means)
+        with means.watch.stage("refine"):
+            return fit_camera(asked, refine_best(asked, candidates, workers), workers)
 
 
-def find_by_edges(query: Query, scan_map: ScanMap, watch: Stopwatch) -> Found:
+def find_by_edges(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     """Find the poses of a photo in a scan without colours, at one tilt of the camera after another."""
-    axes = find_axes(query.source)
+    axes = find_axes(problem.source)
     yaw_of_walls = scan_map.yaw_of_walls
-    level = align_level(query, axes, yaw_of_walls)
-    found = [find(level, scan_map, watch)]  # most cameras are about level
-    if not is_tilt_known(query) and not is_explained(found[0].selection, level):
-        with watch.stage("search"):
-            tilts = find_tilts(query, axes, yaw_of_walls)
-        found += [find(tilt, scan_map, watch) for tilt in tilts]
+    level = align_level(problem, axes, yaw_of_walls)
+    found = [find(level, scan_map, means)]  # most cameras are about level
+    if not is_tilt_known(problem) and not is_explained(found[0].selection, level):
+        with means.watch.stage("search"):
+            tilts = find_tilts(problem, axes, yaw_of_walls, means.effort, means.workers)
+        found += [find(tilt, scan_map, means) for tilt in tilts]
     best = max(found, key=lambda one: one.selection.best.score)
     if level.rotations is None or is_explained(best.selection, level):
         return best
-    in_any_heading = find(level.with_rotations(None), scan_map, watch)
+    in_any_heading = find(replace(level, rotations=None), scan_map, means)
     return max([best, in_any_heading], key=lambda one: one.selection.best.score)
 
 
-def fit_camera(query: Query, found: Selection) -> Found:
+def fit_camera(problem: Problem, found: Selection, workers: Workers) -> Found:
     """Compare what a photo says of its geometry with the scan, and refine the poses, unless they are faint.
 
     Photos of several cameras are taken as they say; so are edges, which lie beside those of the scan.
     """
-    if is_faint(query, found):
-        return Found(query, found, None)
-    if query.given.focal_prior is not None:
-        return Found(*calibrate(query, found))
-    if query.given.cameras or query.scan_map.has_shape:
-        return Found(query, found, None)
-    return Found(*calibrate_sphere(query, found))
+    if is_faint(problem.profile, found):
+        return Found(problem, found, None)
+    if problem.given.focal_prior is not None:
+        return Found(*calibrate(problem, found, workers))
+    if problem.given.cameras or problem.profile.has_shape:
+        return Found(problem, found, None)
+    return Found(*calibrate_sphere(problem, found, workers))
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:

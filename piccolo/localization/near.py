@@ -3,58 +3,63 @@
 from dataclasses import replace
 from typing import NamedTuple
 
-from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import Standing, posterior
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
-from .comparison import Comparison, compare, compare_from
+from ..jobs.threads import Workers
+from .candidate import Candidate, Selection
+from .comparison import compare_from
 from .covariance import UNKNOWN_ERRORS, estimate_covariance
-from .ladder import FULL, NEARLY, climb_from_afar, refine, settle
+from .examine import complete
+from .ladder import climb_from_afar, refine, settle
 from .last_descent import HOPELESS_SCORE
-from .query import Query
+from .prior import contradictions
+from .problem import Problem
 from .selection import assess_alone
-from .verification import verify
+from .stages import FULL, NEARLY
+from .verification import draw_near, verify
 
 
 class Near(NamedTuple):
     """A pose near one that was given, and how likely it is."""
 
-    pose: Pose  # in the map
-    seen: Comparison  # of the photo with the scan there
-    gaussian: PoseGaussian | None  # with its covariance; None where the points do not fix it
+    end: Candidate
+    gaussian: PoseGaussian | None  # the pose with its covariance; None where the points do not fix it
     probability: float  # that the pose is right
 
 
-def refine_near(query: Query, start: Pose) -> Near:
+def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
     """Descend from a pose and from poses around it, then on the points, and judge the end (`assess_end`).
 
     A partial photo converges slowly: its descent goes on.
     """
-    middle, seen_from = climb_from_afar(query, start)
-    pose = refine(query, middle, FULL).pose
-    seen = compare_from(query, pose, seen_from if pose.distance(seen_from) < NEARLY else pose)
-    end = Hypothesis(pose, seen.score)
-    if query.photo.is_partial:
-        end = settle(query, end, seen)
-        seen = seen if end.pose is pose else compare(query, end.pose)
+    middle, seen_from = climb_from_afar(problem, start, workers)
+    pose = refine(problem, middle, workers, FULL).pose
+    seen = compare_from(problem, pose, seen_from if pose.distance(seen_from) < NEARLY else pose)
+    end = Candidate(pose, seen.score, seen, contradictions(problem.scan_map, pose, problem.prior))
+    if problem.profile.is_partial:
+        end = settle(problem, end, workers)
     errors = UNKNOWN_ERRORS
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
-        errors = estimate_covariance(query, end.pose, seen, middle if sees_same else None)
+        errors = estimate_covariance(problem, end, workers, middle if sees_same else None)
     within = probability_within(errors.gaussian)
-    probability = float(posterior([assess_end(query, end)], errors.std_of_fit, within)[0])
-    return Near(end.pose, seen, errors.gaussian, probability)
+    standing = assess_end(problem, end, workers)
+    probability = float(posterior([standing], errors.std_of_fit, within)[0])
+    return Near(end, errors.gaussian, probability)
 
 
-def assess_end(query: Query, end: Hypothesis) -> Standing:
+def assess_end(problem: Problem, end: Candidate, workers: Workers) -> Standing:
     """Return the evidence for a pose by whole views; of a narrow photo by its matches there too.
 
     Matches do not count if they put the photo elsewhere, with photos beside or without.
     """
-    (standing,) = assess_alone(query.by_views(), [end])
-    if not query.is_narrow:
+    by_views = problem.by_views()
+    (standing,) = assess_alone(by_views.profile, complete(by_views, Selection(end, ()), workers).ranked)
+    if not problem.profile.is_narrow:
         return standing
-    found = [verify(some, end.pose) for some in (query, replace(query, beside=()))]
+    drawn = draw_near(problem, end.pose, end.drawn, workers).matches
+    found = [verify(some, end.pose, drawn) for some in (problem, replace(problem, beside=()))]
     own = [v.num_matches for v in found if RIGHT.holds(v.pose, end.pose)]
-    return standing._replace(num_matches=max(own, default=0), evidence=query.evidence)
+    return standing._replace(num_matches=max(own, default=0), evidence=problem.profile.evidence)

@@ -18,7 +18,8 @@ from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
 from .correlation import BLOCK, Samples, correlate_pairs, masked_correlation, weigh_by_area
 from .prior import allow_rotations
-from .query import Query
+from .problem import Problem
+from .settings import Effort
 
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB
@@ -173,25 +174,24 @@ def best_poses(scores: Samples, pool: int, least: np.float32 = LOWEST) -> tuple[
     return row, column, flat[top]
 
 
-def search_poses(query: Query, tilts: Tilts) -> Starts:
+def search_poses(problem: Problem, tilts: Tilts, effort: Effort, workers: Workers) -> Starts:
     """Search the sparse candidates with all rotations in two stages; return the distinct best.
 
     The first scores wide cells of all, by matrix products, the second the search grid's cells of the best
     poses. A photo of a part of the sphere has only the first, with the means subtracted.
     """
-    m = query.scan_map
-    settings = query.settings
-    rotations = list_rotations(query, tilts)
+    m = problem.scan_map
+    rotations = list_rotations(problem, tilts, effort)
     num_views = min(views_at_once(len(rotations)), len(m.sparse))
     num_bytes = len(rotations) * (len(make_grid(SEARCH_RINGS)) * TURNED_BYTES + 4 * num_views)
     task = f"a search of {len(m.sparse)} positions in {len(rotations)} rotations"
     check_memory(num_bytes, task, "set fewer num_yaws or num_rotations")
-    samples, validity = turn_panorama(query.photo.images.search(), rotations)
-    is_partial = query.photo.is_partial
+    samples, validity = turn_panorama(problem.photo.images.search(), rotations)
+    is_partial = problem.profile.is_partial
     enough = max(len(m.sparse) // CANDIDATES_PER_START, MIN_STARTS)
-    num_starts = settings.max_starts if is_partial else min(enough, settings.max_starts)
+    num_starts = effort.max_starts if is_partial else min(enough, effort.max_starts)
     pool = num_starts * POSES_PER_START
-    sparse, turn, _ = best_poses_wide(m, samples, validity, pool, query.workers, is_partial)
+    sparse, turn, _ = best_poses_wide(m, samples, validity, pool, workers, is_partial)
     candidate = m.sparse[sparse]
     R = rotations[turn]
     centers = m.centers[candidate]
@@ -203,25 +203,24 @@ def search_poses(query: Query, tilts: Tilts) -> Starts:
     scores = np.empty(len(kept), np.float32)
     used, row_of_turn = np.unique(turn[kept], return_inverse=True)
     panorama = weigh_by_area(samples[used], validity[used], make_grid(SEARCH_RINGS).solid_angle, 1)
-    row, views = m.views.at(candidate, query.workers)
+    row, views = m.views.at(candidate, workers)
     areas = whole_areas(SEARCH_RINGS)
     correlate_pairs(views.features, views.is_seen, areas, panorama, row, row_of_turn, scores)
     order = np.lexsort((turn[kept], candidate, -scores))
     return Starts(R[kept][order], centers[kept][order], candidate[order])
 
 
-def list_rotations(query: Query, tilts: Tilts) -> Array:
+def list_rotations(problem: Problem, tilts: Tilts, effort: Effort) -> Array:
     """Return the rotations (N, 3, 3), camera from map, to search: upright, about level, or all."""
-    R_map_from_world = query.scan_map.R_map_from_world
-    settings = query.settings
-    if query.rotations is not None:
-        rotations = query.rotations
+    R_map_from_world = problem.scan_map.R_map_from_world
+    if problem.rotations is not None:
+        rotations = problem.rotations
     elif tilts == "known":
-        rotations = query.photo.R_cam_from_level @ uniform_yaws(settings.num_yaws)
+        rotations = problem.photo.R_cam_from_level @ uniform_yaws(effort.num_yaws)
     elif tilts == "level":
         headings = 360.0 / NUM_LEVEL_YAWS * np.arange(NUM_LEVEL_YAWS)
         tilted = [R_cam_from_angles(heading, pitch, 0.0) for pitch in PITCHES_DEG for heading in headings]
-        rotations = query.photo.R_cam_from_level @ np.stack(tilted)
+        rotations = problem.photo.R_cam_from_level @ np.stack(tilted)
     else:
-        rotations = uniform_rotations(settings.num_rotations)
-    return allow_rotations(rotations @ R_map_from_world, settings.prior) @ R_map_from_world.T
+        rotations = uniform_rotations(effort.num_rotations)
+    return allow_rotations(rotations @ R_map_from_world, problem.prior) @ R_map_from_world.T

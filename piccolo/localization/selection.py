@@ -1,94 +1,91 @@
-"""Select the best pose by all evidence, and decide whether it is sure."""
+"""Choose the best candidate by all evidence, and decide whether it is sure: pure functions of candidates."""
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis, alternative_poses, sort_by_score
+from ..confidence.alternatives import alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
-from ..geometry.pose import Pose
-from .comparison import DRAWN_CHANCE, compare
-from .prior import contradictions
-from .query import Query
-from .settings import DRAWN_VIEW
-from .verification import SURE_MATCHES, count_each
+from .candidate import MAX_COMPARED, NOTHING, Candidate, Selection
+from .profile import Profile
 
-MAX_COMPARED = 8  # alternatives of the best pose
 FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
 SURE_ODDS = 3.0  # [log] least odds of the best pose against any elsewhere: 20 to 1
-CLEAR_SCORE = 0.3  # least score by whole views without features: see docs/METHOD.md
-CLEAR_SHAPE = 0.1  # least score by edges
 CLEAR_MARGIN = 0.5  # least margin by whole views
+CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
+SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do
+MIRROR_RATIO = 1.05  # least ratio of scores, mirrored photo to photo
+RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 
 
-@dataclass(frozen=True)
-class Selection:
-    """The best hypothesis, and the best ones elsewhere, best first."""
-
-    best: Hypothesis
-    alternatives: tuple[Hypothesis, ...]
-    rival_ratio: float = 0.0  # largest ratio of an alternative to the best, over what both views show
-
-    @property
-    def margin(self) -> float:
-        """Relative lead of the best, at least -1: the lesser of those by score and over both views."""
-        by_score = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
-        return max(1.0 - max(self.rival_ratio, by_score), -1.0)
-
-
-NOTHING = Selection(Hypothesis(Pose(np.eye(3), np.zeros(3)), -1.0), ())
-
-
-def rank(hypotheses: Sequence[Hypothesis]) -> Selection:
-    """Return the best hypothesis by score, and at most MAX_COMPARED elsewhere; NOTHING if there are none."""
-    if not hypotheses:
+def rank(candidates: Sequence[Candidate]) -> Selection:
+    """Return the best candidate by score, and at most MAX_COMPARED elsewhere; NOTHING if there are none."""
+    if not candidates:
         return NOTHING
-    best = sort_by_score(hypotheses)[0]
-    return Selection(best, tuple(alternative_poses(best.pose, hypotheses, count=MAX_COMPARED)))
+    best = sort_by_score(candidates)[0]
+    return Selection(best, tuple(alternative_poses(best, candidates, count=MAX_COMPARED)))
 
 
-def assess_poses(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Standing]:
-    """Return the evidence for the best pose and for others, compared over what both views show."""
-    at_best = compare(query, best.pose)
-    ratios = [1.0, *(compare(query, h.pose).compute_ratio(at_best) for h in others)]
-    return [s._replace(ratio=v) for s, v in zip(assess_alone(query, [best, *others]), ratios, strict=True)]
+def find_rivals(profile: Profile, ranked: Sequence[Candidate]) -> list[bool]:
+    """Return True for ranked candidates, the best first, whose matches count: there the scan is drawn.
 
-
-def assess_alone(query: Query, hypotheses: Sequence[Hypothesis]) -> list[Standing]:
-    """Return the evidence for each of several poses by itself, the best first.
-
-    Features are not counted for a pose that can't win. Poses that contradict the prior share the odds that
-    the prior is wrong.
+    A pose that explains far less than one with which many features agree can't win.
     """
-    is_wrong = [bool(contradictions(query.scan_map, h.pose, query.settings.prior)) for h in hypotheses]
+    if not profile.uses_matches:
+        return [False] * len(ranked)
+    best, *others = ranked
+    is_sure = (best.num_matches or 0) >= SURE_MATCHES
+    could_win = [not is_sure or h.score >= RIVAL_SCORE * best.score for h in others]
+    if profile.most_rivals is not None:
+        allowed = list(np.cumsum(could_win) <= profile.most_rivals)
+        could_win = [could and bool(allows) for could, allows in zip(could_win, allowed, strict=True)]
+    return [True, *could_win]
+
+
+def count_matches(profile: Profile, ranked: Sequence[Candidate]) -> list[int]:
+    """Return the matches of ranked candidates, the best first; 0 of those that can't win."""
+    counts = zip(ranked, find_rivals(profile, ranked), strict=True)
+    return [(h.num_matches or 0) if is_rival else 0 for h, is_rival in counts]
+
+
+def assess_alone(profile: Profile, ranked: Sequence[Candidate]) -> list[Standing]:
+    """Return the evidence for each of several candidates by itself, the best first.
+
+    Poses that contradict the prior share the odds that the prior is wrong.
+    """
+    is_wrong = [bool(h.contradicted) for h in ranked]
     log_prior = math.log(CONTRADICTED / max(sum(is_wrong), 1))
-    counts = count_each(query, hypotheses[0], hypotheses[1:])
+    counts = count_matches(profile, ranked)
     standings = []
-    for h, wrong, count in zip(hypotheses, is_wrong, counts, strict=True):
-        num_matches = count if query.uses_matches else None
+    for h, wrong, count in zip(ranked, is_wrong, counts, strict=True):
+        num_matches = count if profile.uses_matches else None
+        drawn = None if h.edge_score is None else h.edge_score * profile.discount
         of_prior = log_prior if wrong else 0.0
-        is_shape = query.evidence == "shape"
-        # of few blocks chance explains more
-        part = math.sqrt(query.photo.small.valid_share) if is_shape and query.photo.is_partial else 1.0
-        drawn = compare(query, h.pose, DRAWN_VIEW).score_beyond(DRAWN_CHANCE) * part if is_shape else None
-        standings.append(Standing(1.0, part * h.score, num_matches, query.evidence, of_prior, drawn))
+        score = profile.discount * h.score
+        standings.append(Standing(1.0, score, num_matches, profile.evidence, of_prior, drawn))
     return standings
 
 
-def select(query: Query, found: Selection) -> Selection:
-    """Select the pose with the greatest odds, each pair compared over what both views show.
+def assess(profile: Profile, found: Selection) -> list[Standing]:
+    """Return the evidence for the best candidate and for others, compared over what both views show."""
+    ratios = [1.0, *(h.seen.compute_ratio(found.best.seen) for h in found.alternatives)]
+    alone = assess_alone(profile, found.ranked)
+    return [standing._replace(ratio=ratio) for standing, ratio in zip(alone, ratios, strict=True)]
+
+
+def select(profile: Profile, found: Selection) -> Selection:
+    """Select the candidate with the greatest odds, each pair compared over what both views show.
 
     Each pair is compared over another part of the sphere, so three poses may beat each other in turn. The
     best is the one that is beaten least (minimax; Simpson 1969, Kramer 1977); the others follow by odds.
     """
     if not found.alternatives:
         return found
-    ranked = [found.best, *found.alternatives]
-    seen = [compare(query, h.pose) for h in ranked]
-    alone = assess_alone(query, ranked)
-    ratios = [[other.compute_ratio(one) for other in seen] for one in seen]
+    ranked = found.ranked
+    alone = assess_alone(profile, ranked)
+    ratios = [[other.seen.compute_ratio(one.seen) for other in ranked] for one in ranked]
     odds = np.array(
         [[log_odds(a._replace(ratio=v)) for a, v in zip(alone, row, strict=True)] for row in ratios]
     )
@@ -100,20 +97,48 @@ def select(query: Query, found: Selection) -> Selection:
     return Selection(ranked[best], tuple(ranked[k] for k in others), rival_ratio)
 
 
-def is_sure(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Return True if the best pose is not faint, and its matches and its odds end the search."""
-    ranked = rank(hypotheses)
-    if ranked.best.score < FAINT_SCORE:
-        return False
-    found = select(query, ranked)
-    best, *others = assess_poses(query, found.best, found.alternatives)
+def is_sure(profile: Profile, found: Selection) -> bool:
+    """Return True if the matches of the selected candidate and its odds against the others end the search."""
+    best, *others = assess(profile, found)
     if (best.num_matches or 0) < SURE_MATCHES:
         return False
     return all(log_odds(best) - log_odds(other) >= SURE_ODDS for other in others)
 
 
-def is_clear(query: Query, hypotheses: Sequence[Hypothesis]) -> bool:
-    """Return True if one pose alone explains a whole photo."""
-    found = select(query, rank(hypotheses))
-    least = CLEAR_SHAPE if query.scan_map.has_shape else CLEAR_SCORE
-    return found.best.score >= least and found.margin >= CLEAR_MARGIN
+def is_clear(profile: Profile, found: Selection) -> bool:
+    """Return True if one candidate alone explains a whole photo."""
+    return found.best.score >= profile.clear_score and found.margin >= CLEAR_MARGIN
+
+
+def is_faint(profile: Profile, found: Selection) -> bool:
+    """Return True if all are faint and no more features agree than by chance: refinement soon ends."""
+    if max(h.score for h in found.ranked) >= FAINT_SCORE:
+        return False
+    return max(count_matches(profile, found.ranked)) <= CHANCE_MATCHES
+
+
+def explains_more(mirrored: Candidate, own: Candidate) -> bool:
+    """Return True if a mirrored photo explains more; in a symmetric scene both are about equal."""
+    return mirrored.score > MIRROR_RATIO * own.score
+
+
+def is_mirrored(own: Candidate, mirrored: Candidate | None) -> bool:
+    """Return True if a photo fits better mirrored: a pose explains more, and more features agree with it."""
+    if mirrored is None or not explains_more(mirrored, own):
+        return False
+    return (mirrored.num_matches or 0) > (own.num_matches or 0)
+
+
+def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> list[Standing]:
+    """Give every copy of a place the greatest number of matches among the copies.
+
+    How many agree tells how well a copy was scanned, not which of them it is. So do edges: in a scan without
+    colours every copy has the best pose's evidence.
+    """
+    if standings[0].evidence == "shape":
+        best = standings[0]
+        credited = [best._replace(log_prior=s.log_prior) for s in standings]
+        return [c if copied else s for c, s, copied in zip(credited, standings, is_copy, strict=True)]
+    most = max((s.num_matches or 0 for s in compress(standings, is_copy)), default=0)
+    pairs = zip(standings, is_copy, strict=True)
+    return [s._replace(num_matches=most) if copied else s for s, copied in pairs]

@@ -18,7 +18,8 @@ from ..panorama.local_normalization import LEVELS_PER_UNIT
 from ..panorama.texels import Texels
 from ..views.view import Cells
 from .covariance import jackknife_gradients, sort_by_block, take
-from .ladder import Limits, to_levels
+from .ladder import to_levels
+from .stages import Limits
 
 FIRST_DAMPING = 1e-3
 RISE = 6.0  # of the damping, after a step that does not lower the loss

@@ -9,14 +9,18 @@ from ..arrays import Array
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws, yaw_rotation
 from ..geometry.sphere import find_cell, pixel_rays
+from ..jobs.threads import Workers
 from ..panorama.gpano import attitude_of_gravity
 from ..views.points_around import round_position
 from .attempts import FIRST_BEAM
-from .beam import brief_query, refine_starts, score_starts
+from .beam import refine_starts, score_starts
+from .candidate import Candidate, Selection
 from .comparison import FINE_VIEW, compare
-from .query import Cache, Query, prepare_query
+from .problem import Problem, prepare_problem
+from .profile import CLEAR_SHAPE, choose_profile
 from .search import search_poses
-from .selection import CLEAR_MARGIN, CLEAR_SHAPE, Selection
+from .selection import CLEAR_MARGIN
+from .settings import Effort
 
 NUM_TILTS = 3  # that are searched in full, at most
 # of what the scan shows at a pose, that it shows at a copy of that place too; chosen between panoramas of
@@ -25,13 +29,13 @@ LEAST_ALIKE = 0.5
 LEVEL_SINE = np.sin(np.radians(20.0))  # of the angle of level lines to the horizon, at most
 
 
-def is_tilt_known(query: Query) -> bool:
+def is_tilt_known(problem: Problem) -> bool:
     """Return True if the settings, or the photo, say how the camera was tilted."""
-    gravity = query.settings.gravity
-    return gravity == "known" or (query.source.gpano is not None and gravity != "unknown")
+    gravity = problem.gravity
+    return gravity == "known" or (problem.source.gpano is not None and gravity != "unknown")
 
 
-def is_explained(found: Selection, searched: Query) -> bool:
+def is_explained(found: Selection, searched: Problem) -> bool:
     """Return True if a pose explains a photo by its edges: one alone, unless lines lie along the walls."""
     is_alone = found.margin > CLEAR_MARGIN or searched.rotations is not None
     return found.best.score > CLEAR_SHAPE and is_alone
@@ -51,55 +55,68 @@ def align_lines(yaw_of_walls: float | None, axes: Sequence[Array], R_cam_from_le
     return np.stack([R_cam_from_level @ yaw_rotation(float(yaw)) for yaw in yaws])
 
 
-def align_level(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) -> Query:
-    """Return the query at the camera's tilt: level unless the photo says another."""
-    known = replace(query, settings=replace(query.settings, gravity="known"))
-    return known.with_rotations(align_lines(yaw_of_walls, axes, query.photo.R_cam_from_level))
+def align_level(problem: Problem, axes: Sequence[Array], yaw_of_walls: float | None) -> Problem:
+    """Return the problem at the camera's tilt: level unless the photo says another."""
+    rotations = align_lines(yaw_of_walls, axes, problem.photo.R_cam_from_level)
+    return replace(problem, gravity="known", rotations=rotations)
 
 
-def find_tilts(query: Query, axes: Sequence[Array], yaw_of_walls: float | None) -> list[Query]:
-    """Return queries with one of the axes (3,) of the photo's lines as vertical, those that fit best.
+def find_tilts(
+    problem: Problem,
+    axes: Sequence[Array],
+    yaw_of_walls: float | None,
+    effort: Effort,
+    workers: Workers,
+) -> list[Problem]:
+    """Return problems with one of the axes (3,) of the photo's lines as vertical, those that fit best.
 
     In a building the vertical is one of six directions of lines. Each is searched briefly.
     """
+    effort = effort.brief()
     tried = []
     for axis in axes:
         x, y, z = -axis
-        source = replace(query.source, gpano=attitude_of_gravity((float(x), float(y), float(z))))
-        turned = prepare_query(source, query.scan_map, query.settings, query.workers)
+        source = replace(problem.source, gpano=attitude_of_gravity((float(x), float(y), float(z))))
+        turned = prepare_problem(source, problem.scan_map, problem.prior, problem.gravity)
         tried.append(align_level(turned, axes, yaw_of_walls))
     scores = []
     for one in tried:
-        brief = brief_query(one)
-        scores.append(score_starts(brief, search_poses(brief, "known")))
+        starts = search_poses(one, "known", effort, workers)
+        scores.append(score_starts(one, starts, workers))
     ranked = sorted(range(len(tried)), key=lambda k: -scores[k])
     return [tried[k] for k in ranked[:NUM_TILTS]]
 
 
-def find_alike(query: Query, pose: Pose) -> list[Pose]:
+def find_alike(problem: Problem, pose: Pose, effort: Effort, workers: Workers) -> list[Pose]:
     """Return poses elsewhere at which the scan looks as at a pose, as between racks of one kind.
 
     The edges of the scan seen from the pose are searched in the scan, as if they were a photo.
     """
-    drawn = draw_scan(query, pose)
-    ends = refine_starts(drawn, search_poses(drawn, "known"), FIRST_BEAM)
+    drawn = draw_scan(problem, pose, effort.num_yaws)
+    starts = search_poses(drawn, "known", effort.brief(), workers)
+    ends = refine_starts(drawn, starts, FIRST_BEAM, workers)
     here = compare(drawn, pose)
 
-    def is_alike(other: Pose) -> bool:
-        is_elsewhere = not ONE_ANSWER.holds(other, pose)
-        return is_elsewhere and compare(drawn, other).compute_ratio(here) >= LEAST_ALIKE
+    def is_alike(other: Candidate) -> bool:
+        is_elsewhere = not ONE_ANSWER.holds(other.pose, pose)
+        return is_elsewhere and other.seen.compute_ratio(here) >= LEAST_ALIKE
 
-    return [end.pose for end in ends if is_alike(end.pose)]
+    return [end.pose for end in ends if is_alike(end)]
 
 
-def draw_scan(query: Query, pose: Pose) -> Query:
-    """Return a brief query in which the scan as seen from a pose takes the photo's place, at its tilt."""
-    sums = query.averages_at(pose, round_position(pose), FINE_VIEW)
-    shown = query.photo.panorama.is_valid
+def draw_scan(problem: Problem, pose: Pose, num_yaws: int) -> Problem:
+    """Return a problem in which the scan as seen from a pose takes the photo's place, at its tilt."""
+    sums = problem.averages_at(pose, round_position(pose), FINE_VIEW)
+    shown = problem.photo.panorama.is_valid
     rays = pixel_rays(shown.shape[1]) @ pose.R_cam_from_world
     cells = find_cell(rays.reshape(-1, 3).astype(np.float32), FINE_VIEW.num_rings).reshape(shown.shape)
     counts = sums[cells, 6:7]
     rgb = np.rint(255.0 * sums[cells, 3:6] / np.maximum(counts, 1.0)).astype(np.uint8)
-    photo = query.photo.take(replace(query.photo.panorama, rgb=rgb, is_valid=shown & (counts[..., 0] > 0.0)))
-    drawn = replace(brief_query(query), photo=photo, cache=Cache(query.cache.views))
-    return drawn.with_rotations(pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws))
+    is_valid = shown & (counts[..., 0] > 0.0)
+    photo = problem.photo.take(replace(problem.photo.panorama, rgb=rgb, is_valid=is_valid))
+    return replace(
+        problem,
+        photo=photo,
+        profile=choose_profile(photo.small.valid_share, photo.is_partial, has_shape=True),
+        rotations=pose.R_cam_from_world @ uniform_yaws(num_yaws),
+    )

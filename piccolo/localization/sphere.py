@@ -20,13 +20,13 @@ from ..camera.model import whole_sphere
 from ..confidence.claim import Claim
 from ..confidence.localization import SphereGeometry
 from ..geometry.pose import Pose
-from ..panorama import Panorama
-from .comparison import score_pose
-from .ladder import Limits
+from ..jobs.threads import Workers
+from .candidate import Selection
+from .examine import examine_each
 from .last_descent import refine_best
-from .query import Query, prepare_query
-from .selection import Selection
+from .problem import Problem
 from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, estimate_corrections, invert
+from .stages import Limits
 
 NO_CORRECTION = np.zeros(3)
 CLAIM = Claim(
@@ -107,85 +107,81 @@ def count_deviations(estimate: Estimate) -> float:
     return float((np.abs(estimate.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
-def calibrate_sphere(query: Query, found: Selection) -> tuple[Query, Selection, SphereFit]:
+def calibrate_sphere(
+    problem: Problem, found: Selection, workers: Workers
+) -> tuple[Problem, Selection, SphereFit]:
     """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
-    camera = whole_sphere(*query.given.rgb.shape[1::-1])
+    camera = whole_sphere(*problem.given.rgb.shape[1::-1])
     freedom = make_freedom(camera)
     ways = (
-        partial(descend_on_cells, query, found.best.pose, freedom, NO_CORRECTION, CHECK),
-        partial(descend_on_points, query, found.best.pose, freedom, HERE),
+        partial(descend_on_cells, problem, found.best.pose, freedom, NO_CORRECTION, CHECK),
+        partial(descend_on_points, problem, found.best.pose, freedom, HERE),
     )
-    estimate, here = query.workers.map(
-        lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama"
-    )
+    estimate, here = workers.map(lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama")
     is_suspect = count_deviations(estimate) > SUSPECT
-    other = retake_as_found(query, found, camera) if is_suspect else None
+    other = retake_as_found(problem, found, camera, workers) if is_suspect else None
     if other is not None:
         return other
     conflict = CLAIM.conflict(estimate.values, estimate.information)
     doubt = CLAIM.doubt(estimate.values, estimate.information)
-    return query, found, SphereFit(camera, here, True, conflict, doubt)
+    return problem, found, SphereFit(camera, here, True, conflict, doubt)
 
 
 def retake_as_found(
-    query: Query, found: Selection, claimed: Camera
-) -> tuple[Query, Selection, SphereFit] | None:
-    """Search other geometries; return the query with the one that explains clearly more, refined, or None."""
-    end = search_geometry(query, found.best.pose, claimed)
+    problem: Problem, found: Selection, claimed: Camera, workers: Workers
+) -> tuple[Problem, Selection, SphereFit] | None:
+    """Search other geometries; return the problem with one that explains clearly more, refined, or None."""
+    end = search_geometry(problem, found.best.pose, claimed, workers)
     if count_deviations(estimate_corrections(end, CURVATURE)) < CONTRADICTED:
         return None
-    given = query.given
+    given = problem.given
     camera = claimed
     best = found
     for _ in range(MOST_ROUNDS):
         camera = Corrections(Mount(camera)).apply(end.values)
-        query = retake(query, given, camera)
+        problem = problem.retake(given.retake(camera))
         others = [h.pose for h in best.alternatives]
-        scored = query.workers.map(partial(score_pose, query), [end.pose, *others], "compare")
-        best = refine_best(query, scored)
-        end = descend_on_points(query, best.best.pose, make_freedom(camera), FULL)
+        scored = examine_each(problem, [end.pose, *others], workers)
+        best = refine_best(problem, scored, workers)
+        end = descend_on_points(problem, best.best.pose, make_freedom(camera), FULL)
         if np.all(np.abs(end.values) < CLAIM.deviations):
             break
     if best.best.score < MIN_GAIN * found.best.score:
         return None
-    return query, best, SphereFit(camera, estimate_corrections(end, CURVATURE), is_claimed=False)
+    return problem, best, SphereFit(camera, estimate_corrections(end, CURVATURE), is_claimed=False)
 
 
-def descend_on_cells(query: Query, pose: Pose, freedom: Freedom, values: Array, limits: Limits) -> FreeEnd:
+def descend_on_cells(
+    problem: Problem, pose: Pose, freedom: Freedom, values: Array, limits: Limits
+) -> FreeEnd:
     """Descend on the fine cells that are seen from a pose."""
-    cells = query.view_at(pose, "fine")
-    return descend_freely(cells, query.photo.image("fine"), freedom, pose, values, limits)
+    cells = problem.view_at(pose, "fine")
+    return descend_freely(cells, problem.photo.image("fine"), freedom, pose, values, limits)
 
 
-def descend_on_points(query: Query, pose: Pose, freedom: Freedom, limits: Limits) -> FreeEnd:
+def descend_on_points(problem: Problem, pose: Pose, freedom: Freedom, limits: Limits) -> FreeEnd:
     """Descend on the points that are seen from a pose, in the finest image."""
-    points = query.view_at(pose, "points")
-    return descend_freely(points, query.photo.image("full"), freedom, pose, NO_CORRECTION, limits)
+    points = problem.view_at(pose, "points")
+    return descend_freely(points, problem.photo.image("full"), freedom, pose, NO_CORRECTION, limits)
 
 
-def search_geometry(query: Query, pose: Pose, claimed: Camera) -> FreeEnd:
+def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Workers) -> FreeEnd:
     """Search the corrections of a panorama from several starts, on coarse cells, then on finer ones."""
     freedom = make_freedom(claimed)
-    cells = query.view_at(pose, "middle")
+    cells = problem.view_at(pose, "middle")
 
     def begin(start: tuple[float, float]) -> FreeEnd:
         height, share = start
         horizon = share * max(1.0 - math.exp(-height), LEAST_CUT) * 0.5 * math.pi
         values = np.array([0.0, height, horizon])
-        return descend_freely(cells, query.photo.image("search"), freedom, pose, values, COARSE)
+        return descend_freely(cells, problem.photo.image("search"), freedom, pose, values, COARSE)
 
     def go_on(end: FreeEnd) -> FreeEnd:
-        middle = query.view_at(end.pose, "middle")
-        image = query.photo.image("middle")
+        middle = problem.view_at(end.pose, "middle")
+        image = problem.photo.image("middle")
         end = descend_freely(middle, image, freedom, end.pose, end.values, MIDDLE)
-        return descend_on_cells(query, end.pose, freedom, end.values, FINE)
+        return descend_on_cells(problem, end.pose, freedom, end.values, FINE)
 
     starts = list(itertools.product(HEIGHTS, HORIZONS))
-    ends = sorted(query.workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)
-    return min(query.workers.map(go_on, ends[:NUM_ENDS], "fit the panorama"), key=lambda end: end.loss)
-
-
-def retake(query: Query, given: Panorama, camera: Camera) -> Query:
-    """Prepare the query again with a panorama as it shows the sphere."""
-    fresh = prepare_query(given.retake(camera), query.scan_map, query.settings, query.workers)
-    return fresh if query.uses_matches else fresh.by_views()
+    ends = sorted(workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)
+    return min(workers.map(go_on, ends[:NUM_ENDS], "fit the panorama"), key=lambda end: end.loss)

@@ -15,29 +15,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Array32, Bytes
-from ..confidence.alternatives import Hypothesis
 from ..confidence.occlusion import EXPLAINED, occlusion_mask
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
+from ..jobs.threads import Workers
 from ..kernels.jit import kernel
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
-from .query import Query
+from .candidate import Drawn
+from .problem import Problem
+from .selection import CHANCE_MATCHES
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this
 AROUND = 12  # [px] around the photo that are drawn too: it moves when the pose is refined
 DISTINCT_RATIO = 0.8  # of the best distance to the second best elsewhere, at most (Lowe, 2004)
 COS_ELSEWHERE = np.float32(math.cos(math.radians(2.0)))
-CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
-SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do
-MOST_RIVALS = 4  # of a whole photo: the scan is drawn in four views for each, and further ones never won
-RIVAL_SCORE = 0.5  # least score of a pose that could win against a sure one, as a fraction of that one's
 COS_AGREE = math.cos(math.radians(0.5))  # matches with a smaller error agree
 LEAST_ERROR = 2e-3  # [rad] of a keypoint along an axis: a third of a pixel
 # of the covariance by matches with the drawn scan, whose errors are not independent: by 76 crops of three
@@ -60,54 +58,24 @@ class Verified(NamedTuple):
     num_matches: int
 
 
-def count_agreeing(query: Query, pose: Pose) -> int:
-    """Count the photo's local features that agree with a pose; 0 by whole views alone."""
-    if not query.uses_matches:
-        return 0
-    verified = verify(query, pose)
-    return verified.num_matches if CONFIRMED.holds(verified.pose, pose) else 0
-
-
-def list_rivals(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Return those of other poses, best first, that could win against the best: there the scan is drawn.
-
-    A pose that explains far less than one with which many features agree can't.
-    """
-    if not query.uses_matches:
-        return []
-    if count_agreeing(query, best.pose) >= SURE_MATCHES:
-        others = [h for h in others if h.score >= RIVAL_SCORE * best.score]
-    return list(others if query.photo.is_partial else others[:MOST_RIVALS])
-
-
-def count_each(query: Query, best: Hypothesis, others: Sequence[Hypothesis]) -> list[int]:
-    """Count the photo's features that agree with the best pose and with others; 0 of those that can't win."""
-    rivals = list_rivals(query, best, others)
-    poses = [h.pose for h in (best, *rivals)]
-    counts = query.workers.map(partial(count_agreeing, query), poses, "verify")
-    by_key = {pose.key: count for pose, count in zip(poses, counts, strict=True)}
-    return [by_key.get(h.pose.key, 0) for h in (best, *others)]
-
-
-def verify(query: Query, pose: Pose) -> Verified:
+def verify(problem: Problem, pose: Pose, drawn: Matches) -> Verified:
     """Find the pose that most matches near a pose agree with, and count these.
 
     The pose is fitted to all matches: with the scan drawn there, and with each of the photos beside. Those of
     the one picture with which most agree are counted. A wrong pose of a photo beside misleads this one.
     """
-    pictures = [matches_near(query, pose), *query.beside]
+    pictures = [drawn, *problem.beside]
     found = exact_pose(merge_matches(pictures), pose)
     if found is None:
         return Verified(pose, 0)
     return Verified(found.pose, max(count_matches(matches, found.pose, COS_AGREE) for matches in pictures))
 
 
-def place_by_matches(query: Query, pose: Pose) -> tuple[Pose, Array] | None:
+def place_by_matches(pose: Pose, matches: Matches) -> tuple[Pose, Array] | None:
     """Return the pose near another with which most matches with the drawn scan agree, and its covariance.
 
     None if no more agree than by chance. The covariance (6, 6) is as of `PoseGaussian`.
     """
-    matches = matches_near(query, pose)
     found = exact_pose(matches, pose)
     if found is None or found.num_matches <= CHANCE_MATCHES or not CONFIRMED.holds(found.pose, pose):
         return None
@@ -124,69 +92,71 @@ def match_covariance(matches: Matches, pose: Pose) -> Array:
     return np.asarray(variance * np.linalg.inv(information + LOOSE * np.eye(6)))
 
 
-def matches_near(query: Query, pose: Pose) -> Matches:
-    """Return the matches with the scan drawn near a pose, on a grid of poses; cached by the grid."""
+def draw_near(problem: Problem, pose: Pose, known: Drawn | None, workers: Workers) -> Drawn:
+    """Match the photo's features with the scan drawn near a pose, on a grid of poses.
+
+    `known` are those near another pose: the same if it is near enough.
+    """
     place = np.rint(pose.center_world / PLACE)
     turn = np.rint(log_so3(pose.R_cam_from_world) / TURN)
     key = np.concatenate([place, turn]).astype(np.int64).tobytes()
-    if key not in query.cache.matches:
-        query.cache.matches[key] = match_drawn(query, Pose(exp_so3(turn * TURN), place * PLACE))
-    matches: Matches = query.cache.matches[key]
-    return matches
+    if known is not None and known.key == key:
+        return known
+    return Drawn(key, match_drawn(problem, Pose(exp_so3(turn * TURN), place * PLACE), workers))
 
 
-def match_drawn(query: Query, pose: Pose) -> Matches:
+def match_drawn(problem: Problem, pose: Pose, workers: Workers) -> Matches:
     """Draw the scan at a pose in the map, and match the photo's features with those of the picture."""
-    return match_located(query.photo.seen().keypoints, find_all_drawn(query, pose))
+    return match_located(problem.photo.seen(workers).keypoints, find_all_drawn(problem, pose, workers))
 
 
-def find_all_drawn(query: Query, pose: Pose) -> Located:
+def find_all_drawn(problem: Problem, pose: Pose, workers: Workers) -> Located:
     """Draw all that the photo would show at a pose in the map; return the keypoints."""
-    parts = query.workers.map(partial(find_drawn, query, pose), query.photo.seen().views, "draw")
+    parts = workers.map(partial(find_drawn, problem, pose), problem.photo.seen(workers).views, "draw")
     ranges = np.concatenate([ranges for _, ranges in parts])
     return Located(join_keypoints([keypoints for keypoints, _ in parts]), ranges, pose)
 
 
-def find_copies(query: Query, pose: Pose, others: Sequence[Pose]) -> list[bool]:
+def find_copies(problem: Problem, pose: Pose, others: Sequence[Pose], workers: Workers) -> list[bool]:
     """Return True for each of other poses at which the scan looks as at a pose, as in rooms of one kind.
 
     The scan drawn at the one is matched with the scan drawn at the other.
     """
     if not others:
         return []
-    keypoints = find_all_drawn(query, pose).keypoints
+    keypoints = find_all_drawn(problem, pose, workers).keypoints
 
     def is_copy(other: Pose) -> bool:
-        found = exact_pose(match_located(keypoints, find_all_drawn(query, other)), other)
+        found = exact_pose(match_located(keypoints, find_all_drawn(problem, other, workers)), other)
         return found is not None and CONFIRMED.holds(found.pose, other)
 
-    return query.workers.map(is_copy, others, "compare places")
+    return workers.map(is_copy, others, "compare places")
 
 
-def place_keypoints(query: Query, pose: Pose) -> Located:
+def place_keypoints(problem: Problem, pose: Pose, workers: Workers) -> Located:
     """Give the keypoints of a photo that was taken at a pose in the map their ranges, from the scan.
 
     Those on what the scan does not show, as people and furniture that has moved, are left out.
     """
-    views, keypoints = query.photo.seen()
-    panorama = query.photo.panorama
-    mask = occlusion_mask(query.surroundings_at(pose)[0], panorama, pose)
+    views, keypoints = problem.photo.seen(workers)
+    panorama = problem.photo.panorama
+    mask = occlusion_mask(problem.surroundings_at(pose)[0], panorama, pose)
     keypoints = keypoints.take(mask[compute_indices(keypoints.rays, mask.shape[1])] == EXPLAINED)
     ranges = np.zeros(len(keypoints.rays), np.float32)
     for view in views:
         shown = view.find_own(keypoints.rays)
-        ranges[shown] = draw(query, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
+        ranges[shown] = draw(problem, pose, view)[0].ranges[view.project(keypoints.rays[shown])]
     is_seen = np.flatnonzero(ranges > 0.0)
     return Located(keypoints.take(is_seen), ranges[is_seen], pose)
 
 
-def match_beside(query: Query, other: Located) -> Matches:
+def match_beside(problem: Problem, other: Located, workers: Workers) -> Matches:
     """Match a photo's features with those of another photo.
 
     What both show in the same direction is left out: it may be carried along, as dirt on a lens is. There
     are no matches if the mirrored photo has more.
     """
-    own = query.photo.seen().keypoints
+    own = problem.photo.seen(workers).keypoints
     mine, theirs = match_pictures(own, other.keypoints)
     if len(mine) < LEAST_MATCHES or len(match_pictures(own.mirror(), other.keypoints)[0]) > len(mine):
         return NO_MATCHES
@@ -220,17 +190,17 @@ def pair(own: Keypoints, mine: NDArray[np.intp], picture: Located, theirs: NDArr
     )
 
 
-def draw(query: Query, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
+def draw(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[ViewImage, Bytes]:
     """Draw what a view of a photo would show at a pose, and a little around; return also its mask."""
-    mask = view.cut_mask(add_margin(query.photo.panorama.is_valid))
+    mask = view.cut_mask(add_margin(problem.photo.panorama.is_valid))
     shown = cv2.dilate(mask, np.ones((2 * AROUND + 1,) * 2, np.uint8))
     turned = Pose(view.R_sphere_from_view.T @ pose.R_cam_from_world, pose.center_world)
-    return render_gray(query.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
+    return render_gray(problem.scan_map.octree, turned, shown > 0, view.focal), np.asarray(shown, np.uint8)
 
 
-def find_drawn(query: Query, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, Array32]:
+def find_drawn(problem: Problem, pose: Pose, view: PerspectiveView) -> tuple[Keypoints, Array32]:
     """Draw what a view of the photo would show at a pose; return the keypoints, and their ranges (N,) [m]."""
-    image, shown = draw(query, pose, view)
+    image, shown = draw(problem, pose, view)
     found = find_in_view(image.gray, np.where(image.is_filled, shown, np.uint8(0)), view)
     ranges = image.ranges[view.project(found.rays)]
     is_seen = np.flatnonzero(ranges > 0.0)

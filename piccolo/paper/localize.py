@@ -234,7 +234,7 @@ def evaluate(
     """Return the evidence at the best pose, and the alternatives, best first."""
     at_pose = measure_agreement(points, panorama, best.pose)
     others = [Hypothesis(r.pose, measure_agreement(points, panorama, r.pose).score) for r in refined]
-    others = alternative_poses(best.pose, others)
+    others = alternative_poses(Hypothesis(best.pose, at_pose.score), others)
     explained, contradicted = compare_occlusion(points, panorama, best.pose).fractions()
     evidence = Evidence(
         score=at_pose.score,

@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
-from ..localization.comparison import Comparison
+from ..localization.candidate import Candidate
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 
@@ -41,7 +41,7 @@ class State:
     log_odds: float  # against none of the frame's poses being right
     score: float | None = None  # as of Evidence; None of a pose that was not refined
     gaussian: PoseGaussian | None = None  # the pose with its covariance, in the map
-    seen: Comparison | None = None  # where the photo was tracked to; None of one that was searched
+    end: Candidate | None = None  # where the photo was tracked to; None of one that was searched
     gain: float = 0.0  # [log] of one that was found among the few places within reach
 
     @property

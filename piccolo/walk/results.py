@@ -25,7 +25,7 @@ from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..jobs.threads import Progress, no_progress, one_blas_thread
 from ..localization.judge import decide, take_pose
 from ..localization.prior import contradictions
-from ..localization.query import Query
+from ..localization.problem import Problem
 from .frames import Frame
 from .path import EVEN, Belief, Gap, Path, believe, build_lattice
 from .tracker import Expected, Followed, Tracker, find_near, refine_state
@@ -33,7 +33,7 @@ from .tracker import Expected, Followed, Tracker, find_near, refine_state
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
 LEAST_RATIOS = 4  # of distances; fewer say nothing
 TOLD_SCALE = 0.03  # error of an odometry's scale that is reported
-Find = Callable[[Query], Followed | None]
+Find = Callable[[Problem], Followed | None]
 
 
 @dataclass(frozen=True)
@@ -244,21 +244,23 @@ def _list_rough(tracker: Tracker, path: Path, k: int) -> list[int]:
 def _refine(tracker: Tracker, path: Path, k: int) -> None:
     """Refine the likely places of a key frame."""
     frame = tracker.frames[k]
-    query = tracker.query_of(k)
+    problem = tracker.problem_of(k)
     for rough in [frame.states[j] for j in _list_rough(tracker, path, k)]:
-        others = [state for state in frame.states if state is not rough]
-        frame.states = others if query is None else refine_state(query, frame.states, rough)
+        if problem is None:
+            frame.states = [state for state in frame.states if state is not rough]
+        else:
+            frame.states = refine_state(problem, frame.states, rough, tracker.workers)
 
 
 def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int) -> None:
     """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
     frames = tracker.frames
     ways = _list_ways(tracker, beliefs, k)
-    query = tracker.query_of(k) if ways else None
-    if query is None:
+    problem = tracker.problem_of(k) if ways else None
+    if problem is None:
         return
     for begin, find in ways:
-        found = find(query)
+        found = find(problem)
         if found is None or not _is_walked(tracker, beliefs, k, found.state.pose):
             continue
         if found.is_alone or found.how == "tracked":
@@ -283,7 +285,7 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Belief], k: int) -> list[tupl
     ways: list[tuple[int, Find]] = []
     if frame.key is not None and belief.expected is not None:
         expected = Expected(belief.expected, tracker.motion.reach(0.0), belief.expected)
-        ways = [(frame.key, partial(find_near, expected=expected))]
+        ways = [(frame.key, partial(find_near, expected=expected, means=tracker.means))]
     if not belief.is_sure and (sides := _list_sure(tracker.frames, beliefs, k)):
         near = [(m, beliefs[m].states[0].pose) for m in sides[0]]
         ways.append((sides[0][0], partial(tracker.find, frame=frame, near=near)))

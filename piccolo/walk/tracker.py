@@ -8,21 +8,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import MODELS, Standing, pose_features, posterior
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
 from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..localization.attempts import is_whole
-from ..localization.beam import Ends, brief_query, descend_briefly, score_briefly, score_mirror, score_near
-from ..localization.comparison import compare
+from ..localization.attempts import Means, is_whole
+from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
+from ..localization.candidate import Selection
+from ..localization.examine import complete, examine
 from ..localization.localize import localize
 from ..localization.near import refine_near
 from ..localization.prior import apply_prior
-from ..localization.query import Cache, Query, prepare_query
-from ..localization.selection import assess_alone
-from ..localization.settings import CoarseToFineSettings
-from ..localization.verification import match_beside, place_keypoints, verify
+from ..localization.problem import Problem, prepare_problem
+from ..localization.selection import assess
+from ..localization.settings import CoarseToFineSettings, Effort
+from ..localization.verification import draw_near, match_beside, place_keypoints, verify
 from ..panorama import Panorama
 from ..scan_map.camera_positions import FreeSpace
 from ..scan_map.scan_map import ScanMap
@@ -44,7 +44,7 @@ from .path import COPY_LOG_ODDS, EVEN, Lattice
 Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
-NUM_QUERIES = 4  # are kept, of the frames that were asked for last
+NUM_KEPT = 4  # problems, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
@@ -78,7 +78,8 @@ class Tracker:
         self.motion: Motion = motion
         self.lattice: Lattice = Lattice(FreeSpace(scan_map.octree, scan_map.centers, workers), motion)
         self.read: Read = lambda k: None  # until somebody keeps the pictures
-        self.queries: dict[int, Query] = {}  # by the number of the frame
+        self.means = Means(settings.effort, workers, Stopwatch())
+        self.problems: dict[int, Problem] = {}  # by the number of the frame
         self.found_at: float = -math.inf  # time when it was last found; before that, of the first search
         self.next_search: float = 0.0  # [m] reach since then at which all places are searched again
 
@@ -91,32 +92,33 @@ class Tracker:
         """Use the numbers of frames as times, from the first frame on: only their order is known."""
         self.motion = self.lattice.motion = replace(self.motion, is_timed=False)
 
-    def prepare(self, panorama: Panorama) -> Query:
-        """Prepare the query of a frame, with the images that its descents need."""
-        query = prepare_query(panorama, self.scan_map, self.settings, self.workers)
-        for image in query.photo.images:
+    def prepare(self, panorama: Panorama) -> Problem:
+        """Prepare the problem of a frame, with the images that its descents need."""
+        settings = self.settings
+        problem = prepare_problem(panorama, self.scan_map, settings.prior, settings.gravity)
+        for image in problem.photo.images:
             image()
-        return query
+        return problem
 
     @one_blas_thread()
-    def add(self, panorama: Panorama, query: Query, time: float, odometry: Pose | None = None) -> Frame:
-        """Localize the next frame, whose query is prepared; the first one waits until free space is known."""
+    def add(self, panorama: Panorama, problem: Problem, time: float, odometry: Pose | None = None) -> Frame:
+        """Localize the next frame, whose problem is prepared; the first waits until free space is known."""
         frame = Frame(time, odometry=odometry)
         if panorama.is_valid.any() and len(self.scan_map.centers) > 0:
-            self._keep(len(self.frames), query)
+            self._keep(len(self.frames), problem)
             self.lattice.space.prepare()
             is_known = odometry is not None or not self.frames
             is_far = not is_known and self.motion.reach(time - self.frames[-1].time) > ELSEWHERE
             if not is_far:
-                self._follow(query, frame)
+                self._follow(problem, frame)
             if is_far or (not frame.states and self.motion.reach(time - self.found_at) >= self.next_search):
-                self._search(query, panorama, frame)
+                self._search(problem, panorama, frame)
             elif frame.states and self._is_telling(frame):
-                frame.states = list_key_states(query, frame.states)
+                frame.states = list_key_states(problem, frame.states, self.means)
                 frame.is_key = True
         self.lattice.add(frame)
         if frame.is_key:
-            self._depart(query, frame)
+            self._depart(problem, frame)
         self._note(frame)
         return frame
 
@@ -139,14 +141,14 @@ class Tracker:
         begin = None if frame.key is None else self.frames[frame.key].tracking_pose
         return begin is None or frame.arrived is None or frame.arrived.distance(begin) >= BETWEEN_KEYS
 
-    def _follow(self, query: Query, frame: Frame) -> None:
+    def _follow(self, problem: Problem, frame: Frame) -> None:
         """Find a frame from the last one that was found."""
         key = self._last_key()
         if key is None:
             return
         since = [key, *(k for k in range(key + 1, len(self.frames)) if self.frames[k].key == key)]
         near = [(k, pose) for k in since[:-3:-1] if (pose := self.frames[k].tracking_pose)]
-        found = self.find(query, frame, near)
+        found = self.find(problem, frame, near)
         if found is None:
             return
         frame.states = [found.state]
@@ -155,53 +157,54 @@ class Tracker:
             frame.arrived = found.state.pose
             frame.key = key
 
-    def find(self, query: Query, frame: Frame, near: Sequence[tuple[int, Pose]]) -> Followed | None:
+    def find(self, problem: Problem, frame: Frame, near: Sequence[tuple[int, Pose]]) -> Followed | None:
         """Find a frame from others, the last of them first, by their numbers and poses.
 
         A narrow photo is matched with those of them that are sure by themselves.
         """
-        if query.is_narrow:
+        if problem.profile.is_narrow:
             sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= MOST_EXPECTED]
-            others = [(other, pose) for k, pose in sure if (other := self.query_of(k))]
-            located = (place_keypoints(*other) for other in others)
-            query = replace(query, beside=tuple(match_beside(query, one) for one in located))
-        return find_near(query, expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion))
+            others = [(other, pose) for k, pose in sure if (other := self.problem_of(k))]
+            located = (place_keypoints(*other, self.workers) for other in others)
+            beside = tuple(match_beside(problem, one, self.workers) for one in located)
+            problem = replace(problem, beside=beside)
+        expected = expect(frame, [(self.frames[k], pose) for k, pose in near], self.motion)
+        return find_near(problem, expected, self.means)
 
-    def query_of(self, k: int) -> Query | None:
-        """Return a frame's query, as new; None if its picture can't be read or shows nothing."""
-        query = self.queries.pop(k, None)
-        if query is None:
+    def problem_of(self, k: int) -> Problem | None:
+        """Return a frame's problem; None if its picture can't be read or shows nothing."""
+        problem = self.problems.pop(k, None)
+        if problem is None:
             panorama = self.read(k)
             if panorama is None or not panorama.is_valid.any():
                 return None
-            query = self.prepare(panorama)
-        self._keep(k, query)
-        return replace(query, cache=Cache(query.cache.views))
+            problem = self.prepare(panorama)
+        self._keep(k, problem)
+        return problem
 
-    def _keep(self, k: int, query: Query) -> None:
-        """Keep the query of a narrow photo among the last few."""
-        if query.is_narrow:
-            self.queries[k] = query
-        for old in list(self.queries)[:-NUM_QUERIES]:
-            del self.queries[old]
+    def _keep(self, k: int, problem: Problem) -> None:
+        """Keep the problem of a narrow photo among the last few."""
+        if problem.profile.is_narrow:
+            self.problems[k] = problem
+        for old in list(self.problems)[:-NUM_KEPT]:
+            del self.problems[old]
 
     def _last_key(self) -> int | None:
         """Return the number of the last key frame that can be tracked from."""
         numbers = (column.number for column in reversed(self.lattice.columns))
         return next((k for k in numbers if self.frames[k].departed is not None), None)
 
-    def _search(self, query: Query, panorama: Panorama, frame: Frame) -> None:
+    def _search(self, problem: Problem, panorama: Panorama, frame: Frame) -> None:
         """Search the whole scan for a frame, which is then a key frame."""
         frame.alone = localize(self.scan_map, panorama, self.settings, self.workers, Stopwatch())
         is_sure = frame.is_localized_alone
-        brief = brief_query(query)
-        is_mirrored = not is_sure and is_whole(query) and score_mirror(brief) > score_briefly(brief)
+        is_mirrored = not is_sure and is_whole(problem) and fits_mirror(problem, self.means)
         if found := [] if is_mirrored else list_states(self.scan_map, frame.alone):
             frame.how = "alone"
-            frame.states = list_key_states(query, found[:1] if is_sure else found, is_sure)
+            frame.states = list_key_states(problem, found[:1] if is_sure else found, self.means, is_sure)
             frame.is_key = True
 
-    def _depart(self, query: Query, frame: Frame) -> None:
+    def _depart(self, problem: Problem, frame: Frame) -> None:
         """Refine the likeliest place of a key frame: if it is likely, the next frames are tracked from it.
 
         Of places about as likely, as copies are, it is the one that looks best.
@@ -212,7 +215,7 @@ class Tracker:
             likeliest = max(compress(frame.states, is_likely), key=lambda state: state.log_odds)
             if likeliest.is_refined:
                 break
-            frame.states = refine_state(query, frame.states, likeliest)
+            frame.states = refine_state(problem, frame.states, likeliest, self.workers)
             self.lattice.change_last()
         frame.departed = likeliest.pose if probabilities.sum() > EVEN else None
         if likeliest is not frame.states[0]:
@@ -220,7 +223,16 @@ class Tracker:
             self.lattice.change_last()
 
 
-def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -> list[State]:
+def fits_mirror(problem: Problem, means: Means) -> bool:
+    """Return True if the mirrored photo has the better pose by brief searches."""
+    effort = means.effort.brief()
+    own = score_briefly(problem, effort, means.workers)
+    return score_mirror(problem, effort, means.workers) > own
+
+
+def list_key_states(
+    problem: Problem, own: Sequence[State], means: Means, is_sure: bool = False
+) -> list[State]:
     """List the states of a key frame: the poses that were found for it, best first, and all other places.
 
     If the photo is sure by itself, other places get the lowest odds that one frame may give.
@@ -229,7 +241,7 @@ def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -
     limit = -MOST_ODDS - COPY_LOG_ODDS if is_sure else 0.0
     rough = [
         State(pose, best.log_odds + min(behind, limit))
-        for pose, behind in find_places(query, best.pose)
+        for pose, behind in find_places(problem, best.pose, means)
         if not any(ONE_PLACE.holds(pose, state.pose) for state in own)
     ]
     states: list[State] = []
@@ -239,20 +251,19 @@ def list_key_states(query: Query, own: Sequence[State], is_sure: bool = False) -
     return states[:MOST_PLACES]
 
 
-def refine_state(query: Query, states: Sequence[State], rough: State) -> list[State]:
+def refine_state(problem: Problem, states: Sequence[State], rough: State, workers: Workers) -> list[State]:
     """Refine a rough state; its odds are then relative to those of the best refined one, by whole views.
 
     It is dropped if a frame would not be tracked there, or has that pose already.
     """
     best = max((s for s in states if s.is_refined), key=lambda s: s.log_odds)
-    end = track(query, rough.pose)
+    end = track(problem, rough.pose, workers)
     others = [s for s in states if s is not rough]
     if end is None or any(s.is_refined and ONE_ANSWER.holds(s.pose, end.pose) for s in others):
         return others
-    ends = [Hypothesis(s.pose, s.score or 0.0) for s in (best, end)]
-    at_best, at_end = (s.seen or compare(query, s.pose) for s in (best, end))
-    standings = assess_alone(query.by_views(), ends)
-    standings[1] = standings[1]._replace(ratio=at_end.compute_ratio(at_best))
+    by_views = problem.by_views()
+    ends = [s.end or replace(examine(by_views, s.pose), score=s.score or 0.0) for s in (best, end)]
+    standings = assess(by_views.profile, complete(by_views, Selection(ends[0], (ends[1],)), workers))
     first, second = posterior(standings, None)[:2]
     return put_state(others, replace(end, log_odds=best.log_odds + log_ratio(float(second), float(first))))
 
@@ -283,7 +294,7 @@ def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pos
     return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
 
 
-def find_near(query: Query, expected: Expected) -> Followed | None:
+def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | None:
     """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 
     Else, or if that fails, it is tracked from that place. An end away from the expected pose counts only if
@@ -291,36 +302,37 @@ def find_near(query: Query, expected: Expected) -> Followed | None:
     last with a narrow photo, of which views tell little. None if none holds, or if the mirrored photo fits
     better.
     """
-    near = query_near(query, expected.last, expected.reach)
-    ends = descend_briefly(near)
-    if not query.photo.is_partial and score_mirror(near) > ends.best_score:
+    near, effort = narrow_down(problem, expected.last, expected.reach, means.effort)
+    workers = means.workers
+    ends = descend_briefly(near, effort, workers)
+    if not problem.profile.is_partial and score_mirror(near, effort, workers) > ends.best_score:
         return None
-    score = score_near(query, expected.pose)
+    score = score_near(problem, expected.pose, workers)
     best_score = max(ends.best_score, score)
-    is_alike = log_behind(query, score, best_score) > -COPY_LOG_ODDS
-    places = [pose for pose, behind in list_places(query, ends, best_score) if behind > -COPY_LOG_ODDS]
+    is_alike = log_behind(problem, score, best_score) > -COPY_LOG_ODDS
+    places = [pose for pose, behind in list_places(problem, ends, best_score) if behind > -COPY_LOG_ODDS]
     alike = [pose for pose in places if pose.distance(expected.last) <= expected.reach]
     starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
-    found = (track(query, start) for start in starts)
+    found = (track(problem, start, workers) for start in starts)
     end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
-    if end is None and not is_alike and query.is_narrow:
-        last = track(query, expected.pose)
+    if end is None and not is_alike and problem.profile.is_narrow:
+        last = track(problem, expected.pose, workers)
         is_sure = last is not None and last.log_odds >= MOST_EXPECTED and is_acceptable(last, expected)
         end = last if is_sure else None
     if end is None:
         return None
     how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
-    state = replace(end, gain=compute_gain(query, near))
+    state = replace(end, gain=compute_gain(problem, near))
     return Followed(state, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
 
 
-def compute_gain(query: Query, near: Query) -> float:
+def compute_gain(problem: Problem, near: Problem) -> float:
     """Return what a frame gains [log] if it is found among some places: the fewer, the less it is by chance.
 
     A narrow photo gains nothing: it may look the same at two poses near each other.
     """
-    share = len(near.scan_map.sparse) / len(query.scan_map.sparse)
-    return 0.0 if query.photo.is_partial else min(-math.log(share), MOST_EXPECTED)
+    share = len(near.scan_map.sparse) / len(problem.scan_map.sparse)
+    return 0.0 if problem.profile.is_partial else min(-math.log(share), MOST_EXPECTED)
 
 
 def is_acceptable(state: State, expected: Expected) -> bool:
@@ -329,47 +341,53 @@ def is_acceptable(state: State, expected: Expected) -> bool:
     return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
-def track(query: Query, start: Pose) -> State | None:
+def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
     """Refine a pose; None if the end more likely is wrong than right, or explains nothing.
 
     A narrow photo is tracked again from where its matches put it.
     """
-    ends = [refine_near(query, start)]
-    if query.is_narrow:
-        ends.append(refine_near(query, verify(query, ends[0].pose).pose))
-    odds = [log_odds_of_place(end.probability, end.probability, end.gaussian) for end in ends]
+    ends = [refine_near(problem, start, workers)]
+    if problem.profile.is_narrow:
+        first = ends[0].end
+        drawn = draw_near(problem, first.pose, first.drawn, workers).matches
+        ends.append(refine_near(problem, verify(problem, first.pose, drawn).pose, workers))
+    odds = [log_odds_of_place(near.probability, near.probability, near.gaussian) for near in ends]
     best = int(np.argmax(odds))
-    end = ends[best]
-    is_wrong = odds[best] < 0.0 or end.seen.score < LEAST_SCORE
-    return None if is_wrong else State(end.pose, odds[best], end.seen.score, end.gaussian, end.seen)
+    end, gaussian, _ = ends[best]
+    is_wrong = odds[best] < 0.0 or end.score < LEAST_SCORE
+    return None if is_wrong else State(end.pose, odds[best], end.score, gaussian, end.forget())
 
 
-def query_near(query: Query, pose: Pose, radius: float) -> Query:
-    """Return the query of whole views that searches within a radius [m] of a pose: its tilt, any heading."""
-    m = query.scan_map
+def narrow_down(problem: Problem, pose: Pose, radius: float, effort: Effort) -> tuple[Problem, Effort]:
+    """Return the problem of whole views within a radius [m] of a pose, in its tilt and any heading.
+
+    Return also the effort of its brief search.
+    """
+    m = problem.scan_map
     distances = np.linalg.norm(m.centers[m.sparse] - pose.center_world, axis=1)
     near = m if math.isinf(radius) else m.narrow(distances <= max(radius, float(distances.min())))
-    level = pose.R_cam_from_world @ uniform_yaws(query.settings.num_yaws)
-    close = replace(query.by_views(), scan_map=near, cache=Cache(query.cache.views), rotations=level)
-    return brief_query(close, max(len(near.sparse), 1))
+    level = pose.R_cam_from_world @ uniform_yaws(effort.num_yaws)
+    close = replace(problem.by_views(), scan_map=near, rotations=level)
+    return close, effort.brief(max(len(near.sparse), 1))
 
 
-def find_places(query: Query, own: Pose) -> list[Place]:
+def find_places(problem: Problem, own: Pose, means: Means) -> list[Place]:
     """Find the distinct poses, of the tilt of its own, that look like a photo beside that; best first."""
-    ends = descend_briefly(query_near(query, own, math.inf))
-    return list_places(query, ends, score_near(query, own))
+    close, effort = narrow_down(problem, own, math.inf, means.effort)
+    ends = descend_briefly(close, effort, means.workers)
+    return list_places(problem, ends, score_near(problem, own, means.workers))
 
 
-def list_places(query: Query, ends: Ends, own_score: float) -> list[Place]:
+def list_places(problem: Problem, ends: Ends, own_score: float) -> list[Place]:
     """List the distinct ends with their odds to a pose of a score."""
     R, centers = ends.poses.R_cam_from_map, ends.poses.center_map
     kept = non_maximum_suppression(R, centers, MOST_PLACES, ONE_ANSWER)
     found = zip(ends.poses.take(kept).poses(), ends.scores[kept], strict=True)
-    return [(pose, log_behind(query, float(score), own_score)) for pose, score in found]
+    return [(pose, log_behind(problem, float(score), own_score)) for pose, score in found]
 
 
-def log_behind(query: Query, score: float, own_score: float) -> float:
+def log_behind(problem: Problem, score: float, own_score: float) -> float:
     """Return the log odds of a pose against another by their scores, at most 0, by the model of views."""
-    standing = Standing(score / max(own_score, 1e-9), 1.0, None, query.by_views().evidence)
+    standing = Standing(score / max(own_score, 1e-9), 1.0, None, problem.profile.by_views().evidence)
     weight = MODELS[standing.evidence].weights[0]
     return min(weight * float(pose_features(standing)[0]), 0.0)

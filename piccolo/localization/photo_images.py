@@ -26,7 +26,8 @@ from ..panorama.local_normalization import normalize_panorama
 from ..panorama.model import resize
 from ..panorama.texels import Texels, find_valid, pack_texels
 from .cone import find_cone
-from .settings import ImageName, ImageScale, ImageScales
+from .profile import ImageScale, ImageScales
+from .stages import ImageName
 
 WHOLE = 0.9  # least fraction of the sphere that a whole photo shows
 ALL_SHOWN = 0.98  # of the sphere: a photo that shows more counts as showing all cells
@@ -51,18 +52,17 @@ class Seen(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Photo:
-    """A photo at the sizes at which it is compared; immutable, as threads share it."""
+class PhotoImages:
+    """The images of a photo at the sizes at which it is compared; immutable, as threads share it."""
 
     panorama: Panorama  # at the width of its features
     images: Images
     small: Texels  # colours at the size of fine images, at which poses are compared
-    seen: Once[Seen]  # what verification compares with the scan drawn at a pose
+    seen: Once[Seen]  # what verification compares with the scan drawn at a pose; it is asked with workers
     shown: Once[Cone]  # the cone around what it shows, in the camera's axes
     R_cam_from_level: Array  # (3, 3) how the camera was tilted where gravity is known
     has_tilt: bool  # R_cam_from_level is known, from metadata or a gravity vector
     scales: ImageScales
-    workers: Workers
 
     @property
     def is_partial(self) -> bool:
@@ -88,14 +88,14 @@ class Photo:
             return EVERYWHERE
         return self.shown().widen(BESIDE + 1.5 * math.pi / num_rings).turn(pose.R_cam_from_world.T)
 
-    def mask(self, is_hidden: Mask) -> "Photo":
+    def mask(self, is_hidden: Mask) -> "PhotoImages":
         """Return the photo without pixels (h, 2 h), the rest normalised again."""
         height, width = self.panorama.is_valid.shape
         enlarged = cv2.resize(is_hidden.view(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST)
         rest = replace(self.panorama, is_valid=self.panorama.is_valid & (enlarged == 0))
         return self.take(rest)
 
-    def mirror(self) -> "Photo":
+    def mirror(self) -> "PhotoImages":
         """Return the photo mirrored left to right."""
         rgb = self.panorama.rgb[:, ::-1]
         panorama = replace(self.panorama, rgb=rgb, is_valid=self.panorama.is_valid[:, ::-1])
@@ -105,31 +105,31 @@ class Photo:
             panorama=panorama,
             images=Images(*(Once(Texels.mirror, image) for image in self.images)),
             small=small,
-            seen=Once(find_seen, panorama, small, self.workers),
+            seen=Once(find_seen, panorama, small),
             shown=Once(find_cone, small, 0.0),
             R_cam_from_level=ACROSS @ self.R_cam_from_level @ ACROSS,
         )
 
-    def forget(self) -> "Photo":
+    def forget(self) -> "PhotoImages":
         """Return the photo with its images as they are before they are asked for."""
         return self.take(self.panorama)
 
-    def take(self, panorama: Panorama) -> "Photo":
+    def take(self, panorama: Panorama) -> "PhotoImages":
         """Return the photo of another panorama, by a camera of the same tilt."""
-        return make_photo(panorama, self.scales, self.R_cam_from_level, self.has_tilt, self.workers)
+        return make_photo(panorama, self.scales, self.R_cam_from_level, self.has_tilt)
 
 
 def make_photo(
-    panorama: Panorama, scales: ImageScales, R_cam_from_level: Array, has_tilt: bool, workers: Workers
-) -> Photo:
+    panorama: Panorama, scales: ImageScales, R_cam_from_level: Array, has_tilt: bool
+) -> PhotoImages:
     """Make the photo of a panorama, each of its images resized from the one before."""
     panorama = resize(panorama, scales.full.width)
     least = reduce(panorama, scales.fine)
     small = pack_texels(least.rgb, least.is_valid)
-    seen = Once(find_seen, panorama, small, workers)
+    seen = Once(find_seen, panorama, small)
     images = make_images(panorama, scales)
     shown = Once(find_cone, small, 0.0)
-    return Photo(panorama, images, small, seen, shown, R_cam_from_level, has_tilt, scales, workers)
+    return PhotoImages(panorama, images, small, seen, shown, R_cam_from_level, has_tilt, scales)
 
 
 def make_images(panorama: Panorama, scales: ImageScales) -> Images:

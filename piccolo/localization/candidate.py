@@ -1,0 +1,122 @@
+"""Candidates: poses that may be right, each with its evidence; who decides reads them, computing nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array, Mask
+from ..geometry.pose import Pose
+from ..local_features.matching import Matches
+from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
+from .photo_images import PhotoImages
+
+CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
+LEAST_SHARED = 0.3  # fraction of what the poorer view shows
+MAX_COMPARED = 8  # alternatives of the best pose
+
+
+class Comparison(NamedTuple):
+    """Agreement of photo and scan at a pose, by blocks of the photo."""
+
+    correlation: Array  # (blocks,) of locally normalised colours, 0 where nothing is shared
+    area: Array  # (blocks,) fractions of the sphere that both show and do not contradict
+    visible_area: Array  # (blocks,) that both show
+    valid_area: float  # of the sphere that the photo shows
+
+    @property
+    def score(self) -> float:
+        """Area explained beyond chance, divided by the area that the photo shows, in [0, 1]."""
+        return self.score_beyond(CHANCE)
+
+    def score_beyond(self, chance: float) -> float:
+        """Return the score where chance explains as much of a block as `chance`."""
+        beyond = np.maximum(self.correlation - chance, 0.0) / (1.0 - chance)
+        return float(beyond @ self.area) / max(self.valid_area, 1e-9)
+
+    @property
+    def contradicts(self) -> Mask:
+        """Mask (blocks,) of those that contradict the scan: an occluder, or the wrong pose."""
+        return (self.correlation < CONTRADICTS) & (self.visible_area > 0.0)
+
+    def compute_ratio(self, other: "Comparison") -> float:
+        """Return the ratio of the area explained by this pose to another's, over blocks that both views show.
+
+        Over all blocks, a pose from which more was scanned would gain by that alone. 0 if hardly any block
+        is shared.
+        """
+        shared = np.minimum(self.visible_area, other.visible_area)
+        if shared.sum() < LEAST_SHARED * min(self.visible_area.sum(), other.visible_area.sum()):
+            return 0.0
+        mine, others = (np.maximum(c.correlation - CHANCE, 0.0) @ shared for c in (self, other))
+        return float(mine / max(others, 1e-9))
+
+
+class Unoccluded(NamedTuple):
+    """A photo without its blocks that contradict the scan at a pose."""
+
+    contradicts: bytes  # the mask of these blocks
+    photo: PhotoImages
+
+
+class Drawn(NamedTuple):
+    """The matches of a photo with the scan drawn near a pose, on a grid of poses."""
+
+    key: bytes  # of the pose of the grid
+    matches: Matches
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose that may be right, with its evidence, as far as it was asked for."""
+
+    pose: Pose  # in the map
+    score: float  # of `seen`
+    seen: Comparison  # of the photo with the scan there
+    contradicted: tuple[str, ...] = ()  # what was given that the pose contradicts
+    num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
+    edge_score: float | None = None  # of the edges drawn there, in a scan without colours
+    is_climbed: bool = False  # no perturbation improves it
+    # what was made for this pose, and serves for poses near it too
+    unoccluded: Unoccluded | None = None
+    drawn: Drawn | None = None
+
+    def forget(self) -> "Candidate":
+        """Return the candidate without what takes memory."""
+        return replace(self, unoccluded=None, drawn=None)
+
+
+_EMPTY = np.zeros(NUM_BLOCKS)
+NO_CANDIDATE = Candidate(Pose(np.eye(3), np.zeros(3)), -1.0, Comparison(_EMPTY, _EMPTY, _EMPTY, 0.0))
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The best candidate, and the best ones elsewhere, best first."""
+
+    best: Candidate
+    alternatives: tuple[Candidate, ...]
+    rival_ratio: float = 0.0  # largest ratio of an alternative to the best, over what both views show
+
+    @property
+    def ranked(self) -> list[Candidate]:
+        """The best candidate, then the others."""
+        return [self.best, *self.alternatives]
+
+    @property
+    def margin(self) -> float:
+        """Relative lead of the best, at least -1: the lesser of those by score and over both views."""
+        by_score = max([0.0, *(h.score for h in self.alternatives)]) / max(self.best.score, 1e-9)
+        return max(1.0 - max(self.rival_ratio, by_score), -1.0)
+
+    def take(self, ranked: Sequence[Candidate]) -> "Selection":
+        """Return the selection with other evidence for the same poses, the best first."""
+        return replace(self, best=ranked[0], alternatives=tuple(ranked[1:]))
+
+    def forget(self) -> "Selection":
+        """Return the selection without what takes memory."""
+        return self.take([candidate.forget() for candidate in self.ranked])
+
+
+NOTHING = Selection(NO_CANDIDATE, ())

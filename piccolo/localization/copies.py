@@ -1,0 +1,42 @@
+"""Copies of a place, as rooms of one kind: poses elsewhere at which the scan looks the same."""
+
+from itertools import compress
+
+from ..confidence.alternatives import MAX_ALTERNATIVES, suppress_near
+from ..geometry.nearness import ONE_ANSWER
+from ..jobs.threads import Workers
+from .candidate import Selection
+from .examine import complete, examine_each
+from .problem import Problem
+from .selection import find_rivals
+from .settings import Effort
+from .shape import find_alike
+from .verification import find_copies
+
+
+def list_reported(
+    problem: Problem, found: Selection, effort: Effort, workers: Workers
+) -> tuple[Selection, list[bool]]:
+    """Return the selection with the alternatives to report; True for poses that are copies, the best first.
+
+    In a scan without colours copies are searched. They are reported before other poses.
+    """
+    if not problem.profile.has_shape:
+        reported = found.take(found.ranked[: 1 + MAX_ALTERNATIVES])
+        return reported, list_copies(problem, reported, workers)
+    alike = find_alike(problem, found.best.pose, effort, workers)
+    copies = examine_each(problem, alike, workers)
+    others = suppress_near([*copies, *found.alternatives], MAX_ALTERNATIVES, ONE_ANSWER)
+    reported = complete(problem, found.take([found.best, *others]), workers)
+    return reported, [True, *(k < len(copies) for k in range(len(others)))]
+
+
+def list_copies(problem: Problem, found: Selection, workers: Workers) -> list[bool]:
+    """Return True for the best pose and for copies of its place; of a photo without matches there False."""
+    ranked = found.ranked
+    if not problem.profile.uses_matches:
+        return [False] * len(ranked)
+    is_rival = find_rivals(problem.profile, ranked)[1:]
+    rivals = [h.pose for h in compress(found.alternatives, is_rival)]
+    is_copy = iter(find_copies(problem, found.best.pose, rivals, workers))
+    return [True, *(is_one and next(is_copy) for is_one in is_rival)]

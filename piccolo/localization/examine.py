@@ -1,0 +1,87 @@
+"""Make candidates with their evidence, complete for those who decide."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+
+from ..geometry.nearness import CONFIRMED
+from ..geometry.pose import Pose
+from ..jobs.threads import Workers
+from .candidate import Candidate, Selection
+from .comparison import compare
+from .prior import contradictions
+from .problem import Problem
+from .profile import DRAWN_VIEW
+from .selection import find_rivals, rank, select
+from .verification import draw_near, verify
+
+DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper
+
+
+def examine(problem: Problem, pose: Pose, near: Candidate | None = None) -> Candidate:
+    """Compare the scan at a pose with the photo.
+
+    `near` is a candidate from which the pose was reached: what was drawn there serves here too, if it is near
+    enough.
+    """
+    seen = compare(problem, pose)
+    found = check_prior(problem, Candidate(pose, seen.score, seen))
+    return found if near is None else replace(found, unoccluded=near.unoccluded, drawn=near.drawn)
+
+
+def check_prior(problem: Problem, candidate: Candidate) -> Candidate:
+    """Return a candidate with what was given that its pose contradicts."""
+    found = contradictions(problem.scan_map, candidate.pose, problem.prior)
+    return replace(candidate, contradicted=found)
+
+
+def examine_each(problem: Problem, poses: Sequence[Pose], workers: Workers) -> list[Candidate]:
+    """Compare the scan at several poses with the photo."""
+    return workers.map(partial(examine, problem), poses, "compare")
+
+
+def count_agreeing(problem: Problem, candidate: Candidate, workers: Workers) -> Candidate:
+    """Count the photo's features that agree with the scan drawn at a candidate."""
+    drawn = draw_near(problem, candidate.pose, candidate.drawn, workers)
+    found = verify(problem, candidate.pose, drawn.matches)
+    count = found.num_matches if CONFIRMED.holds(found.pose, candidate.pose) else 0
+    return replace(candidate, num_matches=count, drawn=drawn)
+
+
+def complete(problem: Problem, found: Selection, workers: Workers) -> Selection:
+    """Complete the evidence of ranked candidates: the scan is drawn at the best, and at those that could win.
+
+    In a scan without colours its edges are drawn at all of them.
+    """
+
+    def fill(candidate: Candidate) -> Candidate:
+        if candidate.num_matches is not None:
+            return candidate
+        return count_agreeing(problem, candidate, workers)
+
+    def fill_edges(candidate: Candidate) -> Candidate:
+        if candidate.edge_score is not None:
+            return candidate
+        drawn = compare(problem, candidate.pose, DRAWN_VIEW)
+        return replace(candidate, edge_score=drawn.score_beyond(DRAWN_CHANCE))
+
+    if problem.profile.has_shape:
+        return found.take([fill_edges(candidate) for candidate in found.ranked])
+    if not problem.profile.uses_matches:
+        return found
+    ranked = [fill(found.best), *found.alternatives]
+    is_rival = find_rivals(problem.profile, ranked)
+    rivals = [h for h, is_one in zip(ranked, is_rival, strict=True) if is_one]
+    filled = iter(workers.map(fill, rivals, "verify"))
+    return found.take([next(filled) if is_one else h for h, is_one in zip(ranked, is_rival, strict=True)])
+
+
+def choose(problem: Problem, found: Selection, workers: Workers) -> Selection:
+    """Complete the evidence of ranked candidates, and select the best by all of it."""
+    chosen = select(problem.profile, complete(problem, found, workers))
+    return complete(problem, chosen, workers)
+
+
+def choose_among(problem: Problem, candidates: Sequence[Candidate], workers: Workers) -> Selection:
+    """Choose the best of candidates, and the best ones elsewhere."""
+    return choose(problem, rank(candidates), workers)

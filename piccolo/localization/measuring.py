@@ -1,0 +1,73 @@
+"""Measurements of the best candidate: how well it explains a photo, and how well the photo fixes it."""
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from ..confidence.localization import Evidence
+from ..confidence.occlusion import compare_occlusion, measure_agreement
+from ..geometry.pose import Pose
+from ..jobs.threads import Workers
+from ..optimize.sampling_loss import sampling_loss
+from ..views.zbuffer import visible_points
+from .candidate import Selection
+from .covariance import Errors, estimate_errors
+from .focal_length import FocalFit
+from .prior import contradictions
+from .problem import Problem
+from .selection import count_matches
+from .sphere import SphereFit
+
+Fit = FocalFit | SphereFit
+
+
+class Measured(NamedTuple):
+    """Measurements of the best candidate."""
+
+    pose: Pose  # in the map
+    errors: Errors
+    loss: float
+    evidence: Evidence
+    contradicted: tuple[str, ...]  # what was given that the pose contradicts
+
+
+def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Workers) -> Measured | None:
+    """Measure how well the best candidate explains a photo, and how well the photo fixes the pose.
+
+    The pose is that of `estimate_errors`, the loss is taken there; the evidence is that of the candidate.
+    None if there is no pose, or no point is visible from it.
+    """
+    if found.best.score < 0.0:
+        return None
+    pose = found.best.pose
+    points, coarse = problem.surroundings_at(pose)
+
+    def find_end() -> tuple[Errors, Pose, float]:
+        """Return the errors, the pose that they are of, and the loss there."""
+        errors = estimate_errors(problem, found.best, workers)
+        end = errors.gaussian.pose if errors.gaussian else pose
+        return errors, end, sampling_loss(visible_points(points, end.center_world), problem.colors(), end)
+
+    measures: list[Callable[[], Any]] = [
+        find_end,  # takes longest
+        lambda: compare_occlusion(points, problem.given, pose).fractions(),
+        lambda: measure_agreement(coarse, problem.photo.panorama, pose),
+    ]
+    (errors, end, loss), fractions, agreement = workers.map(operator.call, measures, "evaluate")
+    if not math.isfinite(loss):
+        return None
+    num_matches = count_matches(problem.profile, found.ranked)
+    uses_matches = problem.profile.uses_matches
+    evidence = Evidence(
+        score=found.best.score,
+        margin=found.margin,
+        agreement=agreement.value,
+        explained_fraction=fractions[0],
+        contradicted_fraction=fractions[1],
+        seen_fraction=agreement.seen_fraction,
+        num_matches=num_matches[0] if uses_matches else None,
+        alternative_matches=max(num_matches[1:], default=0) if uses_matches else None,
+    )
+    errors = errors.widen(fit.pose_covariance) if fit else errors
+    return Measured(end, errors, loss, evidence, contradictions(problem.scan_map, end, problem.prior))

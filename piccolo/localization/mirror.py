@@ -1,0 +1,62 @@
+"""Does a photo fit the scan better mirrored, left for right? Then it was turned over."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..geometry.pose import Pose, uniform_yaws
+from ..jobs.threads import Workers
+from ..local_features.hypotheses import propose_poses
+from ..local_features.matching import match
+from .attempts import FIRST_BEAM, join_features
+from .beam import descend_briefly, refine_matches, refine_starts, score_briefly, score_near
+from .candidate import Candidate
+from .examine import count_agreeing
+from .photo_images import ACROSS
+from .problem import Problem
+from .search import search_poses
+from .selection import explains_more
+from .settings import Effort
+
+ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
+FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found
+UPSIDE_DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def find_mirrored(problem: Problem, best: Candidate, effort: Effort, workers: Workers) -> Candidate | None:
+    """Return the best pose of the mirrored photo; None if there is none that explains more.
+
+    Not searched are photos with a score of ENOUGH_EXPLAINED, scans without colours, and poses by whole views
+    alone: the first look has compared these with the mirrored photo.
+    """
+    if best.score >= ENOUGH_EXPLAINED or not problem.profile.uses_matches:
+        return None
+    mirrored = problem.mirror()
+    found = search_mirrored(problem, mirrored, best.pose, effort, workers)
+    if not found or not explains_more(found[0], best):
+        return None
+    return count_agreeing(mirrored, found[0], workers)
+
+
+def search_mirrored(
+    problem: Problem, mirrored: Problem, pose: Pose, effort: Effort, workers: Workers
+) -> list[Candidate]:
+    """Return poses of the mirrored photo, best first, by what found the photo's own: features, or views.
+
+    A wall or a ceiling seen from behind fits the mirrored photo: its tilt is that of the pose found, or that
+    upside down. The search is brief if a brief one finds the photo's own pose.
+    """
+    if problem.features:
+        keypoints = join_features(problem, workers)[0]
+        matches = match(keypoints.mirror(), problem.scan_map.features_now(workers), workers)
+        return refine_matches(mirrored, [f.pose for f in propose_poses(matches, 1, workers)], workers)
+    yaws = uniform_yaws(effort.num_yaws)
+    tilt = ACROSS @ pose.R_cam_from_world @ ACROSS
+    asked = replace(mirrored, rotations=tilt @ np.concatenate([yaws, UPSIDE_DOWN @ yaws]))
+    own = replace(problem, rotations=pose.R_cam_from_world @ yaws)
+    own_score = score_near(problem, pose, workers)
+    if score_briefly(own, effort.brief(), workers) < FOUND_AGAIN * own_score:
+        starts = search_poses(asked, "known", effort, workers)
+        return refine_starts(asked, starts, problem.profile.beam, workers)
+    ends = descend_briefly(asked, effort.brief(), workers)
+    return refine_starts(asked, ends.poses, FIRST_BEAM, workers) if ends.best_score > own_score else []

@@ -1,0 +1,171 @@
+"""A problem: where in a map was a photo taken? What is asked, and no more: steps hand on what they find."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+
+from ..arrays import Array, Array32
+from ..cloud.soa import PackedPoints
+from ..geometry.pose import Gravity, Pose
+from ..jobs.threads import Once, Workers
+from ..local_features.keypoints import Keypoints, find_keypoints
+from ..local_features.matching import Matches, match
+from ..local_features.perspective_view import HALVES, PerspectiveView, cover_sphere
+from ..panorama import Panorama
+from ..panorama.edges import draw_edges
+from ..panorama.gpano import rotation_to_level
+from ..panorama.model import shrink
+from ..panorama.texels import Texels, pack_texels
+from ..photo import NOTHING_KNOWN, Prior
+from ..scan_map.scan_map import ScanMap
+from ..views.points_around import Place, RecentViews, round_position
+from ..views.view import Cells, ViewConfig, normalize_view
+from .photo_images import ACROSS, PhotoImages, make_photo
+from .profile import VIEWS, Profile, choose_profile, choose_scales
+from .stages import ViewName
+
+MAX_WIDTH = 2048  # [px] of the photo for the loss: more costs time and gains nothing
+NUM_POINTS = 30_000  # of the last descent, among those that the photo shows
+VOXEL_PER_RANGE = 1 / 150  # of points around a pose, with which the photo is compared
+COARSE_VOXEL_PER_RANGE = 1 / 40  # of coarser ones
+
+
+class Features(NamedTuple):
+    """Keypoints of a photo, and the similar features of the map."""
+
+    keypoints: Keypoints
+    matches: Matches
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A photo, the map that it is searched in, and what is known about its pose."""
+
+    source: Panorama  # the photo as it was read
+    given: Panorama  # which is compared: the photo, or its edges if the scan has no colours
+    photo: PhotoImages
+    colors: Once[Texels]  # of what is given, at the size at which the loss is taken
+    scan_map: ScanMap  # of which the prior allows every candidate
+    views: RecentViews  # of the scan, drawn when they are asked for
+    profile: Profile
+    prior: Prior
+    gravity: Gravity
+    # of a part of the photo's views each, asked with workers; none by whole views alone
+    features: tuple[Once[Features], ...]
+    rotations: Array | None = None  # (N, 3, 3) camera from map, searched in place of all
+    beside: tuple[Matches, ...] = ()  # with each of the photos beside this one whose poses are known
+
+    @property
+    def pixel(self) -> float:
+        """Pixel [rad] of the photo as it was given, but none finer than those that are compared."""
+        width: int = min(self.given.rgb.shape[1], self.photo.panorama.rgb.shape[1])
+        return math.tau / width
+
+    def without_features(self) -> "Problem":
+        """Return the problem in which no features of the map are asked for poses."""
+        return replace(self, features=())
+
+    def by_views(self) -> "Problem":
+        """Return the problem by whole views alone."""
+        return replace(self, features=(), profile=self.profile.by_views())
+
+    def show(self, photo: PhotoImages) -> "Problem":
+        """Return the problem with other images of the photo, as without what hides the scan."""
+        return replace(self, photo=photo)
+
+    def forget(self) -> "Problem":
+        """Return the problem without images that were made, but with its features: 100 MB less."""
+        colors = Once(make_texels, self.given)
+        return replace(self, photo=self.photo.forget(), colors=colors, views=make_views(self.scan_map))
+
+    def retake(self, panorama: Panorama) -> "Problem":
+        """Return the problem of the photo as another camera took it; what it shows may lie elsewhere."""
+        fresh = prepare_problem(panorama, self.scan_map, self.prior, self.gravity)
+        return fresh if self.profile.uses_matches else fresh.by_views()
+
+    def mirror(self) -> "Problem":
+        """Return the problem of the mirrored photo, without features of the map and the prior's heading."""
+        rotations = None if self.rotations is None else ACROSS @ self.rotations @ ACROSS
+        return replace(
+            self.without_features(),
+            photo=self.photo.mirror(),
+            prior=self.prior.without_heading(),
+            rotations=rotations,
+            beside=(),
+        )
+
+    def view_at(self, pose: Pose, name: ViewName) -> Cells:
+        """Return the cells or points seen from a position near a pose, those that the photo shows."""
+        config = VIEWS[name]
+        place = round_position(pose)
+        shown = self.photo.find_shown_cells(config.num_rings, pose)
+        if name == "points":
+            cone = self.photo.find_cone(config.num_rings, pose)
+            return self.views.points(place, config, shown.tobytes(), cone, NUM_POINTS)
+        return normalize_view(self.averages_at(pose, place, config), place, config, shown)
+
+    def averages_at(self, pose: Pose, place: Place, config: ViewConfig) -> Array32:
+        """Return the sums (cells, 8) of a view from a place near a pose, of what the photo shows."""
+        return self.views.averages(place, config, self.photo.find_cone(config.num_rings, pose))
+
+    def surroundings_at(self, pose: Pose) -> tuple[PackedPoints, PackedPoints]:
+        """Return the points around a pose with which the photo is compared, and coarser ones."""
+        around = partial(self.views.surroundings, round_position(pose))
+        return around(VOXEL_PER_RANGE), around(COARSE_VOXEL_PER_RANGE)
+
+
+def prepare_problem(
+    panorama: Panorama, scan_map: ScanMap, prior: Prior = NOTHING_KNOWN, gravity: Gravity = "auto"
+) -> Problem:
+    """Prepare a panorama for the search where its prior allows; the photo may give the camera's tilt."""
+    source = panorama
+    R_level_from_cam = rotation_to_level(panorama.gpano) if panorama.gpano else None
+    has_tilt = R_level_from_cam is not None
+    R_cam_from_level = np.eye(3) if R_level_from_cam is None else R_level_from_cam.T
+    if scan_map.has_shape:
+        panorama = draw_edges(panorama, R_cam_from_level, scan_map.has_intensity)
+    photo = make_photo(panorama, choose_scales(scan_map.has_shape), R_cam_from_level, has_tilt)
+    every = cover_sphere(photo.panorama.rgb.shape[1])
+    features = tuple(
+        Once(find_features, photo.panorama, scan_map, [every[k] for k in half])
+        for half in (() if scan_map.has_shape else HALVES)
+    )
+    return Problem(
+        source=source,
+        given=panorama,
+        photo=photo,
+        colors=Once(make_texels, panorama),
+        scan_map=scan_map,
+        views=make_views(scan_map),
+        profile=choose_profile(photo.small.valid_share, photo.is_partial, scan_map.has_shape),
+        prior=prior,
+        gravity=gravity,
+        features=features,
+    )
+
+
+def make_views(scan_map: ScanMap) -> RecentViews:
+    """Return the views of a map, none rendered yet."""
+    # leaves have narrow edges, which only the last descent is near enough to
+    averaged = scan_map.octree.without_leaves() if scan_map.has_shape else None
+    return RecentViews(scan_map.octree, averaged)
+
+
+def find_features(
+    panorama: Panorama, scan_map: ScanMap, views: Sequence[PerspectiveView], workers: Workers
+) -> Features:
+    """Find the features in several views of a panorama, and match them to the map."""
+    gray = np.asarray(cv2.cvtColor(panorama.rgb, cv2.COLOR_RGB2GRAY), np.uint8)
+    keypoints = find_keypoints(gray, panorama.is_valid, views, workers)
+    return Features(keypoints, match(keypoints, scan_map.features_now(workers), workers))
+
+
+def make_texels(panorama: Panorama) -> Texels:
+    """Pack a panorama into texels, at most MAX_WIDTH wide."""
+    panorama = shrink(panorama, MAX_WIDTH)
+    return pack_texels(panorama.rgb, panorama.is_valid)

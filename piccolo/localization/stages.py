@@ -1,0 +1,51 @@
+"""The stages on which a pose is refined, from coarse images and views to single points: one table."""
+
+from typing import Literal, NamedTuple
+
+ViewName = Literal["prepared", "middle", "fine", "points"]
+ImageName = Literal["full", "fine", "middle", "search"]
+NEARLY = 0.02  # [m] after a smaller move the camera sees the same points
+
+
+class Limits(NamedTuple):
+    """The loss of a descent, and its end."""
+
+    loss_scale: float  # [standard deviations]
+    num_iterations: int  # at most
+    tolerance: float  # [rad + m] a shorter step ends the descent
+
+
+class Around(NamedTuple):
+    """Poses around the one that is given: each descends on a coarser image first, and the best end counts."""
+
+    image: ImageName
+    num_iterations: int  # on that
+    size: float  # of the perturbations, relative to PERTURBED_DISTANCE and PERTURBED_ANGLE
+
+
+class Rounds(NamedTuple):
+    """Repetitions of a descent, each on the points that are visible from the end of the one before."""
+
+    most: int
+    arrived: float  # [m] a smaller move ends them
+
+
+class Stage(NamedTuple):
+    """A descent from a pose: on which view of the scan from there, and in which image of the photo."""
+
+    view: ViewName
+    image: ImageName
+    limits: Limits
+    around: Around | None = None
+    rounds: Rounds = Rounds(1, 0.0)
+
+
+FIRST = Stage("prepared", "search", Limits(1.2, 5, 2e-3))
+SECOND = Stage("prepared", "search", Limits(1.2, 12, 2e-3))
+MIDDLE = Stage("middle", "middle", Limits(1.2, 12, 1e-3))
+AROUND_MIDDLE = Stage("middle", "middle", Limits(1.2, 8, 1e-3), Around("search", 6, 1.0))
+AROUND_FINE = Stage("fine", "fine", Limits(1.2, 8, 1e-3), Around("middle", 6, 0.4))
+FINE = Stage("fine", "fine", Limits(1.0, 12, 1e-4))
+SOFT = Stage("points", "fine", Limits(1.0, 12, 1e-4))  # of edges, before the next ones
+FULL = Stage("points", "full", Limits(0.7, 10, 1e-4), rounds=Rounds(2, NEARLY))
+LAST = Stage("points", "full", Limits(0.7, 30, 1e-7), rounds=Rounds(6, 1e-4))
