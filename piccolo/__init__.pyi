@@ -7,7 +7,7 @@ from .confidence.localization import (
 )
 from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
-from .localization.settings import CoarseToFineSettings as CoarseToFineSettings
+from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .opening import Cloud as Cloud, open_scan as open_scan
 from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior

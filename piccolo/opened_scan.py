@@ -24,12 +24,12 @@ from .localization.beside import SurePhoto, localize_beside, place_sure
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
-from .localization.problem import prepare_problem
-from .localization.settings import CoarseToFineSettings
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
 from .photo import GpsPrior, Photo, Prior
+from .problem.problem import prepare_problem
+from .problem.settings import CoarseToFineSettings
 from .result import Result, Source, describe_failure, unreadable_result, with_localization
 from .scan_map.scan_map import ScanMap, add_places, check_within
 

@@ -16,10 +16,10 @@ from .errors import InputError
 from .files.cache import sha256_of_files
 from .geometry.colors import Labels
 from .jobs.threads import ProgressCallback, Stopwatch, Workers, no_progress, num_cores, report_progress
-from .localization.settings import CoarseToFineSettings
 from .opened_scan import OpenedScan, Settings
 from .paper.localize import PaperMap, prepare as prepare_by_paper
 from .photo import File
+from .problem.settings import CoarseToFineSettings
 from .scan import Scan
 from .scan_map.open_map import CachePolicy, find_prepared_map, open_map
 from .scan_map.scan_map import ScanMap, check_within, prepare_map

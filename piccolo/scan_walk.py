@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from . import __version__
+from .. import __version__
 from .arguments import check_kind
 from .arrays import Bytes
 from .confidence.localization import Localization
@@ -14,11 +14,11 @@ from .errors import InputError
 from .files.json_file import reading_once
 from .geometry.pose import Pose, check_pose
 from .jobs.threads import Progress, Stopwatch, Workers, no_progress
-from .localization.problem import Problem
 from .opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from .panorama import Panorama
 from .panorama.photo import read_photo_facts, sha256_of
 from .photo import File, Photo, as_photo
+from .problem.problem import Problem
 from .result import Result, with_localization
 from .scan_map.scan_map import add_places, check_within
 from .walk.frames import Frame, Motion, check_times

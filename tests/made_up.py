@@ -4,17 +4,18 @@ from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
+from piccolo.localization.query import Cache, Features, Query
 
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.evidence.comparison import FINE_VIEW, Comparison
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Once, Workers
+from piccolo.judge import selection
 from piccolo.local_features.keypoints import join_keypoints
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import last_descent, selection
-from piccolo.localization.comparison import FINE_VIEW, Comparison
-from piccolo.localization.query import Cache, Features, Query
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.localization import last_descent
 from piccolo.optimize.channel_loss import CHANCE
+from piccolo.problem.settings import CoarseToFineSettings
 
 WHOLE = SimpleNamespace(is_partial=False, has_tilt=False)  # photos, of which nothing else is asked
 PARTIAL = SimpleNamespace(is_partial=True, has_tilt=False)

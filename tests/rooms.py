@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+from piccolo.localization.query import prepare_query
 
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points
@@ -17,10 +18,9 @@ from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
-from piccolo.localization.query import prepare_query
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan import Scan
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import prepare_map

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 import rooms
 from made_up import PARTIAL, QUERY, TILTED_PARTIAL, TILTED_WHOLE, WHOLE, at, compared, place, places
+from piccolo.localization.photo import ACROSS
 
 from piccolo.confidence.confidence import LOCALIZED
+from piccolo.evidence.verification import Verified
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.selection import is_clear
 from piccolo.local_features.matching import NO_MATCHES
 from piccolo.localization import attempts, beam, localize as method, query
-from piccolo.localization.photo import ACROSS
 from piccolo.localization.search import search_poses
-from piccolo.localization.selection import is_clear
-from piccolo.localization.settings import CoarseToFineSettings
-from piccolo.localization.verification import Verified
 from piccolo.panorama import GPano
 from piccolo.photo import Prior
+from piccolo.problem.settings import CoarseToFineSettings
 
 
 def _localized(panorama, settings=rooms.KNOWN):

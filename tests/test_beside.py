@@ -9,16 +9,16 @@ import rooms
 from test_verification import NUM_POINTS, _beside, _narrow, _query, _true_pose
 
 from piccolo.confidence.localization import Localization
+from piccolo.evidence import verification
+from piccolo.evidence.focal_length import FocalFit
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.selection import NOTHING
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import verification
 from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside
-from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
-from piccolo.localization.selection import NOTHING
 from piccolo.photo import Prior
 
 

@@ -15,6 +15,7 @@ from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.selection import Selection
 from piccolo.localization import bundle_search
 from piccolo.localization.bundle import (
     CONTRADICTS,
@@ -25,7 +26,6 @@ from piccolo.localization.bundle import (
     localize_bundle,
 )
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
-from piccolo.localization.selection import Selection
 from piccolo.panorama import Panorama
 from research.synthetic.world import mask_outside_field, photograph
 

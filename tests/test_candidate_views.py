@@ -10,8 +10,8 @@ from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
-from piccolo.localization.settings import VIEWS
 from piccolo.panorama.local_normalization import LEVELS_PER_UNIT
+from piccolo.problem.settings import VIEWS
 from piccolo.views import candidate_views, points_around
 from piccolo.views.candidate_views import SEARCH_VIEW, CandidateViews, render_views, render_wide
 from piccolo.views.points_around import visible_points

@@ -8,11 +8,12 @@ import pytest
 import rooms
 
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.evidence import comparison
+from piccolo.evidence.verification import count_agreeing
 from piccolo.geometry.pose import Pose, exp_so3, yaw_rotation
 from piccolo.geometry.sphere import find_cell, pixel_rays, solid_angles
-from piccolo.localization import comparison, judge as judging
-from piccolo.localization.judge import is_mirrored
-from piccolo.localization.verification import count_agreeing
+from piccolo.judge import decide as judging
+from piccolo.judge.decide import is_mirrored
 from piccolo.optimize.channel_loss import BLOCK_RINGS, CHANCE, NUM_BLOCKS
 from piccolo.panorama import Panorama
 from piccolo.panorama.texels import pack_texels

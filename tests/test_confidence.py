@@ -13,8 +13,8 @@ from piccolo.confidence.occlusion import Agreement, measure_agreement
 from piccolo.errors import InputError
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.localize import PaperSettings
+from piccolo.problem.settings import CoarseToFineSettings
 
 SURE = 0.002  # [m] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")

@@ -6,14 +6,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rooms
+from piccolo.localization.query import prepare_query
 
 from piccolo.cloud import layers
 from piccolo.cloud.octree import build_octree
+from piccolo.evidence import covariance
+from piccolo.evidence.comparison import compare
 from piccolo.geometry.pose import exp_so3
 from piccolo.jobs.threads import Workers
-from piccolo.localization import covariance
-from piccolo.localization.comparison import compare
-from piccolo.localization.query import prepare_query
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.view import Cells
 

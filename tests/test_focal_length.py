@@ -14,15 +14,16 @@ from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
+from piccolo.evidence import focal_length as focal
+from piccolo.evidence.comparison import score_pose
+from piccolo.evidence.lens_matches import MatchFit, fit_matches
+from piccolo.evidence.self_calibration import Estimate
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.selection import Selection
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import bundle, focal_length as focal, localize as module
-from piccolo.localization.comparison import score_pose
-from piccolo.localization.lens_matches import MatchFit, fit_matches
+from piccolo.localization import bundle, localize as module
 from piccolo.localization.localize import select_likeliest
-from piccolo.localization.selection import Selection
-from piccolo.localization.self_calibration import Estimate
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture

@@ -14,9 +14,9 @@ from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import Matches
 from piccolo.localization.attempts import match_poses
-from piccolo.localization.prior import contradictions
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.photo import Prior
+from piccolo.problem.prior import contradictions
+from piccolo.problem.settings import CoarseToFineSettings
 
 
 @functools.lru_cache

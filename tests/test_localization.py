@@ -13,8 +13,8 @@ from piccolo.cloud.stream import Cloud, stream_of_arrays
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3, uniform_yaws
 from piccolo.jobs.threads import Workers
-from piccolo.localization.prior import allow_rotations, apply_prior
 from piccolo.photo import Prior
+from piccolo.problem.prior import allow_rotations, apply_prior
 from piccolo.scan_map import camera_positions
 from piccolo.scan_map.camera_positions import find_supported_cells, heights_above_floor, top_surfaces
 from piccolo.scan_map.scan_map import prepare_map

@@ -12,13 +12,13 @@ from rooms import as_panorama, errors, query
 from piccolo.cloud.readers.reader import PointSource, RawCloud
 from piccolo.cloud.stream import CloudStream
 from piccolo.confidence.covariance import describe_errors
+from piccolo.evidence import covariance
+from piccolo.evidence.comparison import compare, score_pose
+from piccolo.evidence.sphere import calibrate_sphere
 from piccolo.geometry.pose import Pose, exp_so3, step, yaw_rotation
 from piccolo.geometry.sphere import compute_pixels, pixel_rays
 from piccolo.jobs.threads import Workers
-from piccolo.localization import covariance
-from piccolo.localization.comparison import compare, score_pose
-from piccolo.localization.selection import Selection
-from piccolo.localization.sphere import calibrate_sphere
+from piccolo.judge.selection import Selection
 from piccolo.optimize.channel_loss import ChannelProblem
 from piccolo.panorama import Panorama
 from piccolo.scan_map.scan_map import prepare_map

@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import psutil
 import pytest
+from piccolo.localization.query import prepare_query
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
@@ -20,12 +21,11 @@ from piccolo.cloud.stream import stream_of_arrays
 from piccolo.errors import InputError
 from piccolo.jobs import memory, threads
 from piccolo.jobs.threads import Workers
-from piccolo.localization.query import prepare_query
 from piccolo.localization.search import search_poses
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
 from piccolo.panorama.video import frames_of
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 

@@ -16,12 +16,12 @@ from piccolo.camera.model import pinhole
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.localization import Alternative, FocalLength, Localization
+from piccolo.evidence.covariance import UNKNOWN_ERRORS
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
-from piccolo.localization import judge as judging
-from piccolo.localization.covariance import UNKNOWN_ERRORS
-from piccolo.localization.judge import MIRRORED
-from piccolo.localization.selection import Selection
+from piccolo.judge import decide as judging
+from piccolo.judge.decide import MIRRORED
+from piccolo.judge.selection import Selection
 from research.synthetic.world import photograph, render_picture
 
 HERE, AWAY = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))

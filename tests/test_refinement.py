@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 import rooms
 from made_up import QUERY, VIEWS, at, place
+from piccolo.localization.query import Cache
 
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.evidence.comparison import CONTRADICTS, Comparison
 from piccolo.geometry.cone import EVERYWHERE
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import Pose, step
@@ -18,9 +20,7 @@ from piccolo.geometry.sphere import make_grid
 from piccolo.jobs.threads import Workers
 from piccolo.localization import beam, ladder, query as query_module, settings
 from piccolo.localization.beam import Ends, best_and_alternatives, narrow
-from piccolo.localization.comparison import CONTRADICTS, Comparison
 from piccolo.localization.ladder import AROUND_MIDDLE, FINE, SECOND, Limits
-from piccolo.localization.query import Cache
 from piccolo.localization.search import Starts
 from piccolo.views.view import Cells
 

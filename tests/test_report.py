@@ -21,9 +21,9 @@ import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
 from piccolo.geometry.pose import heading_pitch_roll_deg
-from piccolo.localization.judge import contradict
-from piccolo.localization.prior import find_contradicted_heading
+from piccolo.judge.decide import contradict
 from piccolo.photo import Prior
+from piccolo.problem.prior import find_contradicted_heading
 from piccolo.report.pictures import pack_depth
 from piccolo.report.site import collect_entries, shorten_names, unique_names
 from research.synthetic.walk_frames import writing_video

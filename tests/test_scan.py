@@ -14,9 +14,9 @@ import piccolo
 from piccolo.errors import InputError
 from piccolo.files.cache import sha256_of_arrays
 from piccolo.geometry.pose import heading_pitch_roll_deg
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.localize import PaperSettings
 from piccolo.photo import Prior
+from piccolo.problem.settings import CoarseToFineSettings
 
 
 @pytest.fixture(scope="module")

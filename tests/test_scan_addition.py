@@ -18,8 +18,8 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose
 from piccolo.jobs.threads import Stopwatch, Workers
 from piccolo.localization.localize import localize
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.photo import Prior
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.camera_positions import MIN_CLEARANCE
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_addition import add_scan

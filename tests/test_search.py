@@ -6,19 +6,19 @@ import naive
 import numpy as np
 import pytest
 import rooms
+from piccolo.localization.photo import make_images
 from pictures import encoded, with_metadata, xmp_packet
 
 from piccolo.geometry.pose import angle_between, exp_so3, uniform_rotations, uniform_yaws
 from piccolo.geometry.sphere import make_grid, whole_areas, wider_cells
 from piccolo.jobs.threads import Workers
 from piccolo.localization import attempts, search
-from piccolo.localization.photo import make_images
-from piccolo.localization.settings import CoarseToFineSettings, ImageScales
 from piccolo.panorama import Panorama, read_panorama
 from piccolo.panorama.gpano import GPano
 from piccolo.panorama.local_normalization import normalize_panorama, sample_channels
 from piccolo.panorama.model import resize
 from piccolo.photo import Photo, Prior
+from piccolo.problem.settings import CoarseToFineSettings, ImageScales
 from research.synthetic.world import mask_outside_field
 
 AREA = make_grid(24).solid_angle

@@ -10,13 +10,14 @@ from made_up import QUERY, at, compared, place, places
 
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.localization import Localization
+from piccolo.evidence.comparison import score_pose
+from piccolo.evidence.covariance import UNKNOWN_ERRORS
+from piccolo.evidence.verification import count_agreeing
 from piccolo.geometry.pose import step
-from piccolo.localization import beam, judge as judging, last_descent, selection
-from piccolo.localization.comparison import score_pose
-from piccolo.localization.covariance import UNKNOWN_ERRORS
+from piccolo.judge import decide as judging, selection
+from piccolo.judge.selection import Selection
+from piccolo.localization import beam, last_descent
 from piccolo.localization.last_descent import refine_best
-from piccolo.localization.selection import Selection
-from piccolo.localization.verification import count_agreeing
 
 
 def test_of_poses_that_matches_gave_the_better_end_is_taken(monkeypatch):

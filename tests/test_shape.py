@@ -29,12 +29,12 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import angle_between, exp_so3
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.selection import Selection, assess_alone
 from piccolo.localization import localize as method
-from piccolo.localization.selection import Selection, assess_alone
-from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.localization.shape import align_lines
 from piccolo.panorama import Panorama
 from piccolo.panorama.edges import draw_edges, find_axes, soften
+from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.map_file import load_map, save_map
 from piccolo.scan_map.scan_map import SHAPE_ALONE, prepare_map
 from research.synthetic.places import make_alike

@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 from piccolo.jobs import threads
 from piccolo.jobs.threads import Once, Stopwatch, Workers, one_blas_thread
 from piccolo.localization import localize as method
-from piccolo.localization.settings import CoarseToFineSettings
+from piccolo.problem.settings import CoarseToFineSettings
 
 
 @pytest.mark.parametrize("num_threads", [1, 3])

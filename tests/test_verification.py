@@ -12,17 +12,18 @@ import rooms
 from piccolo.cloud.stream import Cloud
 from piccolo.cloud.voxels import morton_order
 from piccolo.confidence.alternatives import Hypothesis
+from piccolo.evidence import verification
+from piccolo.evidence.comparison import compare
+from piccolo.evidence.covariance import estimate_covariance, estimate_errors
 from piccolo.geometry.pose import MAX_DISTANCE, Pose, exp_so3, log_so3, step, yaw_rotation
 from piccolo.geometry.pose_gaussian import LIKELY, subtract
 from piccolo.geometry.sphere import compute_indices, pixel_rays
 from piccolo.jobs.threads import Workers
+from piccolo.judge import decide as judge
+from piccolo.judge.selection import Selection
 from piccolo.local_features.hypotheses import count_matches
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import judge, verification
-from piccolo.localization.comparison import compare
-from piccolo.localization.covariance import estimate_covariance, estimate_errors
-from piccolo.localization.selection import Selection
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama import Panorama
 from piccolo.photo import Prior

@@ -8,13 +8,14 @@ import rooms
 
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import log_odds
+from piccolo.evidence import verification
+from piccolo.evidence.comparison import Comparison, score_pose
+from piccolo.evidence.verification import CHANCE_MATCHES
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors
 from piccolo.jobs.threads import Workers
-from piccolo.localization import ladder, near, verification
+from piccolo.localization import ladder, near
 from piccolo.localization.beam import brief_query, score_briefly, score_mirror
-from piccolo.localization.comparison import Comparison, score_pose
 from piccolo.localization.near import Near
-from piccolo.localization.verification import CHANCE_MATCHES
 from piccolo.optimize.channel_loss import CHANCE
 from piccolo.walk import tracker
 from piccolo.walk.frames import Frame, Motion, State

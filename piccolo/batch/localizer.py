@@ -21,19 +21,19 @@ from ..confidence.confidence import AMBIGUOUS, LOCALIZED, NOT_LOCALIZED
 from ..confidence.focal_length import Consensus
 from ..confidence.localization import FocalLength
 from ..errors import InputError, is_passing
+from ..evidence.focal_length import WIDE
 from ..files.atomic import temporary_folder, write_temporary
 from ..files.json_file import reading_once
 from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
+from ..judge.decide import follow_consensus
 from ..localization.beside import SurePhoto
-from ..localization.focal_length import WIDE
-from ..localization.judge import follow_consensus
-from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
 from ..photo import Photo, Vector
+from ..problem.settings import CoarseToFineSettings
 from ..result import Beside, Result, Source, localization_of, unreadable_result, with_localization
 from ..scan_map.map_file import load_map
 from ..scan_map.open_map import CachePolicy

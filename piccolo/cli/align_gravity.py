@@ -15,10 +15,10 @@ from ..files.atomic import is_stream, write_atomically
 from ..geometry.pose import orthonormal, rotation_to_z, yaw_rotation
 from ..gravity.alignment import MAX_LEAN, dot, find_up, level, wall_yaw
 from ..jobs.threads import Workers, num_cores
-from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..photo import Photo
+from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import prepare_map
 from .command import Arguments, check_outputs, check_suffix, checking_options, command, option
 from .options import add_cloud_options

@@ -16,11 +16,11 @@ from tqdm import tqdm
 from ..batch.localizer import Answer, Localizer, Task
 from ..confidence.confidence import AMBIGUOUS, LOCALIZED
 from ..errors import InputError, printable
+from ..evidence.focal_length import WIDE
 from ..jobs.cluster import Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
-from ..localization.focal_length import WIDE
 from ..opened_scan import OpenedScan
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map

@@ -22,12 +22,12 @@ from ..files.atomic import STDOUT, check_output, is_stdout, is_stream, temporary
 from ..files.line_file import open_locked, write_line
 from ..jobs.memory import limit_memory
 from ..jobs.threads import Stopwatch, num_cores
-from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import OpenedScan
 from ..panorama import read_panorama
 from ..panorama.cube import is_cube
 from ..panorama.masks import find_mask
 from ..panorama.photo import sha256_of
+from ..problem.settings import CoarseToFineSettings
 from ..result import FAILED, UNREADABLE
 from ..scan_map.open_map import scan_sha256_of
 from ..scan_map.scan_map import ScanMap

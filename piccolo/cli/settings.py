@@ -9,11 +9,11 @@ from ..batch.localizer import Localizer
 from ..cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
 from ..errors import InputError
 from ..geometry.colors import Labels
-from ..localization.settings import CoarseToFineSettings
 from ..opened_scan import Settings
 from ..panorama import check_labels
 from ..paper.localize import PaperSettings
 from ..photo import Photo, Prior
+from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import CachePolicy
 from .command import Arguments
 from .options import NONE

@@ -12,23 +12,23 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from ..evidence.examine import check_prior, choose, choose_among, examine
+from ..evidence.verification import Verified, draw_near, verify
 from ..geometry.pose import Pose
 from ..jobs.threads import Once, Stopwatch, Workers
+from ..judge.candidate import Candidate
+from ..judge.selection import CHANCE_MATCHES, FAINT_SCORE, is_clear, is_sure, rank
 from ..local_features.hypotheses import count_matches, propose_poses
 from ..local_features.keypoints import Keypoints, join_keypoints
 from ..local_features.matching import Matches, join_matches
 from ..photo import NOTHING_KNOWN
+from ..problem.problem import Problem
+from ..problem.profile import Beam
+from ..problem.settings import Effort
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from .beam import refine_matches, refine_starts, score_mirror, score_starts
-from .candidate import Candidate
-from .examine import check_prior, choose, choose_among, examine
-from .problem import Problem
-from .profile import Beam
 from .search import Tilts, search_poses
-from .selection import CHANCE_MATCHES, FAINT_SCORE, is_clear, is_sure, rank
-from .settings import Effort
-from .verification import Verified, draw_near, verify
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
 FIRST_BEAM = Beam(100, 12, 4, 1)

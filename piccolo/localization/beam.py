@@ -8,25 +8,25 @@ import numpy as np
 
 from ..arrays import Array, Int64s
 from ..confidence.alternatives import Hypothesis, best_distinct, sort_by_score, suppress_near
+from ..evidence.examine import examine
 from ..geometry.cone import Cone
 from ..geometry.nearness import DESCENDED, DESCENDING, ONE_ANSWER, Nearness, non_maximum_suppression
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
+from ..judge.candidate import Candidate
 from ..kernels.jit import F0, kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
 from ..panorama.texels import Texels
+from ..problem.cone import find_cone, select_cells
+from ..problem.problem import Problem
+from ..problem.profile import Beam
+from ..problem.settings import Effort
+from ..problem.stages import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage
 from ..views.candidate_views import SEARCH_VIEW, Views
 from ..views.view import ViewArrays
-from .candidate import Candidate
-from .cone import find_cone, select_cells
-from .examine import examine
 from .ladder import climb, refine
-from .problem import Problem
-from .profile import Beam
 from .search import Starts, search_poses
-from .settings import Effort
-from .stages import AROUND_MIDDLE, FINE, FIRST, MIDDLE, SECOND, Stage
 
 BATCH = 16  # starts that a thread takes at a time
 NUM_FOUND = 12  # poses of a search, at most

@@ -11,27 +11,27 @@ from typing import NamedTuple
 
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
+from ..evidence.covariance import split_errors
+from ..evidence.examine import examine
+from ..evidence.focal_length import FocalFit
+from ..evidence.verification import Located, match_beside, match_covariance, place_keypoints
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.decide import reconsider, take_pose
+from ..judge.selection import SURE_MATCHES
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
+from ..problem.prior import apply_prior, contradictions
+from ..problem.problem import Problem, prepare_problem
+from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .attempts import add_verified
-from .covariance import split_errors
-from .examine import examine
-from .focal_length import FocalFit
-from .judge import reconsider, take_pose
 from .judging import Found, judge
 from .last_descent import refine_best
 from .localize import fit_camera
-from .prior import apply_prior, contradictions
-from .problem import Problem, prepare_problem
-from .selection import SURE_MATCHES
-from .settings import CoarseToFineSettings
-from .verification import Located, match_beside, match_covariance, place_keypoints
 
 MOST_BESIDE = 3  # photos whose matches count, those with the most
 

@@ -17,10 +17,14 @@ from ..arrays import Array
 from ..confidence.confidence import LOCALIZED
 from ..confidence.focal_length import MOST_CONFLICT, Consensus
 from ..confidence.localization import Localization
+from ..evidence.examine import complete, examine
+from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.candidate import Selection
 from ..panorama import Panorama
+from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (
     NUM_ROUNDS,
@@ -42,12 +46,9 @@ from .bundle_search import (
     propose_bundles,
     weigh_bundles,
 )
-from .candidate import Selection
-from .examine import complete, examine
-from .focal_length import FocalFit, calibrate
+from .calibration import calibrate
 from .judging import Found, judge, judge_together
 from .localize import explain_nothing, find_alone
-from .settings import CoarseToFineSettings
 
 EVEN = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]

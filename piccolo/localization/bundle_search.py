@@ -12,21 +12,22 @@ from ..arrays import Array
 from ..confidence.confidence import CONTRADICTED, posterior
 from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
+from ..evidence.covariance import estimate_errors
+from ..evidence.examine import complete, count_agreeing, examine
+from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from ..jobs.threads import Workers
+from ..judge.candidate import Candidate, Selection
+from ..judge.case import Errors
+from ..judge.selection import assess
+from ..problem.problem import Problem
+from ..problem.stages import FINE
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
-from .candidate import Candidate, Selection
-from .covariance import Errors, estimate_errors
-from .examine import complete, count_agreeing, examine
 from .judging import Found
 from .ladder import refine
 from .last_descent import HOPELESS_SCORE
-from .problem import Problem
-from .selection import assess
-from .stages import FINE
-from .verification import draw_near, verify
 
 MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMARK.md's phone photos a sixth)
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing

@@ -3,15 +3,15 @@
 from itertools import compress
 
 from ..confidence.alternatives import MAX_ALTERNATIVES, suppress_near
+from ..evidence.examine import complete, examine_each
+from ..evidence.verification import find_copies
 from ..geometry.nearness import ONE_ANSWER
 from ..jobs.threads import Workers
-from .candidate import Selection
-from .examine import complete, examine_each
-from .problem import Problem
-from .selection import find_rivals
-from .settings import Effort
+from ..judge.candidate import Selection
+from ..judge.selection import find_rivals
+from ..problem.problem import Problem
+from ..problem.settings import Effort
 from .shape import find_alike
-from .verification import find_copies
 
 
 def list_reported(

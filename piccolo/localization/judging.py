@@ -8,20 +8,21 @@ from typing import NamedTuple
 from ..arrays import Array
 from ..confidence.confidence import posterior
 from ..confidence.localization import Localization
+from ..evidence.examine import complete
+from ..evidence.focal_length import FocalFit, doubt_unconfirmed, fit_focal
+from ..evidence.measuring import Fit, describe_geometry, measure
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from ..jobs.threads import Workers
-from .candidate import Candidate, Selection
+from ..judge.candidate import Candidate, Selection
+from ..judge.case import Case
+from ..judge.decide import conclude, doubt_given
+from ..judge.selection import assess, credit_copies, is_mirrored
+from ..problem.prior import contradictions
+from ..problem.problem import Problem
+from ..problem.settings import CoarseToFineSettings
 from .copies import list_reported
-from .examine import complete
-from .focal_length import FocalFit, fit_focal
-from .judge import Case, conclude, doubt_alone, doubt_given
 from .ladder import settle
-from .measuring import Fit, measure
 from .mirror import find_mirrored
-from .prior import contradictions
-from .problem import Problem
-from .selection import assess, credit_copies, is_mirrored
-from .settings import CoarseToFineSettings
 
 WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
 
@@ -58,8 +59,9 @@ def judge(
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.ranked[likeliest], fit, workers)
         return judge(other, settings, workers, may_promote=False)
-    fit = doubt_alone(fit, measured.errors.gaussian)
-    case = Case(problem.scan_map, problem.given, reported, fit, measured, tuple(standings))
+    if isinstance(fit, FocalFit):
+        fit = doubt_unconfirmed(fit, measured.errors.gaussian)
+    case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
     return decide_case(problem, case, probabilities, settings, workers)
 
 
@@ -100,7 +102,7 @@ def judge_together(
         contradicted=contradictions(problem.scan_map, gaussian.pose, problem.prior),
     )
     standings = tuple(assess(problem.profile, selection))
-    case = Case(problem.scan_map, problem.given, selection, fit, measured, standings)
+    case = Case(selection, standings, measured, fit and describe_geometry(problem, fit))
     return decide_case(problem, case, probabilities, settings, workers)
 
 
@@ -108,8 +110,9 @@ def decide_case(
     problem: Problem, case: Case, probabilities: Array, settings: CoarseToFineSettings, workers: Workers
 ) -> Localization:
     """Return the result of a case; the mirrored photo is searched if any pose is likely."""
-    probabilities = doubt_given(probabilities, case.fit)
+    probabilities = doubt_given(probabilities, case.geometry)
     best = case.found.best
-    is_likely = probabilities[-1] < 1.0 - WORTH_ASKING
-    mirrored = find_mirrored(problem, best, settings.effort, workers) if is_likely else None
-    return conclude(case, probabilities, is_mirrored(best, mirrored), settings.min_confidence)
+    if probabilities[-1] < 1.0 - WORTH_ASKING:
+        mirrored = find_mirrored(problem, best, settings.effort, workers)
+        case = case._replace(is_mirrored=is_mirrored(best, mirrored))
+    return conclude(problem.scan_map, case, probabilities, settings.min_confidence)

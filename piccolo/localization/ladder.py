@@ -7,21 +7,21 @@ import numpy as np
 
 from ..arrays import Array, Array32, Int32s
 from ..confidence.alternatives import Hypothesis
+from ..evidence.comparison import mask_occluders
+from ..evidence.examine import examine
 from ..geometry.pose import Pose, orthonormal
 from ..jobs.threads import Workers
+from ..judge.candidate import Candidate
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, descend_channels, score
 from ..optimize.levenberg_marquardt import retract
-from ..panorama.local_normalization import LEVELS_PER_UNIT, ZERO_LEVEL
+from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
+from ..problem.problem import Problem
+from ..problem.profile import VIEWS
+from ..problem.stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, SOFT, Limits, Stage
 from ..views.points_around import PLACE_SPACING
 from ..views.view import Cells
-from .candidate import Candidate
-from .comparison import mask_occluders
-from .examine import examine
-from .problem import Problem
-from .profile import VIEWS
-from .stages import AROUND_FINE, AROUND_MIDDLE, FINE, FULL, LAST, MIDDLE, SOFT, Limits, Stage
 
 PERTURBED_DISTANCE = 0.25  # [m]
 PERTURBED_ANGLE = math.radians(8.0)
@@ -192,11 +192,6 @@ def descend_perturbed(
             problem = ChannelProblem(points, levels, weights, texels, width, scale)
             descend_channels(problem, num_iterations[image], tolerance, R[k], t[k])
         scores[k] = score(points, levels, weights, blocks, fine.rgbx, fine.width, R[k], t[k])
-
-
-def to_levels(channels: Array32) -> Array32:
-    """Convert channels in standard deviations to 8-bit levels, not rounded."""
-    return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))
 
 
 def perturbations(size: float) -> Array:

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+from ..evidence.examine import choose, choose_among, complete
 from ..jobs.threads import Workers
-from .candidate import Candidate, Selection
-from .examine import choose, choose_among, complete
+from ..judge.candidate import Candidate, Selection
+from ..judge.selection import SURE_MATCHES, count_matches, is_faint, rank
+from ..problem.problem import Problem
 from .ladder import climb_to_full, climb_unoccluded, settle
-from .problem import Problem
-from .selection import SURE_MATCHES, count_matches, is_faint, rank
 
 HOPELESS_SCORE = 0.02  # black, white and noisy pictures, and most photos of other places, have less
 NEAR_SCORE = 0.6  # an alternative with this fraction of the best score is refined like the best

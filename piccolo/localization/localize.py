@@ -7,25 +7,25 @@ from dataclasses import replace
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED
 from ..confidence.localization import Alternative, FocalLength, Localization
+from ..evidence.focal_length import WIDE
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.candidate import Candidate, Selection
+from ..judge.decide import reconsider
+from ..judge.selection import is_faint
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
 from ..photo import Prior
+from ..problem.prior import apply_prior, nothing_allowed
+from ..problem.problem import Problem, prepare_problem
+from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
 from .attempts import Means, plan_attempts, search_beyond_prior
-from .candidate import Candidate, Selection
-from .focal_length import WIDE, calibrate
-from .judge import reconsider
+from .calibration import calibrate, calibrate_sphere
 from .judging import Found, judge
 from .last_descent import refine_best
-from .prior import apply_prior, nothing_allowed
-from .problem import Problem, prepare_problem
-from .selection import is_faint
-from .settings import CoarseToFineSettings
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
-from .sphere import calibrate_sphere
 
 GUESSES = (
     0.0,

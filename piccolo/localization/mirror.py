@@ -4,19 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..evidence.examine import count_agreeing
 from ..geometry.pose import Pose, uniform_yaws
 from ..jobs.threads import Workers
+from ..judge.candidate import Candidate
+from ..judge.selection import explains_more
 from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
+from ..problem.photo_images import ACROSS
+from ..problem.problem import Problem
+from ..problem.settings import Effort
 from .attempts import FIRST_BEAM, join_features
 from .beam import descend_briefly, refine_matches, refine_starts, score_briefly, score_near
-from .candidate import Candidate
-from .examine import count_agreeing
-from .photo_images import ACROSS
-from .problem import Problem
 from .search import search_poses
-from .selection import explains_more
-from .settings import Effort
 
 ENOUGH_EXPLAINED = 0.7  # with this score a photo is not mirrored
 FOUND_AGAIN = 0.9  # least score of an end of a brief search, as a fraction of the pose's, to count as found

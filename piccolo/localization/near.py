@@ -4,21 +4,22 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ..confidence.confidence import Standing, posterior
+from ..evidence.comparison import compare_from
+from ..evidence.covariance import estimate_covariance
+from ..evidence.examine import complete
+from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from ..jobs.threads import Workers
-from .candidate import Candidate, Selection
-from .comparison import compare_from
-from .covariance import UNKNOWN_ERRORS, estimate_covariance
-from .examine import complete
+from ..judge.candidate import Candidate, Selection
+from ..judge.case import UNKNOWN_ERRORS
+from ..judge.selection import assess_alone
+from ..problem.prior import contradictions
+from ..problem.problem import Problem
+from ..problem.stages import FULL, NEARLY
 from .ladder import climb_from_afar, refine, settle
 from .last_descent import HOPELESS_SCORE
-from .prior import contradictions
-from .problem import Problem
-from .selection import assess_alone
-from .stages import FULL, NEARLY
-from .verification import draw_near, verify
 
 
 class Near(NamedTuple):

@@ -14,12 +14,12 @@ from ..jobs.threads import Workers
 from ..kernels.jit import F0, kernel
 from ..panorama.local_normalization import sample_channels
 from ..panorama.texels import Texels
+from ..problem.prior import allow_rotations
+from ..problem.problem import Problem
+from ..problem.settings import Effort
 from ..scan_map.scan_map import ScanMap
 from ..views.candidate_views import WIDE_RINGS
 from .correlation import BLOCK, Samples, correlate_pairs, masked_correlation, weigh_by_area
-from .prior import allow_rotations
-from .problem import Problem
-from .settings import Effort
 
 ROTATIONS_AT_ONCE = 256  # that a thread averages
 SCORES_AT_ONCE = 1 << 23  # 32 MB

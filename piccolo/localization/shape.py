@@ -6,21 +6,21 @@ from dataclasses import replace
 import numpy as np
 
 from ..arrays import Array
+from ..evidence.comparison import FINE_VIEW, compare
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws, yaw_rotation
 from ..geometry.sphere import find_cell, pixel_rays
 from ..jobs.threads import Workers
+from ..judge.candidate import Candidate, Selection
+from ..judge.selection import CLEAR_MARGIN
 from ..panorama.gpano import attitude_of_gravity
+from ..problem.problem import Problem, prepare_problem
+from ..problem.profile import CLEAR_SHAPE, choose_profile
+from ..problem.settings import Effort
 from ..views.points_around import round_position
 from .attempts import FIRST_BEAM
 from .beam import refine_starts, score_starts
-from .candidate import Candidate, Selection
-from .comparison import FINE_VIEW, compare
-from .problem import Problem, prepare_problem
-from .profile import CLEAR_SHAPE, choose_profile
 from .search import search_poses
-from .selection import CLEAR_MARGIN
-from .settings import Effort
 
 NUM_TILTS = 3  # that are searched in full, at most
 # of what the scan shows at a pose, that it shows at a copy of that place too; chosen between panoramas of

@@ -265,3 +265,8 @@ def sample_channels(
                 s1[n] = v * (b - zero)
                 s2[n] = v * (c - zero)
                 valid[n] = v
+
+
+def to_levels(channels: Array32) -> Array32:
+    """Convert channels in standard deviations to 8-bit levels, not rounded."""
+    return np.asarray(channels * np.float32(LEVELS_PER_UNIT) + np.float32(ZERO_LEVEL))

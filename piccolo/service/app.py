@@ -24,8 +24,8 @@ from .. import __version__
 from ..batch.localizer import Task
 from ..errors import InputError
 from ..jobs.processes import OpeningError, Processes, TooSlowError, WorkerLostError
-from ..localization.settings import CoarseToFineSettings
 from ..photo import Photo
+from ..problem.settings import CoarseToFineSettings
 from ..report import site
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.scan_map import ScanMap

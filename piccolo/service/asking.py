@@ -13,8 +13,8 @@ from starlette.datastructures import FormData, UploadFile
 from ..camera.calibration import calibration_of
 from ..errors import UNPRINTABLE, InputError, printable
 from ..files.json_file import DAMAGE
-from ..localization.settings import CoarseToFineSettings
 from ..photo import Photo, Prior
+from ..problem.settings import CoarseToFineSettings
 
 PARTS = ("photo", "prior", "gravity", "min_confidence")
 # options of a photo that name no file

@@ -21,7 +21,7 @@ from ..errors import InputError
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
-from ..localization.candidate import Candidate
+from ..judge.candidate import Candidate
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 

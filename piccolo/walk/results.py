@@ -23,9 +23,9 @@ from ..confidence.localization import Alternative, Localization
 from ..geometry.pose import Pose, carry
 from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..jobs.threads import Progress, no_progress, one_blas_thread
-from ..localization.judge import decide, take_pose
-from ..localization.prior import contradictions
-from ..localization.problem import Problem
+from ..judge.decide import decide, take_pose
+from ..problem.prior import contradictions
+from ..problem.problem import Problem
 from .frames import Frame
 from .path import EVEN, Belief, Gap, Path, believe, build_lattice
 from .tracker import Expected, Followed, Tracker, find_near, refine_state

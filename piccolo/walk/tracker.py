@@ -9,21 +9,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ..confidence.confidence import MODELS, Standing, pose_features, posterior
+from ..evidence.examine import complete, examine
+from ..evidence.verification import draw_near, match_beside, place_keypoints, verify
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
 from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.candidate import Selection
+from ..judge.selection import assess
 from ..localization.attempts import Means, is_whole
 from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
-from ..localization.candidate import Selection
-from ..localization.examine import complete, examine
 from ..localization.localize import localize
 from ..localization.near import refine_near
-from ..localization.prior import apply_prior
-from ..localization.problem import Problem, prepare_problem
-from ..localization.selection import assess
-from ..localization.settings import CoarseToFineSettings, Effort
-from ..localization.verification import draw_near, match_beside, place_keypoints, verify
 from ..panorama import Panorama
+from ..problem.prior import apply_prior
+from ..problem.problem import Problem, prepare_problem
+from ..problem.settings import CoarseToFineSettings, Effort
 from ..scan_map.camera_positions import FreeSpace
 from ..scan_map.scan_map import ScanMap
 from .frames import (

@@ -12,22 +12,22 @@ from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
 from ..jobs.threads import Workers
+from ..judge.candidate import Candidate
+from ..judge.case import UNKNOWN_ERRORS, Errors
+from ..judge.selection import SURE_MATCHES
 from ..kernels.jit import kernel
 from ..optimize.channel_loss import ChannelProblem, channel_equations, descend_channels, equations_by_part
 from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
-from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
+from ..problem.photo_images import PhotoImages
+from ..problem.prior import contradictions
+from ..problem.problem import Problem
+from ..problem.profile import Profile
+from ..problem.stages import LAST, ImageName
 from ..views.view import Cells
-from .candidate import Candidate
 from .comparison import mask_occluders
-from .ladder import to_levels
-from .photo_images import PhotoImages
-from .prior import contradictions
-from .problem import Problem
-from .profile import Profile
 from .scan_errors import layer_covariance, scan_covariance
-from .selection import SURE_MATCHES
-from .stages import LAST, ImageName
 from .verification import draw_near, place_by_matches
 
 ERROR_RINGS = 12  # 184 blocks of 15 degrees: errors within one are taken as one error
@@ -51,20 +51,6 @@ SEAMS = (0.25, 0.5, 0.75)  # of the points, on one side of a plane between parts
 SEAM_SCORE = 4.5  # of parts; single scans have more in a fifth of photos
 NUM_TRIED = 2  # planes
 HALF_LIMITS = (15, 1e-5)  # iterations of a half's descent, and tolerance [rad + m]
-
-
-class Errors(NamedTuple):
-    """The errors of a pose that is found; None where the points do not fix it."""
-
-    gaussian: PoseGaussian | None  # the pose in the map with its covariance
-    std_of_fit: float | None  # [m] largest deviation if focal length and stitching were exact
-
-    def widen(self, common: Array) -> "Errors":
-        """Return these with a further error (6, 6) that photos have in common, as of a focal length."""
-        return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
-
-
-UNKNOWN_ERRORS = Errors(None, None)
 
 
 class DifferenceSteps(NamedTuple):

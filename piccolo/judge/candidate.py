@@ -10,7 +10,7 @@ from ..arrays import Array, Mask
 from ..geometry.pose import Pose
 from ..local_features.matching import Matches
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
-from .photo_images import PhotoImages
+from ..problem.photo_images import PhotoImages
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
 LEAST_SHARED = 0.3  # fraction of what the poorer view shows

@@ -3,33 +3,26 @@
 import math
 import operator
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
+
+import numpy as np
 
 from ..confidence.localization import Evidence
 from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
+from ..judge.candidate import Selection
+from ..judge.case import Errors, Geometry, Measured
+from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
+from ..problem.prior import contradictions
+from ..problem.problem import Problem
 from ..views.zbuffer import visible_points
-from .candidate import Selection
-from .covariance import Errors, estimate_errors
+from .covariance import estimate_errors
 from .focal_length import FocalFit
-from .prior import contradictions
-from .problem import Problem
-from .selection import count_matches
 from .sphere import SphereFit
 
 Fit = FocalFit | SphereFit
-
-
-class Measured(NamedTuple):
-    """Measurements of the best candidate."""
-
-    pose: Pose  # in the map
-    errors: Errors
-    loss: float
-    evidence: Evidence
-    contradicted: tuple[str, ...]  # what was given that the pose contradicts
 
 
 def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Workers) -> Measured | None:
@@ -71,3 +64,12 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
     )
     errors = errors.widen(fit.pose_covariance) if fit else errors
     return Measured(end, errors, loss, evidence, contradictions(problem.scan_map, end, problem.prior))
+
+
+def describe_geometry(problem: Problem, fit: Fit) -> Geometry:
+    """Return what was found out about the geometry of a photo."""
+    std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
+    found = Geometry(problem.given.cameras, fit.doubt, fit.conflict, std)
+    if isinstance(fit, FocalFit):
+        return found._replace(focal_length=fit.focal_length(problem.given), contradicted=fit.contradicted)
+    return found if fit.is_claimed else found._replace(sphere=fit.describe())

@@ -14,12 +14,11 @@ from ..camera.corrections import Corrections
 from ..geometry.pose import Pose, exp_so3, orthonormal
 from ..optimize.channel_loss import ChannelProblem
 from ..optimize.self_calibration import NUM_OF_POSE, FreeSums, sum_free_equations
-from ..panorama.local_normalization import LEVELS_PER_UNIT
+from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
+from ..problem.stages import Limits
 from ..views.view import Cells
 from .covariance import jackknife_gradients, sort_by_block, take
-from .ladder import to_levels
-from .stages import Limits
 
 FIRST_DAMPING = 1e-3
 RISE = 6.0  # of the damping, after a step that does not lower the loss

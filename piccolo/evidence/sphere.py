@@ -8,7 +8,6 @@ claimed as long as the photo agrees; else as found, from several starts, and the
 
 import itertools
 import math
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -16,17 +15,13 @@ import numpy as np
 from ..arrays import Array
 from ..camera import Camera, Mount
 from ..camera.corrections import Corrections
-from ..camera.model import whole_sphere
 from ..confidence.claim import Claim
 from ..confidence.localization import SphereGeometry
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
-from .candidate import Selection
-from .examine import examine_each
-from .last_descent import refine_best
-from .problem import Problem
-from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, estimate_corrections, invert
-from .stages import Limits
+from ..problem.problem import Problem
+from ..problem.stages import Limits
+from .self_calibration import Estimate, Freedom, FreeEnd, descend_freely, invert
 
 NO_CORRECTION = np.zeros(3)
 CLAIM = Claim(
@@ -39,20 +34,13 @@ CURVATURE = 0.5  # as of `self_calibration`, but of whole panoramas, whose loss 
 BY_CHANCE = 12.0  # squared deviations of the corrections together that a right claim may have
 MOST = np.array([0.2, 0.6, 0.4])  # corrections that are searched
 ANY = np.full(3, np.inf)
-SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
-CONTRADICTED = 3.0  # from which one that explains more is taken
-MIN_GAIN = 1.1  # times the score, by another geometry
 HEIGHTS = -np.log([1.0, 0.9, 0.8, 0.72])  # corrections of the height from which descents begin
 LEAST_CUT = 0.1  # of the height, for which the horizons of starts are spread
 HORIZONS = (-1.0, -0.5, 0.0, 0.5, 1.0)  # where all, three quarters or half is cut off at one end
 NUM_ENDS = 3  # of the descents on coarse cells, that go on
-CHECK = Limits(1.0, 8, 1e-3)
 COARSE = Limits(1.2, 10, 5e-3)
 MIDDLE = Limits(1.2, 12, 1e-3)
 FINE = Limits(1.0, 15, 1e-3)
-FULL = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
-HERE = Limits(0.7, 1, 1e-4)  # and where it does, which tells how exact it is
-MOST_ROUNDS = 3
 
 
 class SphereFit(NamedTuple):
@@ -105,50 +93,6 @@ def count_deviations(estimate: Estimate) -> float:
     """Return how many deviations the most contradicted correction is from what is claimed."""
     variances = np.diag(invert(estimate.information))
     return float((np.abs(estimate.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
-
-
-def calibrate_sphere(
-    problem: Problem, found: Selection, workers: Workers
-) -> tuple[Problem, Selection, SphereFit]:
-    """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
-    camera = whole_sphere(*problem.given.rgb.shape[1::-1])
-    freedom = make_freedom(camera)
-    ways = (
-        partial(descend_on_cells, problem, found.best.pose, freedom, NO_CORRECTION, CHECK),
-        partial(descend_on_points, problem, found.best.pose, freedom, HERE),
-    )
-    estimate, here = workers.map(lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama")
-    is_suspect = count_deviations(estimate) > SUSPECT
-    other = retake_as_found(problem, found, camera, workers) if is_suspect else None
-    if other is not None:
-        return other
-    conflict = CLAIM.conflict(estimate.values, estimate.information)
-    doubt = CLAIM.doubt(estimate.values, estimate.information)
-    return problem, found, SphereFit(camera, here, True, conflict, doubt)
-
-
-def retake_as_found(
-    problem: Problem, found: Selection, claimed: Camera, workers: Workers
-) -> tuple[Problem, Selection, SphereFit] | None:
-    """Search other geometries; return the problem with one that explains clearly more, refined, or None."""
-    end = search_geometry(problem, found.best.pose, claimed, workers)
-    if count_deviations(estimate_corrections(end, CURVATURE)) < CONTRADICTED:
-        return None
-    given = problem.given
-    camera = claimed
-    best = found
-    for _ in range(MOST_ROUNDS):
-        camera = Corrections(Mount(camera)).apply(end.values)
-        problem = problem.retake(given.retake(camera))
-        others = [h.pose for h in best.alternatives]
-        scored = examine_each(problem, [end.pose, *others], workers)
-        best = refine_best(problem, scored, workers)
-        end = descend_on_points(problem, best.best.pose, make_freedom(camera), FULL)
-        if np.all(np.abs(end.values) < CLAIM.deviations):
-            break
-    if best.best.score < MIN_GAIN * found.best.score:
-        return None
-    return problem, best, SphereFit(camera, estimate_corrections(end, CURVATURE), is_claimed=False)
 
 
 def descend_on_cells(

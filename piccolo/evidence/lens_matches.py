@@ -9,9 +9,9 @@ from ..camera import Mount
 from ..camera.corrections import FOCAL, LENS, Corrections
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
+from ..judge.selection import SURE_MATCHES
 from ..local_features.matching import Matches
 from ..optimize.self_calibration import NUM_OF_POSE
-from .selection import SURE_MATCHES
 from .self_calibration import Estimate, invert
 from .verification import LEAST_ERROR
 

@@ -9,34 +9,32 @@ The covariance of the pose is marginal: it includes the errors of all.
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
 import cv2
 import numpy as np
 
-from ..arrays import Array, Array32, Mask
-from ..camera import Camera, Mount
+from ..arrays import Array, Mask
+from ..camera import Camera
 from ..camera.corrections import FOCAL, LENS, Corrections
 from ..camera.model import MODELS, RADIAL
 from ..confidence.claim import Claim, marginal
 from ..confidence.focal_length import WRONG_DEVIATION, WRONG_SHARE, Opinion
 from ..confidence.localization import FocalLength
 from ..geometry.pose import Pose, rotate_points
-from ..geometry.pose_gaussian import add
+from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..geometry.sphere import compute_indices
-from ..jobs.threads import Once, Workers
+from ..jobs.threads import Workers
+from ..judge.candidate import Candidate
 from ..local_features.matching import NO_MATCHES, Matches
 from ..panorama import Panorama
 from ..panorama.model import FocalPrior
+from ..problem.problem import Problem
+from ..problem.stages import Limits
 from ..views.view import Cells
-from .candidate import Candidate, Selection
 from .comparison import mask_occluders
 from .covariance import UNCALIBRATED
-from .examine import examine_each
-from .last_descent import refine_best
 from .lens_matches import MOST, MatchFit, add_matches, fit_matches
-from .problem import Features, Problem
 from .self_calibration import (
     Estimate,
     Freedom,
@@ -45,7 +43,6 @@ from .self_calibration import (
     estimate_corrections,
     invert,
 )
-from .stages import Limits
 from .verification import draw_near
 
 WIDE = 0.05  # a focal length with a larger deviation is a guess: k1 is fitted too
@@ -65,17 +62,15 @@ MOST_VARIANCE = 1.0  # of a focal length's logarithm: with more, the picture say
 FOCAL_WIDTHS = (0.5, *CALIBRATED)
 ALL_WIDTHS = (0.1, 0.05, 0.02, 0.02, 0.1)
 DISAGREE = 2.0  # deviations between picture and what was given, by which chance parts them in one of twenty
-CLEARLY = 2.5  # deviations by which matches must tell another one
-MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
 # of the covariance where all corrections are free, so that right calibrations of 91 crops differ from what is
 # found as chance has it
 INFLATION_OF_ALL = 2.0
 # [px] of the sphere at the picture's edge, which all blocks may have in common; with 0.4 of the focal length
 # a right calibration was called wrong in the real corridor of tests/data
 EDGE_ERRORS = (0.6, 0.2, 0.2, 0.2, 0.4)
+UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 AT_REST = 0.5  # deviations: a smaller change ends the fit
 LEAST_CHANGE = 5e-4  # and so does a smaller fraction of the focal length
-MAX_CALIBRATIONS = 4  # fits of a focal length
 EDGE = 17  # [px] of the sphere, around a point that shows nothing beyond the picture
 NEAR = Limits(1.0, 8, 1e-3)  # on fine cells, from another focal length
 CLOSE = Limits(0.7, 15, 1e-4)
@@ -128,6 +123,17 @@ class FocalFit(NamedTuple):
         px = prior.focal * math.exp(self.opinion.off)
         std = math.sqrt(self.opinion.variance) * px
         return replace(found, doubt=self.doubt, picture_px=px, picture_std_px=std)
+
+
+def doubt_unconfirmed(fit: FocalFit, gaussian: PoseGaussian | None) -> FocalFit:
+    """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
+
+    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
+    """
+    if fit.of_picture is None or gaussian is None:
+        return fit
+    missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
+    return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
 
 
 def fit_focal(problem: Problem, best: Candidate, workers: Workers, is_first: bool = True) -> FocalFit:
@@ -301,79 +307,3 @@ def estimate_lens(problem: Problem, pose: Pose, end: FreeEnd) -> Estimate:
     is_known = estimate.information.any(axis=1)
     errors = np.diag(is_known * (np.array(EDGE_ERRORS) * per_px) ** 2)
     return estimate._replace(information=invert(covariance + errors))
-
-
-def calibrate(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection, FocalFit]:
-    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
-
-    The last change is applied too, so that what is found lies between what was given and what the picture
-    says.
-    """
-    problem, found = follow_matches(problem, found, workers)
-    fit = fit_focal(problem, found.best, workers)
-    for _ in range(MAX_CALIBRATIONS):
-        if fit.is_at_rest:
-            break
-        problem, found = refine_with(problem, found, fit.change, fit.move(found.best.pose), workers)
-        fit = fit_focal(problem, found.best, workers, is_first=False)
-    left = find_change_left(problem.given, fit)
-    if left.any():
-        moved = add(found.best.pose, fit.motion @ left)
-        problem, found = refine_with(problem, found, left, moved, workers)
-    return problem, found, fit._replace(change=fit.change - left)
-
-
-def find_change_left(panorama: Panorama, fit: FocalFit) -> Array:
-    """Return the change (p,) that brings the focal length between those of the picture and of the prior."""
-    prior = panorama.focal_prior
-    assert prior is not None
-    left = np.zeros_like(fit.change)
-    if fit.opinion is not None:
-        now = math.log(panorama.cameras[0].camera.focal[0] / prior.focal)
-        least, most = sorted((0.0, fit.opinion.off))
-        left[0] = min(max(now, least), most) - now
-    return left
-
-
-def refine_with(
-    problem: Problem, found: Selection, change: Array, best: Pose, workers: Workers
-) -> tuple[Problem, Selection]:
-    """Refine the poses with another calibration, of which the best is `best`."""
-    problem = recalibrate(problem, change, workers)
-    poses = [best, *(h.pose for h in found.alternatives)]
-    return problem, refine_best(problem, examine_each(problem, poses, workers), workers)
-
-
-def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:
-    """Begin with the focal length by which most matches agree, if that is clearly another."""
-    matches = list_matches(problem, found.best, workers)
-    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
-    change = float(by_matches.values[FOCAL])
-    if abs(change) * math.sqrt(by_matches.information) < CLEARLY:
-        return problem, found
-    other = refine_with(problem, found, np.array([change]), by_matches.pose, workers)
-    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (problem, found)
-
-
-def recalibrate(problem: Problem, change: Array, workers: Workers) -> Problem:
-    """Prepare the problem again with another calibration; its matches stay, and their rays follow."""
-    given = problem.given
-    before = given.cameras[0]
-    after = before.with_camera(before.camera.change(*change))
-    taken = given.resample(after.camera, given.rgb.shape[1])
-    features = tuple(Once(partial(_turn_features, part, before, after)) for part in problem.features)
-    beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in problem.beside)
-    return replace(problem.retake(taken), features=features, beside=beside)
-
-
-def _turn_features(part: Once[Features], before: Mount, after: Mount, workers: Workers) -> Features:
-    """Give the features the rays that another calibration gives to their pixels."""
-    found = part(workers)
-    keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
-    return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
-
-
-def _turn_rays(rays: Array32, before: Mount, after: Mount) -> Array32:
-    pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
-    found, _ = after.camera.rays(pixels)
-    return np.asarray(rotate_points(found, before.rotation.T), np.float32)

@@ -7,12 +7,12 @@ from functools import partial
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
-from .candidate import Candidate, Selection
+from ..judge.candidate import Candidate, Selection
+from ..judge.selection import find_rivals, rank, select
+from ..problem.prior import contradictions
+from ..problem.problem import Problem
+from ..problem.profile import DRAWN_VIEW
 from .comparison import compare
-from .prior import contradictions
-from .problem import Problem
-from .profile import DRAWN_VIEW
-from .selection import find_rivals, rank, select
 from .verification import draw_near, verify
 
 DRAWN_CHANCE = 0.2  # correlation of a block's drawn edges that wrong poses reach: these are sharper

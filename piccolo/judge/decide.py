@@ -17,22 +17,17 @@ A new way hands over as `bundle` or `beside` do. It is wired in by a method of `
 
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
 from ..arrays import Array
-from ..confidence.confidence import LOCALIZED, Standing, classify
+from ..confidence.confidence import LOCALIZED, classify
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, FocalLength, Localization
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
-from ..panorama import Panorama
+from ..geometry.pose_gaussian import PoseGaussian
 from ..scan_map.scan_map import ScanMap
-from .candidate import Selection
-from .focal_length import FocalFit
-from .measuring import Fit, Measured
-from .sphere import SphereFit
+from .case import Case, Geometry
 
 MIRRORED = "the photo fits the scan better mirrored, left for right: turn it over and try again"
 NOT_AS_CLAIMED = (
@@ -45,48 +40,26 @@ OTHERS = {  # corrections of a lens besides its focal length, in words
     "center_y": "principal point",
     "radial": "distortion",
 }
-UNCONFIRMED = 0.1  # chosen: weight of a photo's own focal length, against the one given, in what it confirms
 TELLING_STD = 0.03  # [m] of the position by the focal length: more is reported
 
 
-class Case(NamedTuple):
-    """What the judge reads."""
-
-    scan_map: ScanMap
-    given: Panorama
-    found: Selection  # with the alternatives that are reported
-    fit: Fit | None
-    measured: Measured
-    standings: tuple[Standing, ...]  # evidence for the best pose and each alternative
-
-
-def doubt_alone(fit: Fit | None, gaussian: PoseGaussian | None) -> Fit | None:
-    """Return the fit of a photo by itself, doubted more where the photo does not confirm what was given.
-
-    If what was given says nothing, the pose is only as exact as by the photo's own focal length.
-    """
-    if not isinstance(fit, FocalFit) or fit.of_picture is None or gaussian is None:
-        return fit
-    missed = 1.0 - probability_within(gaussian.widen(fit.of_picture))
-    return fit._replace(doubt=1.0 - (1.0 - fit.doubt) * (1.0 - UNCONFIRMED * missed))
-
-
-def doubt_given(probabilities: Array, fit: Fit | None) -> Array:
+def doubt_given(probabilities: Array, geometry: Geometry | None) -> Array:
     """Return probabilities (K + 1,) less by the doubt about what was given: no pose is surer than that."""
-    if fit is None:
+    if geometry is None:
         return probabilities
-    poses = (1.0 - fit.doubt) * probabilities[:-1]
+    poses = (1.0 - geometry.doubt) * probabilities[:-1]
     return np.append(poses, 1.0 - poses.sum())
 
 
-def conclude(case: Case, probabilities: Array, is_mirrored: bool, min_confidence: float) -> Localization:
-    """Return the result for measurements and probabilities, if nothing rules the pose out."""
-    scan_map, given, found, fit, measured, standings = case
-    warnings = measured.contradicted + ((MIRRORED,) if is_mirrored else ())
+def conclude(scan_map: ScanMap, case: Case, probabilities: Array, min_confidence: float) -> Localization:
+    """Return the result in the world for a case and probabilities, if nothing rules the pose out."""
+    measured = case.measured
+    geometry = case.geometry
+    warnings = measured.contradicted + ((MIRRORED,) if case.is_mirrored else ())
     gaussian, std_of_fit = measured.errors
     alternatives = [
         Alternative(scan_map.to_world(h.pose), h.score, s.num_matches)
-        for h, s in zip(found.alternatives, standings[1:], strict=True)
+        for h, s in zip(case.found.alternatives, case.standings[1:], strict=True)
     ]
     described = Localization(
         pose=scan_map.to_world(measured.pose),
@@ -95,20 +68,20 @@ def conclude(case: Case, probabilities: Array, is_mirrored: bool, min_confidence
         alternatives=tuple(alternatives),
         covariance=describe_errors(gaussian, scan_map.R_map_from_world.T),
         warnings=warnings,
-        cameras=() if fit is None else given.cameras,
-        focal_length=fit.focal_length(given) if isinstance(fit, FocalFit) else None,
-        sphere=fit.describe() if isinstance(fit, SphereFit) and not fit.is_claimed else None,
-        is_ruled_out=bool(warnings) or (fit is not None and fit.conflict > MOST_CONFLICT),
+        cameras=() if geometry is None else geometry.cameras,
+        focal_length=geometry and geometry.focal_length,
+        sphere=geometry and geometry.sphere,
+        is_ruled_out=bool(warnings) or (geometry is not None and geometry.conflict > MOST_CONFLICT),
         gaussian=gaussian,
         std_of_fit=std_of_fit,
-        standings=standings,
+        standings=case.standings,
     )
     decided = decide(described, probabilities, min_confidence)
     if decided.sphere is not None:
         return replace(decided, warnings=(*warnings, decided.sphere.explain()))
-    if fit is None or decided.status == LOCALIZED:
+    if geometry is None or decided.status == LOCALIZED:
         return decided
-    return replace(decided, warnings=warnings + explain_doubts(given, fit))
+    return replace(decided, warnings=warnings + explain_doubts(geometry))
 
 
 def decide(found: Localization, probabilities: Array, min_confidence: float) -> Localization:
@@ -166,19 +139,18 @@ def take_pose(judged: Localization, fused: PoseGaussian, scan_map: ScanMap) -> L
     return replace(judged, pose=scan_map.to_world(fused.pose), covariance=described, gaussian=fused)
 
 
-def explain_doubts(panorama: Panorama, fit: Fit) -> tuple[str, ...]:
+def explain_doubts(geometry: Geometry) -> tuple[str, ...]:
     """Explain how the photo's geometry makes a pose doubtful, as warnings."""
-    if isinstance(fit, SphereFit):
-        return (NOT_AS_CLAIMED,) if fit.conflict > MOST_CONFLICT else ()
-    focal = fit.focal_length(panorama)
-    if fit.conflict > MOST_CONFLICT:
-        return (explain_conflict(fit.contradicted, focal),)
-    std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
-    if std <= TELLING_STD:
+    focal = geometry.focal_length
+    if focal is None:
+        return (NOT_AS_CLAIMED,) if geometry.conflict > MOST_CONFLICT else ()
+    if geometry.conflict > MOST_CONFLICT:
+        return (explain_conflict(geometry.contradicted, focal),)
+    if geometry.std <= TELLING_STD:
         return ()
     found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
     given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
-    return (f"{found} ({given}): the position is uncertain by {std:.2f} m",)
+    return (f"{found} ({given}): the position is uncertain by {geometry.std:.2f} m",)
 
 
 def explain_conflict(correction: str, focal: FocalLength) -> str:

@@ -21,15 +21,15 @@ from ..geometry.pose import Pose, exp_so3, log_so3, rotate_points
 from ..geometry.pose_gaussian import LOOSE, differentiate_rays
 from ..geometry.sphere import compute_indices
 from ..jobs.threads import Workers
+from ..judge.candidate import Drawn
+from ..judge.selection import CHANCE_MATCHES
 from ..kernels.jit import kernel
 from ..local_features.hypotheses import COS_EXACT, LEAST_MATCHES, count_matches, exact_pose, find_inliers
 from ..local_features.keypoints import Keypoints, find_in_view, join_keypoints
 from ..local_features.matching import NO_MATCHES, Matches, merge_matches
 from ..local_features.perspective_view import PerspectiveView, add_margin
 from ..local_features.view_image import ViewImage, render_gray
-from .candidate import Drawn
-from .problem import Problem
-from .selection import CHANCE_MATCHES
+from ..problem.problem import Problem
 
 PLACE = 0.1  # [m] the scan is drawn at positions on a grid of this spacing
 TURN = 0.05  # [rad] and at rotation vectors on one of this

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..confidence.alternatives import alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
+from ..problem.profile import Profile
 from .candidate import MAX_COMPARED, NOTHING, Candidate, Selection
-from .profile import Profile
 
 FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
 SURE_ODDS = 3.0  # [log] least odds of the best pose against any elsewhere: 20 to 1

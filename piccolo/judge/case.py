@@ -1,0 +1,57 @@
+"""The case of a photo: all that the judge reads, as values."""
+
+from typing import NamedTuple
+
+from ..arrays import Array
+from ..camera import Mount
+from ..confidence.confidence import Standing
+from ..confidence.localization import Evidence, FocalLength, SphereGeometry
+from ..geometry.pose import Pose
+from ..geometry.pose_gaussian import PoseGaussian
+from .candidate import Selection
+
+
+class Errors(NamedTuple):
+    """The errors of a pose that is found; None where the points do not fix it."""
+
+    gaussian: PoseGaussian | None  # the pose in the map with its covariance
+    std_of_fit: float | None  # [m] largest deviation if focal length and stitching were exact
+
+    def widen(self, common: Array) -> "Errors":
+        """Return these with a further error (6, 6) that photos have in common, as of a focal length."""
+        return self._replace(gaussian=self.gaussian and self.gaussian.widen(common))
+
+
+UNKNOWN_ERRORS = Errors(None, None)
+
+
+class Measured(NamedTuple):
+    """Measurements of the best candidate."""
+
+    pose: Pose  # in the map
+    errors: Errors
+    loss: float
+    evidence: Evidence
+    contradicted: tuple[str, ...]  # what was given that the pose contradicts
+
+
+class Geometry(NamedTuple):
+    """What was found out about the geometry of a photo by comparing it with the scan."""
+
+    cameras: tuple[Mount, ...]  # as found
+    doubt: float  # probability that what was given is wrong and has pulled the pose along
+    conflict: float  # deviations between picture and what was given
+    std: float  # [m] of the position by it
+    focal_length: FocalLength | None = None  # of a photo whose focal length was fitted
+    contradicted: str = ""  # of that, the correction of the lens in which picture and given differ most
+    sphere: SphereGeometry | None = None  # of a panorama that is not as it claims
+
+
+class Case(NamedTuple):
+    """What the judge reads of a photo."""
+
+    found: Selection  # with the alternatives that are reported
+    standings: tuple[Standing, ...]  # evidence for the best pose and each alternative
+    measured: Measured
+    geometry: Geometry | None = None  # if it was compared
+    is_mirrored: bool = False  # the photo fits the scan better mirrored

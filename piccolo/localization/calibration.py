@@ -1,0 +1,166 @@
+"""What a photo says of its geometry compared with the scan, and its poses refined with what was found."""
+
+import math
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ..arrays import Array, Array32
+from ..camera import Camera, Mount
+from ..camera.corrections import FOCAL, Corrections
+from ..camera.model import whole_sphere
+from ..evidence.examine import examine_each
+from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
+from ..evidence.lens_matches import fit_matches
+from ..evidence.self_calibration import estimate_corrections
+from ..evidence.sphere import (
+    CLAIM,
+    CURVATURE,
+    NO_CORRECTION,
+    SphereFit,
+    count_deviations,
+    descend_on_cells,
+    descend_on_points,
+    make_freedom,
+    search_geometry,
+)
+from ..geometry.pose import Pose, rotate_points
+from ..geometry.pose_gaussian import add
+from ..jobs.threads import Once, Workers
+from ..judge.candidate import Selection
+from ..panorama import Panorama
+from ..problem.problem import Features, Problem
+from ..problem.stages import Limits
+from .last_descent import refine_best
+
+CLEARLY = 2.5  # deviations by which matches must tell another focal length
+MIN_SCORE_LEFT = 0.95  # fraction of the score that it must keep
+MAX_CALIBRATIONS = 4  # fits of a focal length
+SUSPECT = 0.8  # deviations between claim and picture, from which other geometries are searched
+CONTRADICTED = 3.0  # from which one that explains more is taken
+MIN_GAIN = 1.1  # times the score, by another geometry
+MOST_ROUNDS = 3
+CHECK = Limits(1.0, 8, 1e-3)
+FULL = Limits(0.7, 15, 1e-4)  # on points, where the claim does not hold
+HERE = Limits(0.7, 1, 1e-4)  # and where it does, which tells how exact it is
+
+
+def calibrate(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection, FocalFit]:
+    """Fit the focal length at the best pose, and refine the poses with it, until it is at rest.
+
+    The last change is applied too, so that what is found lies between what was given and what the picture
+    says.
+    """
+    problem, found = follow_matches(problem, found, workers)
+    fit = fit_focal(problem, found.best, workers)
+    for _ in range(MAX_CALIBRATIONS):
+        if fit.is_at_rest:
+            break
+        problem, found = refine_with(problem, found, fit.change, fit.move(found.best.pose), workers)
+        fit = fit_focal(problem, found.best, workers, is_first=False)
+    left = find_change_left(problem.given, fit)
+    if left.any():
+        moved = add(found.best.pose, fit.motion @ left)
+        problem, found = refine_with(problem, found, left, moved, workers)
+    return problem, found, fit._replace(change=fit.change - left)
+
+
+def find_change_left(panorama: Panorama, fit: FocalFit) -> Array:
+    """Return the change (p,) that brings the focal length between those of the picture and of the prior."""
+    prior = panorama.focal_prior
+    assert prior is not None
+    left = np.zeros_like(fit.change)
+    if fit.opinion is not None:
+        now = math.log(panorama.cameras[0].camera.focal[0] / prior.focal)
+        least, most = sorted((0.0, fit.opinion.off))
+        left[0] = min(max(now, least), most) - now
+    return left
+
+
+def refine_with(
+    problem: Problem, found: Selection, change: Array, best: Pose, workers: Workers
+) -> tuple[Problem, Selection]:
+    """Refine the poses with another calibration, of which the best is `best`."""
+    problem = recalibrate(problem, change, workers)
+    poses = [best, *(h.pose for h in found.alternatives)]
+    return problem, refine_best(problem, examine_each(problem, poses, workers), workers)
+
+
+def follow_matches(problem: Problem, found: Selection, workers: Workers) -> tuple[Problem, Selection]:
+    """Begin with the focal length by which most matches agree, if that is clearly another."""
+    matches = list_matches(problem, found.best, workers)
+    by_matches = fit_matches(problem.given.cameras[0], found.best.pose, matches, FOCAL_WIDTHS)
+    change = float(by_matches.values[FOCAL])
+    if abs(change) * math.sqrt(by_matches.information) < CLEARLY:
+        return problem, found
+    other = refine_with(problem, found, np.array([change]), by_matches.pose, workers)
+    return other if other[1].best.score > MIN_SCORE_LEFT * found.best.score else (problem, found)
+
+
+def recalibrate(problem: Problem, change: Array, workers: Workers) -> Problem:
+    """Prepare the problem again with another calibration; its matches stay, and their rays follow."""
+    given = problem.given
+    before = given.cameras[0]
+    after = before.with_camera(before.camera.change(*change))
+    taken = given.resample(after.camera, given.rgb.shape[1])
+    features = tuple(Once(partial(_turn_features, part, before, after)) for part in problem.features)
+    beside = tuple(m._replace(rays=_turn_rays(m.rays, before, after)) for m in problem.beside)
+    return replace(problem.retake(taken), features=features, beside=beside)
+
+
+def _turn_features(part: Once[Features], before: Mount, after: Mount, workers: Workers) -> Features:
+    """Give the features the rays that another calibration gives to their pixels."""
+    found = part(workers)
+    keypoints = found.keypoints._replace(rays=_turn_rays(found.keypoints.rays, before, after))
+    return Features(keypoints, found.matches._replace(rays=_turn_rays(found.matches.rays, before, after)))
+
+
+def _turn_rays(rays: Array32, before: Mount, after: Mount) -> Array32:
+    pixels, _ = before.camera.pixels(rotate_points(rays.astype(np.float64), before.rotation))
+    found, _ = after.camera.rays(pixels)
+    return np.asarray(rotate_points(found, before.rotation.T), np.float32)
+
+
+def calibrate_sphere(
+    problem: Problem, found: Selection, workers: Workers
+) -> tuple[Problem, Selection, SphereFit]:
+    """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
+    camera = whole_sphere(*problem.given.rgb.shape[1::-1])
+    freedom = make_freedom(camera)
+    ways = (
+        partial(descend_on_cells, problem, found.best.pose, freedom, NO_CORRECTION, CHECK),
+        partial(descend_on_points, problem, found.best.pose, freedom, HERE),
+    )
+    estimate, here = workers.map(lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama")
+    is_suspect = count_deviations(estimate) > SUSPECT
+    other = retake_as_found(problem, found, camera, workers) if is_suspect else None
+    if other is not None:
+        return other
+    conflict = CLAIM.conflict(estimate.values, estimate.information)
+    doubt = CLAIM.doubt(estimate.values, estimate.information)
+    return problem, found, SphereFit(camera, here, True, conflict, doubt)
+
+
+def retake_as_found(
+    problem: Problem, found: Selection, claimed: Camera, workers: Workers
+) -> tuple[Problem, Selection, SphereFit] | None:
+    """Search other geometries; return the problem with one that explains clearly more, refined, or None."""
+    end = search_geometry(problem, found.best.pose, claimed, workers)
+    if count_deviations(estimate_corrections(end, CURVATURE)) < CONTRADICTED:
+        return None
+    given = problem.given
+    camera = claimed
+    best = found
+    for _ in range(MOST_ROUNDS):
+        camera = Corrections(Mount(camera)).apply(end.values)
+        problem = problem.retake(given.retake(camera))
+        others = [h.pose for h in best.alternatives]
+        scored = examine_each(problem, [end.pose, *others], workers)
+        best = refine_best(problem, scored, workers)
+        end = descend_on_points(problem, best.best.pose, make_freedom(camera), FULL)
+        if np.all(np.abs(end.values) < CLAIM.deviations):
+            break
+    if best.best.score < MIN_GAIN * found.best.score:
+        return None
+    return problem, best, SphereFit(camera, estimate_corrections(end, CURVATURE), is_claimed=False)
