@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from piccolo.localization.query import prepare_query
+from piccolo.problem.problem import prepare_problem
 
 from piccolo.cloud.settings import CloudSettings
 from piccolo.cloud.soa import pack_points

@@ -32,6 +32,9 @@ LAYERS = [
     "result",
     "walk",
     "localization",
+    "evidence",
+    "judge",
+    "problem",
     "scan_map",
     "local_features",
     "paper",
@@ -131,4 +134,4 @@ def test_one_module_makes_statuses():
         for node in _nodes(path)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id == "classify"
     }
-    assert callers == {"localization/judge.py"}
+    assert callers == {"judge/decide.py"}
