@@ -146,18 +146,15 @@ def compare_cells(
                     kept[i] = F0
 
 
-def compare(problem: Problem, pose: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
-    """Compare the scan at a pose with the photo, by blocks, by default on fine cells."""
-    return compare_from(problem, pose, pose, config)
-
-
-def compare_from(problem: Problem, pose: Pose, seen_from: Pose, config: ViewConfig = FINE_VIEW) -> Comparison:
+def compare(
+    problem: Problem, pose: Pose, config: ViewConfig = FINE_VIEW, seen_from: Pose | None = None
+) -> Comparison:
     """Compare the scan at a pose with the photo, by blocks, by default on fine cells.
 
     `seen_from` is a pose so near that it sees the same, whose view may be known.
     """
     view = config.arrays
-    place = round_position(seen_from)
+    place = round_position(seen_from or pose)
     sums = problem.averages_at(pose, place, config)
     offsets, colors, weights, center = empty_cells(len(sums), place)
     moments = np.empty((view.num_stats, 8), np.float32)

@@ -3,16 +3,16 @@
 import math
 import operator
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from ..confidence.localization import Evidence
 from ..confidence.occlusion import compare_occlusion, measure_agreement
-from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.candidate import Selection
-from ..judge.case import Errors, Geometry, Measured
+from ..judge.case import Geometry, Measured
 from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
 from ..problem.prior import contradictions
@@ -36,18 +36,14 @@ def measure(problem: Problem, found: Selection, fit: Fit | None, workers: Worker
     pose = found.best.pose
     points, coarse = problem.surroundings_at(pose)
 
-    def find_end() -> tuple[Errors, Pose, float]:
-        """Return the errors, the pose that they are of, and the loss there."""
-        errors = estimate_errors(problem, found.best, workers)
-        end = errors.gaussian.pose if errors.gaussian else pose
-        return errors, end, sampling_loss(visible_points(points, end.center_world), problem.colors(), end)
-
     measures: list[Callable[[], Any]] = [
-        find_end,  # takes longest
+        partial(estimate_errors, problem, found.best, workers),  # takes longest
         lambda: compare_occlusion(points, problem.given, pose).fractions(),
         lambda: measure_agreement(coarse, problem.photo.panorama, pose),
     ]
-    (errors, end, loss), fractions, agreement = workers.map(operator.call, measures, "evaluate")
+    errors, fractions, agreement = workers.map(operator.call, measures, "evaluate")
+    end = errors.gaussian.pose if errors.gaussian else pose
+    loss = sampling_loss(visible_points(points, end.center_world), problem.colors(), end)
     if not math.isfinite(loss):
         return None
     num_matches = count_matches(problem.profile, found.ranked)

@@ -95,20 +95,6 @@ def count_deviations(estimate: Estimate) -> float:
     return float((np.abs(estimate.values) / np.sqrt(CLAIM.deviations**2 + variances)).max())
 
 
-def descend_on_cells(
-    problem: Problem, pose: Pose, freedom: Freedom, values: Array, limits: Limits
-) -> FreeEnd:
-    """Descend on the fine cells that are seen from a pose."""
-    cells = problem.view_at(pose, "fine")
-    return descend_freely(cells, problem.photo.image("fine"), freedom, pose, values, limits)
-
-
-def descend_on_points(problem: Problem, pose: Pose, freedom: Freedom, limits: Limits) -> FreeEnd:
-    """Descend on the points that are seen from a pose, in the finest image."""
-    points = problem.view_at(pose, "points")
-    return descend_freely(points, problem.photo.image("full"), freedom, pose, NO_CORRECTION, limits)
-
-
 def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Workers) -> FreeEnd:
     """Search the corrections of a panorama from several starts, on coarse cells, then on finer ones."""
     freedom = make_freedom(claimed)
@@ -124,7 +110,8 @@ def search_geometry(problem: Problem, pose: Pose, claimed: Camera, workers: Work
         middle = problem.view_at(end.pose, "middle")
         image = problem.photo.image("middle")
         end = descend_freely(middle, image, freedom, end.pose, end.values, MIDDLE)
-        return descend_on_cells(problem, end.pose, freedom, end.values, FINE)
+        fine = problem.view_at(end.pose, "fine"), problem.photo.image("fine")
+        return descend_freely(*fine, freedom, end.pose, end.values, FINE)
 
     starts = list(itertools.product(HEIGHTS, HORIZONS))
     ends = sorted(workers.map(begin, starts, "fit the panorama"), key=lambda end: end.loss)

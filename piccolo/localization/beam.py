@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -50,22 +51,19 @@ def refine_starts(problem: Problem, starts: Starts, beam: Beam, workers: Workers
     """Refine the starts by successive halving to a few distinct poses, best first."""
     coarse = keep_ends(descend_prepared(problem, starts, problem.profile.first, workers), beam.num_coarse)
     coarse = keep_ends(descend_prepared(problem, coarse, SECOND, workers), beam.num_middle)
-    middle = refine_each(problem, coarse.poses(), MIDDLE, workers)
-    perturbed = refine_each(problem, narrow(middle, beam.num_fine), AROUND_MIDDLE, workers)
-    fine = refine_each(problem, narrow(perturbed, beam.num_fine), FINE, workers)
-    best = best_distinct(fine, beam.num_perturbed, DESCENDED)
-    ends = workers.map(lambda h: climb(problem, h.pose, workers), best, "descend")
+    descend = partial(refine, problem, workers=workers)
+    middle = workers.map(partial(descend, first=MIDDLE), coarse.poses(), "descend")
+    narrowed = narrow(middle, beam.num_fine)
+    perturbed = workers.map(partial(descend, first=AROUND_MIDDLE), narrowed, "descend")
+    fine = workers.map(partial(descend, first=FINE), narrow(perturbed, beam.num_fine), "descend")
+    best = [end.pose for end in best_distinct(fine, beam.num_perturbed, DESCENDED)]
+    ends = workers.map(partial(climb, problem, workers=workers), best, "descend")
     kept = keep_comparable(keep_distinct([*ends, *fine], middle))
 
     def examine_end(end: Hypothesis) -> Candidate:
         return replace(examine(problem, end.pose), is_climbed=end.is_climbed)
 
     return sort_by_score(workers.map(examine_end, kept, "descend"))
-
-
-def refine_each(problem: Problem, poses: Sequence[Pose], stage: Stage, workers: Workers) -> list[Hypothesis]:
-    """Refine several poses on one stage."""
-    return workers.map(lambda pose: refine(problem, pose, workers, stage), poses, "descend")
 
 
 def refine_matches(problem: Problem, poses: Sequence[Pose], workers: Workers) -> list[Candidate]:

@@ -48,7 +48,7 @@ from .bundle_search import (
 )
 from .calibration import calibrate
 from .judging import Found, judge, judge_together
-from .localize import explain_nothing, find_alone
+from .localize import explain_nothing, find, find_by_edges, prepare_search
 from .means import Means
 
 EVEN = 0.5
@@ -99,9 +99,11 @@ def localize_bundle(
     means = Means(settings.effort, workers, watch)
 
     def localize_alone(k: int, panorama: Panorama) -> Localization:
-        found = find_alone(scan_map, panorama, settings, means)
-        if found is None:
+        problem = prepare_search(scan_map, panorama, settings, watch)
+        if problem is None:
             return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
+        search = find_by_edges if problem.profile.has_shape else find
+        found = search(problem, scan_map, means)
         judged = judge(found, means, settings.min_confidence, may_promote=False)
         members[k] = Member(found.forget(), judged, cams_from_bundle[k])
         return judged

@@ -1,6 +1,7 @@
 """What a photo says of its geometry compared with the scan, and its poses refined with what was found."""
 
 import math
+import operator
 from dataclasses import replace
 from functools import partial
 
@@ -13,15 +14,13 @@ from ..camera.model import whole_sphere
 from ..evidence.examine import examine_each
 from ..evidence.focal_length import FOCAL_WIDTHS, FocalFit, fit_focal, list_matches
 from ..evidence.lens_matches import fit_matches
-from ..evidence.self_calibration import estimate_corrections
+from ..evidence.self_calibration import descend_freely, estimate_corrections
 from ..evidence.sphere import (
     CLAIM,
     CURVATURE,
     NO_CORRECTION,
     SphereFit,
     count_deviations,
-    descend_on_cells,
-    descend_on_points,
     make_freedom,
     search_geometry,
 )
@@ -128,11 +127,15 @@ def calibrate_sphere(
     """Compare what a panorama claims with the scan; refine the poses if it shows otherwise."""
     camera = whole_sphere(*problem.given.rgb.shape[1::-1])
     freedom = make_freedom(camera)
-    ways = (
-        partial(descend_on_cells, problem, found.best.pose, freedom, NO_CORRECTION, CHECK),
-        partial(descend_on_points, problem, found.best.pose, freedom, HERE),
-    )
-    estimate, here = workers.map(lambda way: estimate_corrections(way(), CURVATURE), ways, "fit the panorama")
+    pose = found.best.pose
+    cells = problem.view_at(pose, "fine"), problem.photo.image("fine")
+    points = problem.view_at(pose, "points"), problem.photo.image("full")
+    descents = [
+        partial(descend_freely, *on, freedom, pose, NO_CORRECTION, limits)
+        for on, limits in ((cells, CHECK), (points, HERE))
+    ]
+    ends = workers.map(operator.call, descents, "fit the panorama")
+    estimate, here = (estimate_corrections(end, CURVATURE) for end in ends)
     is_suspect = count_deviations(estimate) > SUSPECT
     other = retake_as_found(problem, found, camera, workers) if is_suspect else None
     if other is not None:
@@ -158,7 +161,9 @@ def retake_as_found(
         others = [h.pose for h in best.alternatives]
         scored = examine_each(problem, [end.pose, *others], workers)
         best = refine_best(problem, scored, workers)
-        end = descend_on_points(problem, best.best.pose, make_freedom(camera), FULL)
+        pose = best.best.pose
+        points = problem.view_at(pose, "points"), problem.photo.image("full")
+        end = descend_freely(*points, make_freedom(camera), pose, NO_CORRECTION, FULL)
         if np.all(np.abs(end.values) < CLAIM.deviations):
             break
     if best.best.score < MIN_GAIN * found.best.score:

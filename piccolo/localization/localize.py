@@ -49,28 +49,26 @@ def localize(
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
     means = Means(settings.effort, workers, watch, trace)
-    found = find_alone(scan_map, panorama, settings, means)
-    if found is None:
+    problem = prepare_search(scan_map, panorama, settings, watch)
+    if problem is None:
         return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
+    with watch.stage("search"):
+        problem.photo.images.search()  # each search begins with it
+    search = find_by_edges if problem.profile.has_shape else find
+    found = search(problem, scan_map, means)
     with watch.stage("refine"):
         return judge(found, means, settings.min_confidence)
 
 
-def find_alone(
-    scan_map: ScanMap,
-    panorama: Panorama,
-    settings: CoarseToFineSettings,
-    means: Means,
-) -> Found | None:
-    """Find the poses of a photo by itself, refined; None if there is nothing to search."""
-    with means.watch.stage("search"):
+def prepare_search(
+    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, watch: Stopwatch
+) -> Problem | None:
+    """Prepare a panorama for the search where the prior allows; None if there is nothing to search."""
+    with watch.stage("search"):
         allowed_map = apply_prior(scan_map, settings.prior)
         if len(allowed_map.sparse) == 0 or not panorama.is_valid.any():
             return None
-        problem = prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
-        problem.photo.images.search()  # each search begins with it
-    search = find_by_edges if problem.profile.has_shape else find
-    return search(problem, scan_map, means)
+        return prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
 
 
 def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from ..confidence.confidence import Standing, posterior
-from ..evidence.comparison import compare_from
+from ..evidence.comparison import compare
 from ..evidence.covariance import estimate_covariance
 from ..evidence.examine import complete
 from ..evidence.verification import draw_near, verify
@@ -37,7 +37,7 @@ def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
     """
     middle, seen_from = climb_from_afar(problem, start, workers)
     pose = refine(problem, middle, workers, FULL).pose
-    seen = compare_from(problem, pose, seen_from if pose.distance(seen_from) < NEARLY else pose)
+    seen = compare(problem, pose, seen_from=seen_from if pose.distance(seen_from) < NEARLY else pose)
     end = Candidate(pose, seen.score, seen, contradictions(problem.scan_map, pose, problem.prior))
     if problem.profile.is_partial:
         end = settle(problem, end, workers)
