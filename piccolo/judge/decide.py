@@ -1,19 +1,4 @@
-"""The judge: the default method's only maker of confidences, and of the statuses localized and ambiguous.
-
-All are made in `decide`. A photo alone comes here with its evidence (`judge`). Photos that help each other
-decide nothing; each way hands over probabilities, or a pose with errors:
-- `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`;
-- `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
-- `batch.localizer`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
-- `walk.results`: the probabilities of a frame's places along the path, to `decide`, its pose to `take_pose`;
-- `coloring`: nothing; each photo is localized as one alone, in colours of the others.
-
-A new way hands over as `bundle` or `beside` do. It is wired in by a method of `opened_scan.OpenedScan`, and
-- of photos that are given together: by a method of `Scan`; in `cli` by an option, a `make_..._job` and
-  NOT_WITH of `together`, and JOINT and `run_jointly` of `photo_run`;
-- as a second look at photos of a batch: by a function in LISTINGS of `batch.localizer`, fields of its `Look`,
-  a branch in `look_again`, and by `may_change` and, in `batch.results_file`, `Finished.is_second`.
-"""
+"""The only maker of confidences, and of the statuses localized and ambiguous: all are made in `decide`."""
 
 import math
 from dataclasses import replace

@@ -2,13 +2,12 @@
 
 A photo's way from its file to a result:
 1. `opened_scan.OpenedScan.localize` reads it (`panorama.read_panorama`) and asks for its GPS position;
-2. `localize.localize` prepares its images and the part of the map that the prior allows (`query`, `photo`);
+2. `localize.localize` makes a `Problem` of its images and the part of the map that the prior allows;
 3. `attempts.plan_attempts` lists the searches: a brief one by views, local features, all views;
-4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`), or
-   draws the scan at poses that are known (`verification`), until one is sure (`selection.is_sure`);
-5. `last_descent.refine_best` refines the best poses to the end and selects among them (`selection.select`);
-6. `focal_length.calibrate` or `sphere.calibrate_sphere` compares what the photo says of its geometry;
-7. `judge.judge` measures the best pose, its covariance (`covariance`) and its probability, and decides;
+4. each finds starts (`search.search_poses`) and refines few of them (`beam`, on the stages of `ladder`) to
+   candidates, with their evidence (`evidence.examine`), until one is sure (`judge.selection.is_sure`);
+5. `last_descent.refine_best` refines the best candidates to the end and selects among them;
+6. `calibration` compares what the photo says of its geometry, and refines with what it finds;
+7. `judging.judge` gathers the case: measurements, copies, the mirrored photo; `judge.decide.conclude` decides;
 8. `result.with_localization` makes the result in the world, which a command writes.
-`judge` tells how photos help each other, and what each way hands over.
 """
