@@ -37,6 +37,8 @@ LAYERS = [
     "paper",
     "gravity",
     "optimize",
+    "confidence.localization",  # until results have a room
+    "judge",
     "confidence",
     "views",
     "panorama",

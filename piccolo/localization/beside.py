@@ -23,7 +23,7 @@ from .attempts import add_verified
 from .comparison import score_pose
 from .covariance import split_errors
 from .focal_length import FocalFit
-from .judge import judge, reconsider, take_pose
+from .judge import judge, take_pose
 from .last_descent import refine_best
 from .localize import Found, fit_camera
 from .prior import apply_prior, contradictions
@@ -100,13 +100,12 @@ def localize_beside(
         kept = list_agreeing(judged, found, ended.query.beside, scan_map)
         if not kept:
             return Localization(), ()
-        factor = max(other.picture.confidence for other in kept)
+        belief = judged.belief.scale(max(other.picture.confidence for other in kept))
         fused = fuse(judged, kept[0], ended)
-        if fused is not None and judged.gaussian is not None:
-            before = probability_within(judged.gaussian)
-            factor *= probability_within(fused) / before
+        if fused is not None:
+            belief = replace(belief, within=probability_within(fused))
             judged = take_pose(judged, fused, scan_map)
-    return reconsider(judged, factor, settings.min_confidence), tuple(other.name for other in kept)
+    return judged.take_belief(belief, settings.min_confidence), tuple(other.name for other in kept)
 
 
 def list_agreeing(
@@ -132,7 +131,7 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
     """
     own = judged.gaussian
     of_photo = other.picture.gaussian
-    if own is None or of_photo is None or judged.is_ruled_out:
+    if own is None or of_photo is None or judged.belief.ruled_out:
         return None
     other_from_cam = other.pose @ of_photo.pose.inverse()
     expected = of_photo.attach(other_from_cam, match_covariance(other.matches, other.pose))

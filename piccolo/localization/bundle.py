@@ -20,6 +20,7 @@ from ..confidence.localization import Localization
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.together import Shares, believe_together
 from ..panorama import Panorama
 from ..scan_map.scan_map import ScanMap
 from .bundle_adjustment import (
@@ -34,7 +35,6 @@ from .bundle_adjustment import (
     find_scale,
 )
 from .bundle_search import (
-    LEAST_NONE,
     Member,
     Support,
     find_support,
@@ -255,42 +255,36 @@ def judge_member(
 
     `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
     """
-    if member.alone.is_ruled_out and not member.is_misplaced:
+    if member.alone.belief.ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
-    right, missed, *_ = support.shares
-    if right + missed < EVEN or number in agreed.apart:
+    shares = Shares(*support.shares[:2].tolist())
+    if shares.here < EVEN or number in agreed.apart:
         return judge_apart(member, CONTRADICTS)
     rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
     own = agreed.estimates.get(number)
     gaussian = None if own is None else own.own
-    within = 0.0
+    within_others = 0.0
     if rest:
         adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
         expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
         if gaussian is not None:
-            factor = compare_errors(expected, gaussian)
-            right, missed = np.array([right * factor, missed]) * (right + missed) / (right * factor + missed)
-        gaussian = expected if gaussian is None or right < missed else expected.fuse(gaussian)
+            shares = shares.weigh_own(compare_errors(expected, gaussian))
+        is_missed = gaussian is None or shares.right < shares.missed
+        gaussian = expected if gaussian is None or is_missed else expected.fuse(gaussian)
         offset = gaussian.pose.center_world - expected.pose.center_world
-        within = missed * probability_near(offset, expected.covariance[3:, 3:])
+        within_others = probability_near(offset, expected.covariance[3:, 3:])
     if gaussian is None:
         return judge_apart(member, NOT_FOUND)
-    of_own = probability_within(gaussian)
-    confidence = (within + right * of_own) * probabilities[0]
-    before = member.alone.gaussian
-    if member.alone.status == LOCALIZED and own and before:
-        # that others show nothing says nothing against a photo that is sure
-        gain = of_own / probability_within(before)
-        focal = member.alone.focal_length
-        doubt = focal.doubt if focal else 0.0  # which the judge takes off again
-        confidence = max(confidence, member.alone.confidence / (1.0 - doubt) * min(gain, 1.0))
-    others = probabilities[1:-1] * min(1.0, (1.0 - confidence) / max(1.0 - probabilities[0], LEAST_NONE))
-    p = np.array([confidence, *others, max(1.0 - confidence - others.sum(), 0.0)])
+    within = probability_within(gaussian)
+    alone = None
+    if member.alone.status == LOCALIZED and own and member.alone.gaussian:
+        alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
+    belief = believe_together(shares, probabilities, within, within_others, alone)
     query, fit = recalibrate_at(member, support)
     placed = [score_pose(query, bundle.place(member.cam_from_bundle)) for bundle in elsewhere]
     selection = Selection(score_pose(query, gaussian.pose), tuple(placed))
-    result = judge_together(query, selection, fit, gaussian, p)
-    doubts = (UNSEEN,) if right < EVEN else ()
+    result = judge_together(query, selection, fit, gaussian, belief)
+    doubts = (UNSEEN,) if shares.right < EVEN else ()
     return replace(result, warnings=result.warnings + doubts + agreed.warnings)
 
 

@@ -15,7 +15,8 @@ from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Localization
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..geometry.pose_gaussian import PoseGaussian
+from ..judge.together import LEAST_NONE
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
 from .comparison import score_pose
 from .covariance import Errors, estimate_errors
@@ -30,7 +31,6 @@ MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMA
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
 SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
 CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
-LEAST_NONE = 1e-6
 NUM_BUNDLES = 4  # poses of the bundle that are tested
 SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
 LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
@@ -56,12 +56,11 @@ class Member:
 
     @property
     def own_poses(self) -> list[tuple[Hypothesis, float]]:
-        """Poses in the map with their probabilities, best first; none if the best one is ruled out."""
-        if self.alone.pose is None or self.alone.is_ruled_out:
+        """Poses in the map with the probabilities of their places, best first; none of what is ruled out."""
+        if self.alone.pose is None or self.alone.belief.ruled_out:
             return []
         hypotheses = [self.selection.best, *self.selection.alternatives]
-        own = [self.alone.confidence, *(a.probability or 0.0 for a in self.alone.alternatives)]
-        return list(zip(hypotheses, own, strict=False))
+        return list(zip(hypotheses, self.alone.belief.place[:-1], strict=False))
 
 
 class Support(NamedTuple):
@@ -70,8 +69,8 @@ class Support(NamedTuple):
     own: Hypothesis  # its own pose there
     gaussian: PoseGaussian | None  # that pose with its covariance; None where the points do not fix it
     is_found: bool  # by the photo alone
-    odds: float  # of that pose, against that none of the photo's poses is right
-    odds_elsewhere: float  # of the photo's other poses
+    odds: float  # of that pose's place, against that none of the photo's poses is right
+    odds_elsewhere: float  # of the places of the photo's other poses
     num_places: int  # of the scan where a photo alone may be
     odds_exchanged: float = 0.0  # of the places of other photos of the bundle, in the mean
 
@@ -187,8 +186,7 @@ def find_support(member: Member, query: Query, bundle: Bundle, exchanged: Sequen
     if found is not member.selection.best and found.score > HOPELESS_SCORE:
         errors = estimate_errors(query, found.pose)
         errors = errors.widen(member.fit.pose_covariance) if member.fit else errors
-    within = probability_within(errors.gaussian)
-    p = posterior(assess_poses(query, poses[0], poses[1:]), errors.std_of_fit, within)
+    p = posterior(assess_poses(query, poses[0], poses[1:]), errors.std_of_fit)
     k = next(k for k, h in enumerate(poses) if h is found)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none

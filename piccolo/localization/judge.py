@@ -1,11 +1,11 @@
-"""The judge: the default method's only maker of confidences, and of the statuses localized and ambiguous.
+"""The judge: from evidence to a result, whose status `judge.belief.decide` alone makes.
 
-All are made in `decide`. A photo alone comes here with its evidence (`judge`). Photos that help each other
-decide nothing; each way hands over probabilities, or a pose with errors:
-- `bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`;
-- `beside`: the mean with the pose by another photo to `take_pose`, a factor of probabilities to `reconsider`;
+A photo alone comes here with its evidence (`judge`). Photos that help each other decide nothing; each way
+changes a `Belief`, or hands over a pose with errors:
+- `bundle`: a pose by all photos and the belief in all poses, to `judge_together`;
+- `beside`: the mean with the pose by another photo, to `take_pose`;
 - `batch.localizer`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
-- `walk.results`: the probabilities of a frame's places along the path, to `decide`, its pose to `take_pose`;
+- `walk.results`: the pose of a frame on a smooth path, to `take_pose`;
 - `coloring`: nothing; each photo is localized as one alone, in colours of the others.
 
 A new way hands over as `bundle` or `beside` do. It is wired in by a method of `opened_scan.OpenedScan`, and
@@ -24,9 +24,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..arrays import Array
 from ..confidence.alternatives import MAX_ALTERNATIVES, Hypothesis, suppress_near
-from ..confidence.confidence import LOCALIZED, Standing, classify, posterior
+from ..confidence.confidence import LOCALIZED, Standing, posterior
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT, Opinion
 from ..confidence.localization import Alternative, Evidence, FocalLength, Localization
@@ -34,6 +33,8 @@ from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose, uniform_yaws
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..judge.belief import Belief, make_belief
+from ..judge.reasons import Reason, explain
 from ..local_features.hypotheses import propose_poses
 from ..local_features.matching import match
 from ..optimize.refine import DescentSettings, make_sampling_loss, refine
@@ -100,9 +101,8 @@ def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: b
         return Localization()
     reported, is_copy = list_reported(query, found)
     standings = credit_copies(assess_poses(query, found.best, reported), is_copy)
-    within = probability_within(measured.errors.gaussian)
-    probabilities = posterior(standings, measured.errors.std_of_fit, within)
-    likeliest = int(probabilities[:-1].argmax())
+    places = posterior(standings, measured.errors.std_of_fit)[:-1]
+    likeliest = int(places.argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         best = settle(query, reported[likeliest - 1])
         others = (found.best, *(h for h in found.alternatives if h is not reported[likeliest - 1]))
@@ -111,7 +111,8 @@ def judge(query: Query, found: Selection, fit: Fit | None = None, may_promote: b
         fit = fit_focal(query, found.best.pose, is_first=False) if isinstance(fit, FocalFit) else fit
         return judge(query, found, fit, may_promote=False)
     fit = doubt_alone(fit, measured.errors.gaussian)
-    return conclude(query, replace(found, alternatives=reported), fit, measured, standings, probabilities)
+    belief = make_belief(places, probability_within(measured.errors.gaussian))
+    return conclude(query, replace(found, alternatives=reported), fit, measured, standings, belief)
 
 
 def doubt_alone(fit: Fit | None, gaussian: PoseGaussian | None) -> Fit | None:
@@ -126,13 +127,13 @@ def doubt_alone(fit: Fit | None, gaussian: PoseGaussian | None) -> Fit | None:
 
 
 def judge_together(
-    query: Query, found: Selection, fit: Fit | None, gaussian: PoseGaussian, probabilities: Array
+    query: Query, found: Selection, fit: Fit | None, gaussian: PoseGaussian, belief: Belief
 ) -> Localization:
     """Return the result of a photo whose pose is what it and others say together.
 
-    `gaussian` is that pose in the map; `found.best` has the same pose. `probabilities` (K + 1,) are of it, of
-    each alternative and of none, by all photos together, each that the pose is within 0.1 m. The doubt about
-    a focal length is not in them. What the photo itself rules out stays so.
+    `gaussian` is that pose in the map; `found.best` has the same pose. `belief` is in it and each
+    alternative, by all photos together, without doubt about a focal length. What the photo itself rules out
+    stays so.
     """
     measured = measure(query, found, fit)
     if measured is None:
@@ -140,7 +141,7 @@ def judge_together(
     standings = assess_poses(query, found.best, found.alternatives)
     errors = measured.errors._replace(gaussian=gaussian)
     measured = measured._replace(pose=gaussian.pose, errors=errors)
-    return conclude(query, found, fit, measured, standings, probabilities)
+    return conclude(query, found, fit, measured, standings, belief)
 
 
 def conclude(
@@ -149,17 +150,20 @@ def conclude(
     fit: Fit | None,
     measured: Measured,
     standings: Sequence[Standing],
-    probabilities: Array,
+    belief: Belief,
 ) -> Localization:
-    """Return the result for measurements and probabilities, if nothing rules the pose out."""
+    """Return the result for measurements and a belief, with what rules the pose out."""
     scan_map = query.scan_map
-    least = query.settings.min_confidence
-    if fit is not None:  # no pose is surer than what it rests on
-        poses = (1.0 - fit.doubt) * probabilities[:-1]
-        probabilities = np.append(poses, 1.0 - poses.sum())
-    warnings = contradictions(scan_map, measured.pose, query.settings.prior)
-    if probabilities[-1] < 1.0 - WORTH_ASKING and is_mirrored(query, found.best):
-        warnings += (MIRRORED,)
+    belief = replace(belief, doubt=fit.doubt if fit else 0.0)  # no pose is surer than what it rests on
+    contradicted = contradictions(scan_map, measured.pose, query.settings.prior)
+    warnings = list(map(explain, contradicted))
+    reasons = [contradiction.reason for contradiction in contradicted]
+    if belief.probabilities[-1] < 1.0 - WORTH_ASKING and is_mirrored(query, found.best):
+        reasons.append(Reason.MIRRORED)
+        warnings.append(MIRRORED)
+    if fit is not None and fit.conflict > MOST_CONFLICT:
+        reasons.append(Reason.SPHERE if isinstance(fit, SphereFit) else Reason.CALIBRATION)
+        warnings.append(explain_conflict(query.given, fit))
     gaussian, std_of_fit = measured.errors
     alternatives = [
         Alternative(scan_map.to_world(h.pose), h.score, s.num_matches)
@@ -171,43 +175,15 @@ def conclude(
         evidence=measured.evidence,
         alternatives=tuple(alternatives),
         covariance=describe_errors(gaussian, scan_map.R_map_from_world.T),
-        warnings=warnings,
         cameras=() if fit is None else query.given.cameras,
         focal_length=fit.focal_length(query.given) if isinstance(fit, FocalFit) else None,
         sphere=fit.describe() if isinstance(fit, SphereFit) and not fit.is_claimed else None,
-        is_ruled_out=bool(warnings) or (fit is not None and fit.conflict > MOST_CONFLICT),
         gaussian=gaussian,
         std_of_fit=std_of_fit,
         standings=tuple(standings),
     )
-    decided = decide(described, probabilities, least)
-    if decided.sphere is not None:
-        return replace(decided, warnings=(*warnings, decided.sphere.explain()))
-    if fit is None or decided.status == LOCALIZED:
-        return decided
-    return replace(decided, warnings=warnings + explain_doubts(query.given, fit))
-
-
-def decide(found: Localization, probabilities: Array, min_confidence: float) -> Localization:
-    """Return a result with the probabilities (K + 1,) of its pose, its alternatives and none, and its status.
-
-    What is ruled out stays so, whatever the probabilities are.
-    """
-    p = np.append(np.zeros(len(probabilities) - 1), 1.0) if found.is_ruled_out else probabilities
-    others = tuple(replace(a, probability=float(q)) for a, q in zip(found.alternatives, p[1:-1], strict=True))
-    return replace(
-        found,
-        status=classify(p, min_confidence),
-        confidence=float(p[0]),
-        probability_none=float(p[-1]),
-        alternatives=others,
-    )
-
-
-def reconsider(found: Localization, factor: float, min_confidence: float) -> Localization:
-    """Return a result with the probabilities of all its poses multiplied by a factor, and its status."""
-    poses = factor * np.array([found.confidence, *(a.probability or 0.0 for a in found.alternatives)])
-    return decide(found, np.append(poses, 1.0 - poses.sum()), min_confidence)
+    decided = described.take_belief(belief.rule_out(*reasons), query.settings.min_confidence)
+    return replace(decided, warnings=(*warnings, *explain_doubts(query.given, fit, decided)))
 
 
 def follow_consensus(found: Localization, consensus: Opinion, min_confidence: float) -> Localization:
@@ -218,18 +194,18 @@ def follow_consensus(found: Localization, consensus: Opinion, min_confidence: fl
     result is ruled out, with a warning.
     """
     focal = found.focal_length
+    belief = found.belief
     assert focal is not None
-    doubt = focal.doubt
     if focal.others_px is None:
         share = focal.opinion.share_of_given(focal.prior_deviation) if focal.opinion else 1.0
-        doubt = share * consensus.doubt(focal.prior_deviation)
-    is_contradicted = consensus.conflict(focal.prior_deviation) > MOST_CONFLICT
-    factor = (1.0 - doubt) / (1.0 - focal.doubt)
-    told = replace(found, focal_length=replace(focal, doubt=doubt), is_ruled_out=is_contradicted)
-    if is_contradicted:
+        focal = replace(focal, doubt=share * consensus.doubt(focal.prior_deviation))
+        belief = replace(belief, doubt=focal.doubt)
+    told = replace(found, focal_length=focal)
+    if consensus.conflict(focal.prior_deviation) > MOST_CONFLICT:
         px = focal.given_px * math.exp(consensus.off)
         told = replace(told, warnings=(contradict("the pictures of this camera have", focal, px),))
-    return reconsider(told, factor, min_confidence)
+        belief = belief.rule_out(Reason.CAMERA)
+    return told.take_belief(belief, min_confidence)
 
 
 def contradict(who_has: str, focal: FocalLength, px: float) -> str:
@@ -325,25 +301,28 @@ def credit_copies(standings: Sequence[Standing], is_copy: Sequence[bool]) -> lis
     return [s._replace(num_matches=most) if copied else s for s, copied in pairs]
 
 
-def explain_doubts(panorama: Panorama, fit: Fit) -> tuple[str, ...]:
-    """Explain how the photo's geometry makes a pose doubtful, as warnings."""
-    if isinstance(fit, SphereFit):
-        return (NOT_AS_CLAIMED,) if fit.conflict > MOST_CONFLICT else ()
+def explain_doubts(panorama: Panorama, fit: Fit | None, found: Localization) -> tuple[str, ...]:
+    """Explain what a photo shows of the sphere, or how its focal length makes a pose doubtful."""
+    if found.sphere is not None:
+        return (found.sphere.explain(),)
+    if not isinstance(fit, FocalFit) or found.status == LOCALIZED or fit.conflict > MOST_CONFLICT:
+        return ()
     focal = fit.focal_length(panorama)
-    if fit.conflict > MOST_CONFLICT:
-        return (explain_conflict(fit.contradicted, focal),)
     std = math.sqrt(float(np.linalg.eigvalsh(fit.pose_covariance[3:, 3:])[-1]))
     if std <= TELLING_STD:
         return ()
-    found = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
+    estimate = f"focal length {focal.px:.0f} +- {focal.std_px:.0f} px"
     given = f"given {focal.given_px:.0f} +- {focal.given_std_px:.0f}"
-    return (f"{found} ({given}): the position is uncertain by {std:.2f} m",)
+    return (f"{estimate} ({given}): the position is uncertain by {std:.2f} m",)
 
 
-def explain_conflict(correction: str, focal: FocalLength) -> str:
-    """Return a warning that a photo's geometry is not as it was given."""
-    if correction in OTHERS:
-        return f"the picture has another {OTHERS[correction]} than was given: check {focal.source}"
+def explain_conflict(panorama: Panorama, fit: Fit) -> str:
+    """Return a warning that a photo's geometry is not as it was given or claims."""
+    if isinstance(fit, SphereFit):
+        return NOT_AS_CLAIMED
+    focal = fit.focal_length(panorama)
+    if fit.contradicted in OTHERS:
+        return f"the picture has another {OTHERS[fit.contradicted]} than was given: check {focal.source}"
     return contradict("the picture has", focal, focal.px)
 
 

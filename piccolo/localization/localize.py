@@ -11,12 +11,15 @@ from ..confidence.localization import Alternative, FocalLength, Localization
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.belief import NOTHING, make_belief
+from ..judge.reasons import Reason
+from ..judge.together import share_place
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
 from ..scan_map.scan_map import ScanMap
 from .attempts import plan_attempts, search_beyond_prior
 from .focal_length import WIDE, FocalFit, calibrate
-from .judge import judge, reconsider
+from .judge import judge
 from .last_descent import is_faint, refine_best
 from .prior import apply_prior, nothing_allowed
 from .query import Query, prepare_query
@@ -68,7 +71,9 @@ def prepare_search(
     """Prepare a panorama for the search where the prior allows; a result says why nothing is searched."""
     allowed_map = apply_prior(scan_map, settings.prior)
     if len(allowed_map.sparse) == 0:
-        return Localization(warnings=(nothing_allowed(scan_map, settings.prior),))
+        is_told = len(scan_map.centers) > 0  # else the scan has no position at all
+        belief = NOTHING.rule_out(Reason.NOWHERE) if is_told else NOTHING
+        return Localization(belief=belief, warnings=(nothing_allowed(scan_map, settings.prior),))
     if not panorama.is_valid.any():
         return Localization(warnings=(NO_PIXEL,))
     return prepare_query(panorama, allowed_map, settings, workers)
@@ -162,16 +167,22 @@ def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettin
     for one in sorted(found, key=lambda f: -f.confidence):
         if not any(one.pose is None or is_same_place(f, one.pose, one.focal_length) for f in places):
             places.append(one)
-    best, *others_found = places
-    total = best.confidence + sum(f.confidence for f in others_found)
-    if total <= best.confidence:
-        return best
-    fraction = best.confidence / total
+    best, *elsewhere = places
     others = [
-        Alternative(f.pose, f.evidence.score, f.evidence.num_matches, f.confidence)
-        for f in others_found
+        (Alternative(f.pose, f.evidence.score, f.evidence.num_matches), f.confidence)
+        for f in elsewhere
         if f.pose and f.evidence
     ]
-    of_best = (a for a in best.alternatives if not any(CONFIRMED.holds(o.pose, a.pose) for o in others))
-    listed = replace(best, alternatives=(*others, *of_best)[:MAX_ALTERNATIVES])
-    return reconsider(listed, fraction, settings.min_confidence)
+    if not any(confidence for _, confidence in others):
+        return best
+    factor, shared = share_place(best.belief, [best.confidence, *(confidence for _, confidence in others)])
+    own = [
+        (alternative, factor * place)
+        for alternative, place in zip(best.alternatives, best.belief.place[1:-1], strict=True)
+        if not any(CONFIRMED.holds(other.pose, alternative.pose) for other, _ in others)
+    ]
+    listed = [*zip([other for other, _ in others], shared, strict=True), *own][:MAX_ALTERNATIVES]
+    alternatives = tuple(alternative for alternative, _ in listed)
+    belief = make_belief([factor * best.belief.place[0], *(p for _, p in listed)])
+    belief = replace(best.belief, place=belief.place)
+    return replace(best, alternatives=alternatives).take_belief(belief, settings.min_confidence)

@@ -7,7 +7,7 @@ from ..confidence.alternatives import Hypothesis
 from ..confidence.confidence import Standing, posterior
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..geometry.pose_gaussian import PoseGaussian
 from .comparison import Comparison, compare, compare_from
 from .covariance import UNKNOWN_ERRORS, estimate_covariance
 from .ladder import FULL, NEARLY, climb_from_afar, refine, settle
@@ -23,7 +23,7 @@ class Near(NamedTuple):
     pose: Pose  # in the map
     seen: Comparison  # of the photo with the scan there
     gaussian: PoseGaussian | None  # with its covariance; None where the points do not fix it
-    probability: float  # that the pose is right
+    place: float  # probability that its place is right
 
 
 def refine_near(query: Query, start: Pose) -> Near:
@@ -42,9 +42,8 @@ def refine_near(query: Query, start: Pose) -> Near:
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
         errors = estimate_covariance(query, end.pose, seen, middle if sees_same else None)
-    within = probability_within(errors.gaussian)
-    probability = float(posterior([assess_end(query, end)], errors.std_of_fit, within)[0])
-    return Near(end.pose, seen, errors.gaussian, probability)
+    place = float(posterior([assess_end(query, end)], errors.std_of_fit)[0])
+    return Near(end.pose, seen, errors.gaussian, place)
 
 
 def assess_end(query: Query, end: Hypothesis) -> Standing:

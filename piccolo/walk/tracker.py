@@ -35,7 +35,6 @@ from .frames import (
     Motion,
     State,
     list_states,
-    log_odds_of_place,
     log_ratio,
     put_state,
 )
@@ -337,7 +336,7 @@ def track(query: Query, start: Pose) -> State | None:
     ends = [refine_near(query, start)]
     if query.is_narrow:
         ends.append(refine_near(query, verify(query, ends[0].pose).pose))
-    odds = [log_odds_of_place(end.probability, end.probability, end.gaussian) for end in ends]
+    odds = [log_ratio(end.place, 1.0 - end.place) for end in ends]
     best = int(np.argmax(odds))
     end = ends[best]
     is_wrong = odds[best] < 0.0 or end.seen.score < LEAST_SCORE
