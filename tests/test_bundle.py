@@ -15,6 +15,8 @@ from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.localization import bundle_search
 from piccolo.localization.bundle import (
     CONTRADICTS,
@@ -44,7 +46,7 @@ def _alone(*probabilities):
     poses = [at(float(k), 0.5) for k in range(len(probabilities))]
     likely = list(zip(poses, probabilities, strict=True))
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
-    alone = Localization(pose=poses[0].pose, confidence=probabilities[0], alternatives=alternatives)
+    alone = Localization(belief=make_belief(probabilities), pose=poses[0].pose, alternatives=alternatives)
     return bundle_search.Member(
         None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0]
     )
@@ -100,7 +102,7 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
 def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
     query = SimpleNamespace(given=SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured)))
     fit = conflict and SimpleNamespace(conflict=conflict)
-    alone = Localization(is_ruled_out=True, warnings=("mirrored",), confidence=0.0)
+    alone = Localization(belief=make_belief([0.9]).rule_out(Reason.MIRRORED), warnings=("mirrored",))
     member = _alone(0.9)
     member = replace(member, query=query, fit=fit, alone=alone)
     assert member.own_poses == []

@@ -19,6 +19,8 @@ from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
 from piccolo.confidence.localization import FocalLength
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.result import Result, Source, read_results
 from research.synthetic.world import render_picture
 
@@ -35,7 +37,9 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
     camera = (Mount(pinhole(1024, 768, GIVEN)),)
     source = Source(None, None, (1024, 768), None)
     result = Result(status, confidence, "a.ply", "a.jpg", pose, cameras=camera, source=source)
-    return replace(result, focal_length=focal, probability_none=1.0 - confidence).to_json()
+    place = confidence / (1.0 - focal.doubt)
+    found = {"probability_none": 1.0 - confidence, "belief": make_belief([place], doubt=focal.doubt)}
+    return replace(result, focal_length=focal, **found).to_json()
 
 
 def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
@@ -74,6 +78,7 @@ def test_photos_that_contradict_a_calibration_together_rule_out_all_of_its_poses
     assert [(number, status) for number, status, _ in changed] == [(k, "localized") for k in range(7)]
     for _, _, result in changed:
         assert (result.status, result.confidence) == ("not_localized", 0.0)
+        assert result.belief.ruled_out == {Reason.CAMERA}
         (warning,) = result.warnings
         assert warning == "the pictures of this camera have a focal length of 735 px, not 700: check `camera`"
     again = [result.to_json() for *_, result in changed]
@@ -85,6 +90,7 @@ def test_photos_that_confirm_a_calibration_make_all_of_its_poses_surer():
     changed = list_changed_by_consensus(texts, 0.9)
     assert [result.status for *_, result in changed] == ["localized"] * 6
     assert all(0.9 < result.confidence < 0.91 for *_, result in changed)
+    assert all(result.belief.doubt == result.focal_length.doubt < 0.01 for *_, result in changed)
     assert list_changed_by_consensus([result.to_json() for *_, result in changed], 0.9) == []
 
 

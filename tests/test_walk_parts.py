@@ -106,8 +106,8 @@ def test_an_odometry_of_another_length_is_named(factor, noise, words):
     centers = np.cumsum(rng.normal(size=(200, 3)) * [0.4, 0.4, 0.0], axis=0)
     frames = [Frame(float(k), odometry=Pose(TURN, factor * c)) for k, c in enumerate(centers)]
     seen = [Pose(TURN, c + noise * rng.normal(size=3)) for c in centers]
-    found = [Localization("localized", 0.99, pose=pose) for pose in seen]
-    found[7] = Localization("localized", 0.99, pose=Pose(TURN, centers[7] + 9.0))
+    found = [Localization("localized", pose=pose) for pose in seen]
+    found[7] = Localization("localized", pose=Pose(TURN, centers[7] + 9.0))
     assert check_odometry(frames, found) == words
     assert check_odometry(frames[:3], found[:3]) == ()
     lost = [Localization(pose=pose) for pose in seen]

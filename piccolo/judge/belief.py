@@ -1,4 +1,4 @@
-"""What is believed of a photo's poses, and the status that follows.
+"""The belief in a photo's poses, and the status that follows from it.
 
 Three questions have answers of their own: which place is right, whether the pose is within 0.1 m there, and
 whether what was given, as a focal length, holds. Only `Belief.probabilities` multiplies them.

@@ -1,4 +1,4 @@
-"""How photos that help each other change what is believed of one."""
+"""Changes of the belief in a photo by photos that help it."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
