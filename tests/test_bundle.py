@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import at
+from made_up import at, compared
 from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
@@ -96,6 +96,28 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
     own = _support(30.0)
     assert bundle_search.weigh_bundles([[own, out, out]], members)[-1] > 0.9
     assert bundle_search.weigh_bundles([[own, own, out]], members)[0] > 0.9
+
+
+@pytest.mark.parametrize("std", [0.005, 0.06, 0.3])
+def test_a_certain_place_counts_whole_however_inexact_the_pose_is(monkeypatch, std):
+    """How exact it is counts once, in the end."""
+    query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.02}, {0.0: 80})
+    query = replace(query, scan_map=SimpleNamespace(**vars(query.scan_map), sparse=range(100)))
+    best, other = at(0.0, 0.6), at(3.0, 0.02)
+    belief = make_belief([0.99, 0.001], within=0.5)
+    gaussian = PoseGaussian(best.pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
+    alone = Localization(
+        belief=belief,
+        pose=best.pose,
+        alternatives=(Alternative(other.pose, other.score),),
+        gaussian=gaussian,
+        std_of_fit=0.005,
+    )
+    member = bundle_search.Member(query, Selection(best, (other,)), None, alone, Pose(np.eye(3), np.zeros(3)))
+    support = bundle_search.find_support(member, query, Bundle(best.pose))
+    assert support.own is best
+    assert support.odds > 5e4
+    assert [p for _, p in member.own_poses] == [0.99, 0.001]
 
 
 @pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])
