@@ -9,7 +9,7 @@ from piccolo.confidence.localization import Alternative, Evidence, Localization
 from piccolo.geometry.pose import Pose
 from piccolo.judge.belief import NOTHING, decide, make_belief
 from piccolo.judge.reasons import WORDS, Contradiction, Reason, explain
-from piccolo.judge.together import Shares, believe_together, share_place
+from piccolo.judge.together import Shares, believe_beside, believe_together, share_place
 from piccolo.paper.localize import believe as believe_by_paper
 
 BELIEF = make_belief([0.9, 0.06], within=0.8, doubt=0.05)
@@ -112,6 +112,14 @@ def test_that_others_show_nothing_says_nothing_against_a_photo_that_is_sure(own,
     else:
         assert belief == believe_together(Shares(0.6, 0.3), BUNDLES, 0.9, 0.0)
     assert sum(belief.place) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("within", "expected"), [(None, 0.8), (0.95, 0.95)])
+def test_a_photo_is_no_surer_than_those_beside_it_and_as_exact_as_the_mean(within, expected):
+    belief = believe_beside(BELIEF, [0.96, 0.98, 0.97], within)
+    assert belief.place == pytest.approx((0.98 * 0.9, 0.98 * 0.06, 1.0 - 0.98 * 0.96))
+    assert (belief.within, belief.doubt) == (expected, BELIEF.doubt)
+    assert believe_beside(BELIEF.rule_out(Reason.NEAR), [0.99], 1.0).ruled_out == {Reason.NEAR}
 
 
 def test_results_at_several_places_share_the_probability_of_the_best_ones_place():

@@ -16,11 +16,12 @@ from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
 from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
-from piccolo.confidence.localization import FocalLength
+from piccolo.confidence.localization import FocalLength, Localization
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
 from piccolo.judge.belief import make_belief
 from piccolo.judge.reasons import Reason
+from piccolo.localization.judge import follow_consensus
 from piccolo.result import Result, Source, read_results
 from research.synthetic.world import render_picture
 
@@ -92,6 +93,27 @@ def test_photos_that_confirm_a_calibration_make_all_of_its_poses_surer():
     assert all(0.9 < result.confidence < 0.91 for *_, result in changed)
     assert all(result.belief.doubt == result.focal_length.doubt < 0.01 for *_, result in changed)
     assert list_changed_by_consensus([result.to_json() for *_, result in changed], 0.9) == []
+
+
+def _judged(belief, **focal):
+    """A result alone by a focal length that was given."""
+    focal = FocalLength(700.0, 2.0, 700.0, 2.1, 700.0, 7.0, doubt=belief.doubt, source="`camera`", **focal)
+    return Localization("localized", belief, Pose(np.eye(3), np.zeros(3)), focal_length=focal)
+
+
+def test_a_consensus_changes_the_doubt_alone_and_rules_out():
+    belief = make_belief([0.97], within=0.98, doubt=0.02)
+    confirming, contradicting = Opinion(0.0, 0.002**2), Opinion(0.05, 0.002**2)
+    found = follow_consensus(_judged(belief), confirming, 0.9)
+    assert found.belief == replace(belief, doubt=found.focal_length.doubt)
+    assert found.belief.doubt < 0.01
+    used = follow_consensus(_judged(belief, others_px=701.0, others_std_px=1.0), confirming, 0.9)
+    assert used.belief == belief, "it was localized with that of the others"
+    refused = follow_consensus(_judged(belief), contradicting, 0.9)
+    assert (refused.status, refused.belief.ruled_out) == ("not_localized", {Reason.CAMERA})
+    assert refused.belief.place == belief.place
+    mirrored = _judged(belief.rule_out(Reason.MIRRORED))
+    assert follow_consensus(mirrored, confirming, 0.9).belief.ruled_out == {Reason.MIRRORED}
 
 
 def test_other_cameras_have_their_own_say():

@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import os
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,8 +12,11 @@ from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
+from piccolo.report.site import NOT_TOLD
 from piccolo.result import Result, Source, read_results, unreadable_result
 
+ROOT = Path(__file__).resolve().parents[1]
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
 ELSEWHERE = Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0]))
@@ -72,6 +77,15 @@ def test_summary_says_what_a_person_asks_first():
     tiny = dataclasses.replace(ALTERNATIVE, probability=0.0049)
     assert "or (" not in dataclasses.replace(RESULT, status="ambiguous", alternatives=(tiny,)).summary()
     assert "or (" not in RESULT.summary()
+
+
+def test_reasons_are_those_of_the_schema_and_of_the_page():
+    """What was told of a photo is named on the page."""
+    schema = json.loads((ROOT / "docs" / "result.schema.json").read_text())
+    belief = schema["properties"]["belief"]["anyOf"][0]["properties"]
+    assert belief["ruled_out"]["items"]["enum"] == list(Reason)
+    words = re.search(r"type Told = (.*);", (ROOT / "page" / "src" / "types.ts").read_text())[1]
+    assert set(re.findall(r'"(\w+)"', words)) == set(Reason) - NOT_TOLD
 
 
 def test_json_says_how_far_probabilities_hold():

@@ -1,6 +1,7 @@
 """Changes of the belief in a photo by photos that help it."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -46,6 +47,15 @@ def believe_together(
         within = alone.within
     left = min(1.0, (1.0 - place) / max(1.0 - float(bundles[0]), LEAST_NONE))
     return make_belief([place, *(left * bundles[1:-1])], within)
+
+
+def believe_beside(alone: Belief, confidences: Sequence[float], within: float | None) -> Belief:
+    """Return the belief in a photo beside others, which is no surer than the surest of them.
+
+    `within` is that of the mean of its own pose and the one by them; None if there is no mean.
+    """
+    belief = alone.scale(max(confidences))
+    return belief if within is None else replace(belief, within=within)
 
 
 def share_place(best: Belief, confidences: Sequence[float]) -> tuple[float, list[float]]:

@@ -15,6 +15,7 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.together import believe_beside
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
@@ -100,11 +101,12 @@ def localize_beside(
         kept = list_agreeing(judged, found, ended.query.beside, scan_map)
         if not kept:
             return Localization(), ()
-        belief = judged.belief.scale(max(other.picture.confidence for other in kept))
+        within = None
         fused = fuse(judged, kept[0], ended)
         if fused is not None:
-            belief = replace(belief, within=probability_within(fused))
+            within = probability_within(fused)
             judged = take_pose(judged, fused, scan_map)
+        belief = believe_beside(judged.belief, [other.picture.confidence for other in kept], within)
     return judged.take_belief(belief, settings.min_confidence), tuple(other.name for other in kept)
 
 
