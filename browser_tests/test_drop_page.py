@@ -263,15 +263,16 @@ def _tell_place(page, x, y, radius):
 
 
 WRONG = {
-    "Contradicts the place you told": (29.0, -7.5),  # at the other end of the flat
-    "The place you told is not in the scan": (500.0, 500.0),
+    "Contradicts the place you told": ((29.0, -7.5), "near"),  # at the other end of the flat
+    "The place you told is not in the scan": ((500.0, 500.0), "nowhere"),
 }
 
 
 @pytest.mark.parametrize("verdict", WRONG)
 def test_a_place_that_the_photo_contradicts_is_the_headline(visit, shoot, verdict):
     page = visit()
-    _tell_place(page, *WRONG[verdict], 1.0)
+    place, reason = WRONG[verdict]
+    _tell_place(page, *place, 1.0)
     _choose(page, FLAT / "images" / "bedroom.jpg")
     _wait(page, "not_localized")
     page.wait_for_selector("#viewer[data-shown]")
@@ -280,8 +281,9 @@ def test_a_place_that_the_photo_contradicts_is_the_headline(visit, shoot, verdic
     facts = page.inner_text("#facts")
     assert "%" not in page.inner_text(".facts-head")
     assert "Most likely not of this scan" not in facts
-    told = page.evaluate("PICCOLO_REPORT.photos[0].contradiction")
-    assert facts.count(told[1:].replace("`near`", "the place")) == 1
+    assert page.evaluate("PICCOLO_REPORT.photos[0].contradicts") == [reason]
+    (warning,) = page.evaluate("PICCOLO_REPORT.photos[0].warnings")
+    assert facts.count(warning[1:].replace("`near`", "the place")) == 1
     shoot(page, f"drop-{verdict[:3]}".lower())
     page.evaluate(LISTEN)
     page.click('.copy:has-text("Search everywhere")')

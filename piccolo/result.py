@@ -23,10 +23,11 @@ from .files.json_file import document_of, parse_lines, read_bytes
 from .geometry.pose import Pose, check_pose, heading_pitch_roll_deg
 from .geometry.sphere import CONVENTION
 from .jobs.memory import is_shortage
+from .judge.belief import NOTHING, Belief
 from .photo import GpsPrior
 from .walk.results import WalkFrame
 
-FORMAT = "piccolo-pose/11"
+FORMAT = "piccolo-pose/12"
 POSE_FIELDS = ("R_cam_from_world", "center_world", "quaternion_wxyz", "T_world_from_cam")
 UNREADABLE = "unreadable"
 FAILED = "failed"
@@ -74,7 +75,9 @@ class Result:
     confidence
         Probability that `best_pose` is within 0.1 m and 5 degrees.
     probability_none
-        Probability that neither `best_pose` nor an alternative is right; None if unknown.
+        Probability that neither `best_pose` nor an alternative is right; None if the photo was not read.
+    belief
+        `Belief`, of which the probabilities are products; None if the photo was not read.
     alternatives
         Other poses that explain the photo, best first, at most 5.
     evidence
@@ -134,6 +137,7 @@ class Result:
     height_above_floor: float | None = None
     walk: WalkFrame | None = None
     beside: Beside | None = None
+    belief: Belief | None = None
 
     def __post_init__(self) -> None:
         """Make the arrays read-only, on which the JSON and the hash rest."""
@@ -151,7 +155,8 @@ class Result:
     def is_calibrated(self) -> bool:
         """Return True if the probabilities are calibrated: not with labels or the preset paper."""
         panorama: Any = self.settings.get("panorama", {})
-        return self.probability_none is not None and not panorama.get("labels")
+        is_rough = panorama.get("labels") or self.settings.get("preset") == "paper"
+        return self.probability_none is not None and not is_rough
 
     @property
     def pose(self) -> Pose | None:
@@ -196,7 +201,7 @@ class Result:
             direction = self.covariance.least_constrained_direction
             lines.append(f"  one sigma {mm:.1f} mm {direction}, rotation {deg:.2f} deg")
         if self.status == AMBIGUOUS:
-            shown = (h for h in self.alternatives if h.probability is None or round(h.probability, 2) > 0.0)
+            shown = (h for h in self.alternatives if round(h.probability, 2) > 0.0)
             lines += [f"  or {_place(h)}" for h in shown]
         return "\n".join(lines)
 
@@ -223,6 +228,7 @@ class Result:
             "confidence": self.confidence,
             "probability_none": self.probability_none,
             "calibrated": self.is_calibrated,
+            "belief": self.belief and {**asdict(self.belief), "ruled_out": sorted(self.belief.ruled_out)},
             "error": self.error,
             "cloud": self.cloud,
             "pano": self.pano,
@@ -287,14 +293,21 @@ def with_localization(result: Result, found: Localization) -> Result:
     """Return a result with what was found, and its warnings added."""
     own = {f.name for f in fields(result)} - {"warnings", "cameras"}
     values = {f.name: getattr(found, f.name) for f in fields(found) if f.name in own}
-    return replace(result, best_pose=found.pose, warnings=result.warnings + found.warnings, **values)
+    return replace(
+        result,
+        best_pose=found.pose,
+        confidence=found.confidence,
+        probability_none=found.probability_none,
+        warnings=result.warnings + found.warnings,
+        **values,
+    )
 
 
 def localization_of(result: Result) -> Localization:
     """Return what was found of a photo, without warnings and cameras, from its result."""
-    own = {f.name for f in fields(result)} - {"warnings", "cameras"}
+    own = {f.name for f in fields(result)} - {"warnings", "cameras", "belief"}
     values = {f.name: getattr(result, f.name) for f in fields(Localization) if f.name in own}
-    return Localization(pose=result.best_pose, **values)
+    return Localization(pose=result.best_pose, belief=result.belief or NOTHING, **values)
 
 
 def describe_failure(error: Exception) -> str:
@@ -335,9 +348,7 @@ def _walk_json(walk: WalkFrame) -> dict[str, object]:
 
 def _place(alternative: Alternative) -> str:
     x, y, z = alternative.pose.center_world
-    p = alternative.probability
-    sure = f"score {alternative.score:.2f}" if p is None else f"probability {p:.2f}"
-    return f"({x:.3f}, {y:.3f}, {z:.3f}) m{_in(alternative.scan)}, {sure}"
+    return f"({x:.3f}, {y:.3f}, {z:.3f}) m{_in(alternative.scan)}, probability {alternative.probability:.2f}"
 
 
 def _in(scan: str | None) -> str:

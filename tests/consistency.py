@@ -40,10 +40,13 @@ def check_probabilities(result):
         yield f"probabilities {known}, wanted 0 to 1"
     if result.probability_none is None or result.status in NOT_READ:
         return
-    if None in others:
-        yield f"alternatives of the probabilities {others} beside {result.probability_none} for none"
     if abs(sum(known) - 1.0) > ROUNDING:
         yield f"probabilities {known} that add up to {sum(known)}"
+    if result.belief is not None and result.best_pose is not None:
+        told = [result.confidence, *others, result.probability_none]
+        believed = result.belief.probabilities
+        if len(believed) != len(told) or np.abs(believed - told).max() > ROUNDING:
+            yield f"probabilities {told} beside the belief {result.belief}"
 
 
 def check_status(result):

@@ -31,6 +31,7 @@ from piccolo.confidence.localization import Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
+from piccolo.judge.belief import make_belief
 from piccolo.opened_scan import OpenedScan
 from piccolo.photo import Photo
 from piccolo.result import Beside, Result, Source, read_results
@@ -141,7 +142,9 @@ class Looked(NamedTuple):
 
 def _sure_by(confidence):
     """The fields of a result whose best pose is the only one that is likely."""
-    return {"confidence": confidence, "probability_none": 1.0 - confidence, "alternatives": ()}
+    belief = make_belief([confidence])
+    stated = {"confidence": confidence, "probability_none": 1.0 - confidence}
+    return {"belief": belief, "alternatives": (), **stated}
 
 
 @pytest.fixture
@@ -308,7 +311,7 @@ def test_what_is_looked_at(scene, monkeypatch):
 
     def localize_beside(_prepared, _picture, poses, pictures, *_):
         asked.append([pose.key for pose in poses[:1]])
-        return Localization("localized", 0.93, 0.07, first.best_pose), tuple(pictures)
+        return Localization("localized", make_belief([0.93]), first.best_pose), tuple(pictures)
 
     monkeypatch.setattr(opened_scan, "localize_beside", localize_beside)
 

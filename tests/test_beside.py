@@ -9,16 +9,18 @@ import rooms
 from test_verification import NUM_POINTS, _beside, _narrow, _query, _true_pose
 
 from piccolo.confidence.localization import Localization
-from piccolo.evidence import verification
-from piccolo.evidence.focal_length import FocalFit
 from piccolo.geometry.pose import Pose
 from piccolo.geometry.pose_gaussian import LIKELY, PoseGaussian, subtract
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.judge.selection import NOTHING
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.local_features.hypotheses import exact_pose
 from piccolo.local_features.matching import NO_MATCHES
+from piccolo.localization import verification
 from piccolo.localization.beside import Neighbor, SurePhoto, fuse, localize_beside
+from piccolo.localization.focal_length import FocalFit
 from piccolo.localization.localize import Found
+from piccolo.localization.selection import NOTHING
 from piccolo.photo import Prior
 
 
@@ -96,7 +98,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     """By their covariances; not if it is ruled out, nor against a prior."""
     true = _true_pose()
     off = Pose(true.R_cam_from_world, true.center_world + np.array([0.09, 0.0, 0.0]))
-    judged = Localization("not_localized", 0.8, 0.2, off, gaussian=_at(off, 0.05))
+    judged = Localization(belief=make_belief([0.8]), pose=off, gaussian=_at(off, 0.05))
     fused = _fused(judged, _at(true, 0.01))
     expected = 0.09 * 0.01**2 / (0.05**2 + 0.01**2)
     assert fused.pose.distance(true) == pytest.approx(expected, rel=0.3)
@@ -105,7 +107,7 @@ def test_a_pose_is_averaged_with_that_by_a_photo_beside():
     assert apart.pose.distance(true) == pytest.approx(0.045, abs=0.004)
     excess = 0.09**2 / (2.0 * 0.01**2) - LIKELY + 1.0
     assert apart.largest_std == pytest.approx(0.01 * (excess / 2.0) ** 0.5, rel=0.1)
-    assert _fused(replace(judged, is_ruled_out=True), _at(true, 0.01)) is None
+    assert _fused(replace(judged, belief=judged.belief.rule_out(Reason.MIRRORED)), _at(true, 0.01)) is None
     assert _fused(replace(judged, gaussian=None), _at(true, 0.01)) is None
     here = rooms.scan_map(1, NUM_POINTS).to_world(true).center_world
     away = replace(rooms.UNKNOWN, prior=Prior(near=(*(here[:2] + 5.0), None), radius=0.5))

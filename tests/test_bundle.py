@@ -8,14 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import at
+from made_up import at, compared
 from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.judge.selection import Selection
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.localization import bundle_search
 from piccolo.localization.bundle import (
     CONTRADICTS,
@@ -26,6 +27,7 @@ from piccolo.localization.bundle import (
     localize_bundle,
 )
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
+from piccolo.localization.selection import Selection
 from piccolo.panorama import Panorama
 from research.synthetic.world import mask_outside_field, photograph
 
@@ -44,7 +46,7 @@ def _alone(*probabilities):
     poses = [at(float(k), 0.5) for k in range(len(probabilities))]
     likely = list(zip(poses, probabilities, strict=True))
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
-    alone = Localization(pose=poses[0].pose, confidence=probabilities[0], alternatives=alternatives)
+    alone = Localization(belief=make_belief(probabilities), pose=poses[0].pose, alternatives=alternatives)
     return bundle_search.Member(
         None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0]
     )
@@ -96,11 +98,33 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
     assert bundle_search.weigh_bundles([[own, own, out]], members)[0] > 0.9
 
 
+@pytest.mark.parametrize("std", [0.005, 0.06, 0.3])
+def test_a_certain_place_counts_whole_however_inexact_the_pose_is(monkeypatch, std):
+    """How exact it is counts once, in the end."""
+    query = compared(monkeypatch, {0.0: 0.6, 3.0: 0.02}, {0.0: 80})
+    query = replace(query, scan_map=SimpleNamespace(**vars(query.scan_map), sparse=range(100)))
+    best, other = at(0.0, 0.6), at(3.0, 0.02)
+    belief = make_belief([0.99, 0.001], within=0.5)
+    gaussian = PoseGaussian(best.pose, np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
+    alone = Localization(
+        belief=belief,
+        pose=best.pose,
+        alternatives=(Alternative(other.pose, other.score),),
+        gaussian=gaussian,
+        std_of_fit=0.005,
+    )
+    member = bundle_search.Member(query, Selection(best, (other,)), None, alone, Pose(np.eye(3), np.zeros(3)))
+    support = bundle_search.find_support(member, query, Bundle(best.pose))
+    assert support.own is best
+    assert support.odds > 5e4
+    assert [p for _, p in member.own_poses] == [0.99, 0.001]
+
+
 @pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])
 def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
     query = SimpleNamespace(given=SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured)))
     fit = conflict and SimpleNamespace(conflict=conflict)
-    alone = Localization(is_ruled_out=True, warnings=("mirrored",), confidence=0.0)
+    alone = Localization(belief=make_belief([0.9]).rule_out(Reason.MIRRORED), warnings=("mirrored",))
     member = _alone(0.9)
     member = replace(member, query=query, fit=fit, alone=alone)
     assert member.own_poses == []

@@ -13,8 +13,9 @@ from piccolo.confidence.occlusion import Agreement, measure_agreement
 from piccolo.errors import InputError
 from piccolo.geometry.nearness import Nearness
 from piccolo.geometry.pose import exp_so3, step
+from piccolo.judge.belief import make_belief
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.paper.localize import PaperSettings
-from piccolo.problem.settings import CoarseToFineSettings
 
 SURE = 0.002  # [m] largest deviation
 RIGHT, WRONG = Standing(1.0, 0.8, 60, "drawn scan"), Standing(1.0, 0.03, 3, "drawn scan")
@@ -25,11 +26,10 @@ MODEL = rule.ChoiceModel((3.0, 1.0, 2.0), (10.0, 2.0))
 def test_probabilities_are_those_of_the_formula_and_add_up_to_one():
     """A conditional logit by a pocket calculator, with made-up weights."""
     standings = [Standing(*values, "drawn scan") for values in ((1.0, 0.5, 12), (0.5, 0.1, 2))]
-    p = posterior(standings, 0.01, 0.8, MODEL)
+    p = posterior(standings, 0.01, MODEL)
     e = math.exp
     odds = [0.5 * 20.0**2, 0.5**3 * 0.1 * 10.0**2, e(10.0 - 2.0 * 2.0)]
-    expected = [0.8 * odds[0] / sum(odds), 0.8 * odds[1] / sum(odds)]
-    np.testing.assert_allclose(p, [*expected, 1.0 - sum(expected)], rtol=1e-12)
+    np.testing.assert_allclose(p, np.array(odds) / sum(odds), rtol=1e-12)
 
 
 def test_right_and_wrong_evidence():
@@ -85,7 +85,7 @@ def test_more_evidence_is_more_probability(name, more):
 
 @pytest.mark.parametrize("within", [0.954, 0.5])
 def test_a_pose_that_may_be_a_decimetre_off_is_doubtful_whatever_the_evidence(within):
-    p = posterior([RIGHT._replace(num_matches=10**7)], SURE, within)
+    p = make_belief(posterior([RIGHT._replace(num_matches=10**7)], SURE)[:-1], within).probabilities
     assert p[0] == pytest.approx(within, abs=0.002)
     assert p.sum() == pytest.approx(1.0)
 

@@ -6,11 +6,12 @@ import json
 import numpy as np
 import pytest
 from consistency import contradictions_of_line, find_contradictions, lines_of_results
-from test_result import ELSEWHERE, POSE, RESULT
+from test_result import POSE, RESULT
 
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Alternative, FocalLength
 from piccolo.geometry.pose import Pose
+from piccolo.judge.belief import make_belief
 from piccolo.walk.results import WalkFrame
 
 SETTINGS = {"preset": "default", "cloud": {}, "panorama": {}}
@@ -38,7 +39,7 @@ def good():
 BROKEN = {
     "add up to 1.0": {"probability_none": 0.01},
     "wanted 0 to 1": {"confidence": 1.2, "probability_none": -0.208},
-    "beside 0.002 for none": {"alternatives": (Alternative(ELSEWHERE, 0.2),)},
+    "beside the belief": {"belief": make_belief([0.98, 0.01])},
     "least 0.9, with": {"confidence": 0.5, "probability_none": 0.492},
     "with the error None": {"status": "unreadable"},
     "with the error 'why'": {"error": "why"},

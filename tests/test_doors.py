@@ -17,6 +17,8 @@ from piccolo import Pose, Result
 from piccolo.cli import localize as localize_command
 from piccolo.cloud.soa import pack_points
 from piccolo.geometry.pose import check_pose, exp_so3
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.kernels.jit import whole
 from piccolo.optimize.sampling_loss import sampling_loss
 from piccolo.panorama.texels import pack_texels
@@ -214,6 +216,10 @@ PROBABILITIES = st.floats(0.0, 1.0)
 MAYBE = {
     "loss": st.none() | PROBABILITIES,
     "probability_none": st.none() | PROBABILITIES,
+    "belief": st.none()
+    | st.builds(make_belief, st.just([0.5, 0.25]), PROBABILITIES, PROBABILITIES).map(
+        lambda belief: belief.rule_out(Reason.NEAR)
+    ),
     "storey": st.none() | st.integers(1, 9),
     "height_above_floor": st.none() | NUMBERS,
     "scan": st.none() | st.text(max_size=5),

@@ -16,9 +16,12 @@ from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli.localize import main
 from piccolo.confidence.focal_length import WRONG_SHARE, Consensus, Opinion
-from piccolo.confidence.localization import FocalLength
+from piccolo.confidence.localization import FocalLength, Localization
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
+from piccolo.localization.judge import follow_consensus
 from piccolo.result import Result, Source, read_results
 from research.synthetic.world import render_picture
 
@@ -35,7 +38,9 @@ def _text(picture, std, given_std=0.003, status="localized", confidence=0.95, **
     camera = (Mount(pinhole(1024, 768, GIVEN)),)
     source = Source(None, None, (1024, 768), None)
     result = Result(status, confidence, "a.ply", "a.jpg", pose, cameras=camera, source=source)
-    return replace(result, focal_length=focal, probability_none=1.0 - confidence).to_json()
+    place = confidence / (1.0 - focal.doubt)
+    found = {"probability_none": 1.0 - confidence, "belief": make_belief([place], doubt=focal.doubt)}
+    return replace(result, focal_length=focal, **found).to_json()
 
 
 def test_a_given_focal_length_is_doubted_by_as_much_as_the_picture_can_tell():
@@ -74,6 +79,7 @@ def test_photos_that_contradict_a_calibration_together_rule_out_all_of_its_poses
     assert [(number, status) for number, status, _ in changed] == [(k, "localized") for k in range(7)]
     for _, _, result in changed:
         assert (result.status, result.confidence) == ("not_localized", 0.0)
+        assert result.belief.ruled_out == {Reason.CAMERA}
         (warning,) = result.warnings
         assert warning == "the pictures of this camera have a focal length of 735 px, not 700: check `camera`"
     again = [result.to_json() for *_, result in changed]
@@ -85,7 +91,29 @@ def test_photos_that_confirm_a_calibration_make_all_of_its_poses_surer():
     changed = list_changed_by_consensus(texts, 0.9)
     assert [result.status for *_, result in changed] == ["localized"] * 6
     assert all(0.9 < result.confidence < 0.91 for *_, result in changed)
+    assert all(result.belief.doubt == result.focal_length.doubt < 0.01 for *_, result in changed)
     assert list_changed_by_consensus([result.to_json() for *_, result in changed], 0.9) == []
+
+
+def _judged(belief, **focal):
+    """A result alone by a focal length that was given."""
+    focal = FocalLength(700.0, 2.0, 700.0, 2.1, 700.0, 7.0, doubt=belief.doubt, source="`camera`", **focal)
+    return Localization("localized", belief, Pose(np.eye(3), np.zeros(3)), focal_length=focal)
+
+
+def test_a_consensus_changes_the_doubt_alone_and_rules_out():
+    belief = make_belief([0.97], within=0.98, doubt=0.02)
+    confirming, contradicting = Opinion(0.0, 0.002**2), Opinion(0.05, 0.002**2)
+    found = follow_consensus(_judged(belief), confirming, 0.9)
+    assert found.belief == replace(belief, doubt=found.focal_length.doubt)
+    assert found.belief.doubt < 0.01
+    used = follow_consensus(_judged(belief, others_px=701.0, others_std_px=1.0), confirming, 0.9)
+    assert used.belief == belief, "it was localized with that of the others"
+    refused = follow_consensus(_judged(belief), contradicting, 0.9)
+    assert (refused.status, refused.belief.ruled_out) == ("not_localized", {Reason.CAMERA})
+    assert refused.belief.place == belief.place
+    mirrored = _judged(belief.rule_out(Reason.MIRRORED))
+    assert follow_consensus(mirrored, confirming, 0.9).belief.ruled_out == {Reason.MIRRORED}
 
 
 def test_other_cameras_have_their_own_say():

@@ -14,16 +14,16 @@ from piccolo.camera import Calibration, Camera, Mount
 from piccolo.camera.model import pinhole
 from piccolo.camera.resampling import View, make_sphere
 from piccolo.confidence.localization import Alternative, Evidence, FocalLength, Localization
-from piccolo.evidence import focal_length as focal
-from piccolo.evidence.comparison import score_pose
-from piccolo.evidence.lens_matches import MatchFit, fit_matches
-from piccolo.evidence.self_calibration import Estimate
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.judge.selection import Selection
+from piccolo.judge.belief import make_belief
 from piccolo.local_features.matching import NO_MATCHES
-from piccolo.localization import bundle, localize as module
+from piccolo.localization import bundle, focal_length as focal, localize as module
+from piccolo.localization.comparison import score_pose
+from piccolo.localization.lens_matches import MatchFit, fit_matches
 from piccolo.localization.localize import select_likeliest
+from piccolo.localization.selection import Selection
+from piccolo.localization.self_calibration import Estimate
 from piccolo.panorama import read_panorama
 from piccolo.photo import Photo
 from research.synthetic.world import render_picture
@@ -169,9 +169,9 @@ def test_other_poses_with_other_guesses_share_the_probability():
     settings = rooms.AUTO
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     here, elsewhere = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
-    sure = Localization("localized", 0.95, 0.05, here, evidence=evidence)
-    assert select_likeliest([replace(sure, confidence=0.9), sure], settings) is sure
-    other = replace(sure, confidence=0.9, pose=elsewhere)
+    sure = Localization("localized", make_belief([0.95]), here, evidence=evidence)
+    assert select_likeliest([replace(sure, belief=make_belief([0.9])), sure], settings) is sure
+    other = replace(sure, belief=make_belief([0.9]), pose=elsewhere)
     doubtful = select_likeliest([sure, other, other], settings)
     assert doubtful.status == "ambiguous"
     assert doubtful.confidence == pytest.approx(0.95**2 / 1.85)
@@ -186,11 +186,13 @@ def test_the_same_place_by_another_focal_length_is_no_alternative_and_none_is_li
     evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
     ahead, aside = Pose(np.eye(3), np.array([1.0, 0.1, 0.0])), Pose(np.eye(3), np.array([0.0, 1.0, 0.0]))
     first = replace(
-        Localization("localized", 0.95, 0.05, Pose(np.eye(3), np.zeros(3)), evidence=evidence),
+        Localization("localized", make_belief([0.95, 0.02]), Pose(np.eye(3), np.zeros(3)), evidence=evidence),
         alternatives=(Alternative(aside, 0.4, None, 0.02),),
         focal_length=FocalLength(300.0, 3.0, 300.0, 60.0),
     )
-    longer = replace(first, confidence=0.9, pose=ahead, focal_length=FocalLength(345.0, 3.0, 345.0, 69.0))
+    longer = replace(
+        first, belief=make_belief([0.9, 0.02]), pose=ahead, focal_length=FocalLength(345.0, 3.0, 345.0, 69.0)
+    )
     assert select_likeliest([first, longer], settings) is first
     as_long = replace(longer, focal_length=first.focal_length)
     assert select_likeliest([first, as_long], settings).status == "ambiguous"

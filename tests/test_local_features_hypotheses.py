@@ -10,6 +10,7 @@ import rooms
 
 from piccolo.geometry.pose import Pose, exp_so3
 from piccolo.jobs.threads import Stopwatch, Workers
+from piccolo.judge.reasons import explain
 from piccolo.local_features.feature_map import make_feature_map
 from piccolo.local_features.hypotheses import count_matches, exact_pose, propose_poses, rough_poses
 from piccolo.local_features.matching import Matches
@@ -118,7 +119,7 @@ def test_poses_that_contradict_a_prior_are_told():
     ):
         told = contradictions(scan_map, _true_pose(1), prior)
         assert len(told) == bool(wrong)
-        assert wrong in "".join(told)
+        assert wrong in "".join(map(explain, told))
 
 
 def test_matches_beyond_a_prior_are_asked_too():

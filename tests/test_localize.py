@@ -22,6 +22,8 @@ from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
 from piccolo.cli import execution, localize, prepare_map
 from piccolo.confidence.localization import FocalLength
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.result import Result
 from research.scene import read_scene
 
@@ -119,8 +121,11 @@ GUESSED = FocalLength(700.0, 9.0, 804.0, 160.8)
             {"confidence": 0.09, "cameras": (Mount(pinhole(4, 3, 4.0)),)},
             ["  it fits nowhere .* focal length"],
         ),
-        ({"confidence": 0.0}, []),  # a warning says why
-        ({"confidence": 0.5, "probability_none": None}, []),  # of the preset paper
+        (
+            {"confidence": 0.0, "belief": make_belief([0.9]).rule_out(Reason.MIRRORED)},
+            [],
+        ),  # a warning says why
+        ({"confidence": 0.5, "settings": {"preset": "paper"}}, []),
     ],
 )
 def test_a_doubtful_result_says_what_to_do(change, advice):

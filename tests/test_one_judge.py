@@ -1,7 +1,6 @@
-"""The judge's decisions; and photos that help each other never overrule what it has ruled out."""
+"""What the judge rules out; and photos that help each other never overrule what it has ruled out."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,43 +11,22 @@ from test_walk import _walk_through
 
 import piccolo
 from piccolo.camera import Mount
-from piccolo.camera.model import pinhole
+from piccolo.camera.model import pinhole, whole_sphere
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import Standing
-from piccolo.confidence.localization import Alternative, FocalLength, Localization
-from piccolo.evidence.covariance import UNKNOWN_ERRORS
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
-from piccolo.judge import decide as judging
-from piccolo.judge.decide import MIRRORED
-from piccolo.judge.selection import Selection
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
+from piccolo.localization import judge as judging
+from piccolo.localization.covariance import UNKNOWN_ERRORS
+from piccolo.localization.judge import MIRRORED, NOT_AS_CLAIMED
+from piccolo.localization.selection import Selection
+from piccolo.localization.self_calibration import Estimate
+from piccolo.localization.sphere import SphereFit
 from research.synthetic.world import photograph, render_picture
 
-HERE, AWAY = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
-JUDGED = Localization(pose=HERE, alternatives=(Alternative(AWAY, 0.3, 4),))
-
-
-@pytest.mark.parametrize(
-    ("probabilities", "status"),
-    [
-        ((0.9, 0.06, 0.04), "localized"),
-        ((0.89, 0.07, 0.04), "ambiguous"),
-        ((0.06, 0.89, 0.05), "ambiguous"),
-        ((0.5, 0.3, 0.2), "not_localized"),
-    ],
-)
-def test_a_status_is_that_of_its_probabilities_but_what_is_ruled_out_has_none(probabilities, status):
-    found = judging.decide(JUDGED, np.array(probabilities), 0.9)
-    told = found.confidence, found.alternatives[0].probability, found.probability_none
-    assert (found.status, told) == (status, probabilities)
-    again = judging.reconsider(found, 0.5, 0.9)
-    halves = [0.5 * p for p in probabilities[:2]]
-    assert [again.confidence, again.alternatives[0].probability] == pytest.approx(halves)
-    assert again.probability_none == pytest.approx(1.0 - sum(halves))
-    assert again.status == "not_localized"
-    refused = judging.decide(replace(JUDGED, is_ruled_out=True), np.array(probabilities), 0.9)
-    assert (refused.status, refused.confidence, refused.probability_none) == ("not_localized", 0.0, 1.0)
-    assert judging.reconsider(refused, 100.0, 0.9).confidence == 0.0
+HERE = Pose(np.eye(3), np.zeros(3))
 
 
 @pytest.mark.parametrize(
@@ -67,17 +45,18 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
 ):
     asked = []
     monkeypatch.setattr(judging, "is_mirrored", lambda _, best: asked.append(best) or is_mirrored)
-    monkeypatch.setattr(judging, "explain_doubts", lambda *_: ())
-    query, focal = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1)), FocalLength(300.0, 3.0, 300.0, 3.0)
-    fit = SimpleNamespace(doubt=doubt, conflict=conflict, focal_length=lambda given: focal)
+    query = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1))
+    nothing = Estimate(np.zeros(3), np.zeros((3, 3)), np.zeros((6, 3)))
+    fit = SphereFit(whole_sphere(64, 32), nothing, is_claimed=True, conflict=conflict, doubt=doubt)
     found = Selection(Hypothesis(HERE, 0.5), ())
     measured = judging.Measured(HERE, UNKNOWN_ERRORS, 0.05, None)
     standings = [Standing(1.0, 0.5, 60, "drawn scan")]
-    p = np.array([probability, 1.0 - probability])
-    result = judging.conclude(query, found, fit, measured, standings, p)
+    belief = make_belief([probability])
+    result = judging.conclude(query, found, fit, measured, standings, belief)
     assert (result.status, MIRRORED in result.warnings, len(asked)) == (status, warns, num_asked)
-    assert result.is_ruled_out == (warns or conflict > 0.0)
-    assert result.confidence == pytest.approx(0.0 if result.is_ruled_out else (1.0 - doubt) * probability)
+    reasons = {Reason.MIRRORED} if warns else {Reason.SPHERE} if conflict else set()
+    assert result.belief == replace(belief, doubt=doubt, ruled_out=frozenset(reasons))
+    assert (NOT_AS_CLAIMED in result.warnings) == (Reason.SPHERE in reasons)
 
 
 def test_photos_of_one_wrong_focal_length_are_not_sure_together():

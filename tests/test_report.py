@@ -8,7 +8,6 @@ import re
 import shutil
 import zlib
 from dataclasses import replace
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -20,10 +19,8 @@ from report_scenes import HOSTILE, STOREY, House, lifted, mixed_house
 import piccolo
 from piccolo.cli import report
 from piccolo.errors import InputError
-from piccolo.geometry.pose import heading_pitch_roll_deg
-from piccolo.judge.decide import contradict
-from piccolo.photo import Prior
-from piccolo.problem.prior import find_contradicted_heading
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
 from piccolo.report.pictures import pack_depth
 from piccolo.report.site import collect_entries, shorten_names, unique_names
 from research.synthetic.walk_frames import writing_video
@@ -376,23 +373,19 @@ def test_hopeless_guesses_are_on_no_plan(house, tmp_path):
 
 def test_what_contradicts_a_result_is_told_apart(house, tmp_path):
     scene, _ = house
-    pose = scene.results[0].pose
-    behind = (heading_pitch_roll_deg(pose)[0] + 180.0) % 360.0
-    (by_heading,) = find_contradicted_heading(pose, Prior(heading_deg=behind))
-    focal = SimpleNamespace(given_px=900.0, source="`focal_px`")
-    by_focal = contradict("the picture has", focal, 1200.0)
-    told = [("read as it is", by_heading), (by_focal,), ("read as it is",)]
+    told = [{Reason.HEADING, Reason.NEAR}, {Reason.CALIBRATION}, {Reason.MIRRORED}, set()]
     results = [
-        replace(result, status="not_localized", confidence=0.001, warnings=warnings)
-        for result, warnings in zip(scene.results, told, strict=False)
+        replace(result, status="not_localized", confidence=0.0, belief=make_belief([0.9]).rule_out(*reasons))
+        for result, reasons in zip(scene.results, told, strict=False)
     ]
-    results.append(replace(scene.results[3], warnings=(by_heading,)))  # localized all the same
+    results.append(scene.results[0])
     lines = write_results(tmp_path / "poses.jsonl", results)
     words = ["--results", str(lines), "--cloud", str(scene.cloud), "--quiet"]
     assert report.main([*words, "--out", str(tmp_path / "r")]) == 0
     photos = _document(tmp_path / "r")["photos"]
-    assert [photo["contradiction"] for photo in photos] == [by_heading, by_focal, None, None]
-    assert [photo["isOnPlan"] for photo in photos] == [True, True, False, True]
+    told = [photo["contradicts"] for photo in photos]
+    assert told == [["heading", "near"], ["calibration"], [], [], []]
+    assert [photo["isOnPlan"] for photo in photos] == [True, True, False, False, True]
 
 
 def test_in_python(house, tmp_path):

@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import os
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,8 +11,12 @@ from refusals import assert_input_error
 from piccolo.confidence.covariance import PoseCovariance
 from piccolo.confidence.localization import Alternative, Evidence
 from piccolo.geometry.pose import Pose, exp_so3
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
+from piccolo.report.site import NOT_TOLD
 from piccolo.result import Result, Source, read_results, unreadable_result
 
+ROOT = Path(__file__).resolve().parents[1]
 POSE = Pose(exp_so3(np.array([0.3, -0.2, 0.9])), np.array([500_000.123, 4_000_000.456, 12.0]))
 EVIDENCE = Evidence(0.7, 0.5, 0.8, 0.6, 0.9, 0.5)
 ELSEWHERE = Pose(exp_so3(np.array([0.1, 0.2, -2.0])), np.array([1.0, 2.0, 3.0]))
@@ -26,10 +32,11 @@ RESULT = Result(
     alternatives=(ALTERNATIVE,),
     covariance=PoseCovariance(np.diag([1e-6, 1e-6, 1e-6, 4e-6, 9e-6, 16e-6]), "up and down"),
     seconds={"read": 0.1, "search": 0.2},
-    settings={"preset": "paper", "seed": 0},
+    settings={"preset": "default", "seed": 0},
     warnings=("odd",),
     source=Source("0" * 64, "1" * 64, (2048, 1024), "2026-11-22T10:00:00+01:00"),
     probability_none=0.002,
+    belief=make_belief([0.99, 0.008]),
     storey=2,
     height_above_floor=1.51,
 )
@@ -53,7 +60,7 @@ def test_json_names_what_the_next_tool_needs_in_its_units():
     assert document["std_mm"] == pytest.approx([2.0, 3.0, 4.0])
     assert document["std_deg"] == pytest.approx([np.degrees(1e-3)] * 3)
     assert "R_true = exp([w]x) R_cam_from_world" in document["covariance_convention"]
-    assert document["format"] == "piccolo-pose/11"
+    assert document["format"] == "piccolo-pose/12"
     assert (document["storey"], document["height_above_floor_m"]) == (2, 1.51)
     T = np.array(document["T_world_from_cam"])
     np.testing.assert_allclose(T[:3, 3], RESULT.pose.center_world)
@@ -69,10 +76,16 @@ def test_summary_says_what_a_person_asks_first():
     assert "or (1.000, 2.000, 3.000) m, probability 0.01" in text
     tiny = dataclasses.replace(ALTERNATIVE, probability=0.0049)
     assert "or (" not in dataclasses.replace(RESULT, status="ambiguous", alternatives=(tiny,)).summary()
-    by_paper = dataclasses.replace(ALTERNATIVE, probability=None)
-    text = dataclasses.replace(RESULT, status="ambiguous", alternatives=(by_paper,)).summary()
-    assert "or (1.000, 2.000, 3.000) m, score 0.20" in text
     assert "or (" not in RESULT.summary()
+
+
+def test_reasons_are_those_of_the_schema_and_of_the_page():
+    """What was told of a photo is named on the page."""
+    schema = json.loads((ROOT / "docs" / "result.schema.json").read_text())
+    belief = schema["properties"]["belief"]["anyOf"][0]["properties"]
+    assert belief["ruled_out"]["items"]["enum"] == list(Reason)
+    words = re.search(r"type Told = (.*);", (ROOT / "page" / "src" / "types.ts").read_text())[1]
+    assert set(re.findall(r'"(\w+)"', words)) == set(Reason) - NOT_TOLD
 
 
 def test_json_says_how_far_probabilities_hold():
@@ -80,7 +93,7 @@ def test_json_says_how_far_probabilities_hold():
     assert document["alternatives"][0]["probability"] == 0.008
     assert (document["probability_none"], document["calibrated"]) == (0.002, True)
     labelled = dataclasses.replace(RESULT, settings={"panorama": {"labels": {"ignored": []}}})
-    by_paper = dataclasses.replace(RESULT, probability_none=None)
+    by_paper = dataclasses.replace(RESULT, settings={"preset": "paper"})
     assert not any(json.loads(r.to_json())["calibrated"] for r in (labelled, by_paper))
 
 
@@ -143,4 +156,4 @@ def test_several_files_of_a_cloud_are_a_list():
 
 @pytest.mark.parametrize("text", ["{", "[]", "{}", *(f'{{"format": "piccolo-pose/{k}"}}' for k in (3, 10))])
 def test_other_text_is_refused(text):
-    assert_input_error("piccolo-pose/11", Result.from_json, text)
+    assert_input_error("piccolo-pose/12", Result.from_json, text)

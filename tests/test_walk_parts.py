@@ -1,6 +1,9 @@
 """Parts of a walk: positions smoothed together, times from names, tables and EXIF, frames read again."""
 
+import math
 import time
+from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -11,13 +14,17 @@ from refusals import assert_input_error
 from test_priors import write_photo
 
 from piccolo.batch.inputs import times_of
-from piccolo.confidence.localization import Localization
+from piccolo.confidence.localization import Alternative, Evidence, Localization
 from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, exp_so3, log_so3
-from piccolo.geometry.pose_gaussian import PoseGaussian
+from piccolo.geometry.pose_gaussian import PoseGaussian, probability_within
+from piccolo.judge.belief import make_belief
+from piccolo.judge.reasons import Reason
+from piccolo.localization.settings import CoarseToFineSettings
 from piccolo.photo import Photo
-from piccolo.walk.frames import Frame
-from piccolo.walk.results import check_odometry, smooth_positions
+from piccolo.walk.frames import MOST_ODDS, Frame, State, list_states
+from piccolo.walk.path import Ranked
+from piccolo.walk.results import check_odometry, make_localization, smooth_positions
 
 MAX_ACCELERATION = 0.5  # [m/s^2]
 MAX_SPEED = 2.0  # [m/s]
@@ -106,12 +113,50 @@ def test_an_odometry_of_another_length_is_named(factor, noise, words):
     centers = np.cumsum(rng.normal(size=(200, 3)) * [0.4, 0.4, 0.0], axis=0)
     frames = [Frame(float(k), odometry=Pose(TURN, factor * c)) for k, c in enumerate(centers)]
     seen = [Pose(TURN, c + noise * rng.normal(size=3)) for c in centers]
-    found = [Localization("localized", 0.99, pose=pose) for pose in seen]
-    found[7] = Localization("localized", 0.99, pose=Pose(TURN, centers[7] + 9.0))
+    found = [Localization("localized", pose=pose) for pose in seen]
+    found[7] = Localization("localized", pose=Pose(TURN, centers[7] + 9.0))
     assert check_odometry(frames, found) == words
     assert check_odometry(frames[:3], found[:3]) == ()
     lost = [Localization(pose=pose) for pose in seen]
     assert check_odometry(frames, lost) == ()
+
+
+def _judged(belief):
+    """A frame that was localized alone, with one alternative."""
+    evidence = Evidence(0.5, 1.0, 0.5, 0.9, 0.3)
+    away = Alternative(Pose(TURN, np.array([3.0, 0.0, 0.0])), 0.3)
+    return Localization("localized", belief, Pose(TURN, np.zeros(3)), evidence=evidence, alternatives=(away,))
+
+
+def test_the_states_of_a_frame_have_the_odds_of_places_however_exact_the_pose_is():
+    """Its focal length may be wrong, and then the place is."""
+    scan_map = SimpleNamespace(from_world=lambda pose: pose)
+    for within in (1.0, 0.1):
+        best, other = list_states(scan_map, _judged(make_belief([0.9, 0.05], within, doubt=0.1)))
+        none = 1.0 - 0.9 * 0.95
+        assert best.log_odds == pytest.approx(math.log(0.9 * 0.9 / none))
+        assert other.log_odds == pytest.approx(math.log(0.9 * 0.05 / none))
+    assert (best.score, other.score) == (0.5, None)
+    certain = list_states(scan_map, _judged(make_belief([1.0, 0.0])))
+    assert [state.log_odds for state in certain] == [MOST_ODDS, pytest.approx(0.0)]
+    refused = _judged(make_belief([0.9, 0.05]).rule_out(Reason.MIRRORED))
+    assert {state.log_odds for state in list_states(scan_map, refused)} == {-2.0 * MOST_ODDS}
+    assert list_states(scan_map, Localization()) == []
+
+
+@pytest.mark.parametrize("std", [0.01, 0.08])
+def test_a_frame_of_a_walk_is_believed_by_its_path_and_its_errors(std):
+    """Of many places the likeliest are told; others count as none."""
+    here = PoseGaussian(Pose(TURN, np.zeros(3)), np.diag([1e-6] * 3 + [std**2] * 3), np.zeros((6, 6)))
+    states = [State(Pose(TURN, np.array([4.0 * k, 0.0, 0.0])), 0.0) for k in range(9)]
+    states[0] = replace(states[0], score=0.5, gaussian=here)
+    scan_map = SimpleNamespace(to_world=lambda pose: pose, R_map_from_world=np.eye(3))
+    tracker = SimpleNamespace(scan_map=scan_map, settings=CoarseToFineSettings())
+    found = make_localization(tracker, Frame(0.0), Ranked(states, np.array([0.92, *[0.01] * 8])))
+    assert found.belief == make_belief([0.92, *[0.01] * 5], probability_within(here))
+    assert found.belief.place[-1] == pytest.approx(0.03)
+    assert (found.status == "localized") == (std == 0.01)
+    assert len(found.alternatives) == 5
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

@@ -12,7 +12,7 @@ from piccolo.errors import InputError
 from piccolo.geometry.pose import Pose, carry, exp_so3, pose_errors, yaw_rotation
 from piccolo.walk import path as walk_path, results
 from piccolo.walk.frames import JUMP_LOG, MOST_EXPECTED, Frame, Motion, State, check_times
-from piccolo.walk.path import NOTHING, Belief, believe
+from piccolo.walk.path import NOTHING, Ranked, believe
 from piccolo.walk.tracker import Followed, expect
 
 MOTION = Motion(max_speed=1.0)
@@ -287,7 +287,7 @@ def walk():
     both = zip(TIMES, sure, strict=True)
     frames = [Frame(time, [state], is_key=True, departed=state.pose) for time, state in both]
     frames[LOST] = Frame(TIMES[LOST])
-    beliefs = [Belief([state], np.array([0.99])) for state in sure]
+    beliefs = [Ranked([state], np.array([0.99])) for state in sure]
     beliefs[LOST] = NOTHING
     probabilities = [belief.probabilities for belief in beliefs]
 
@@ -342,7 +342,7 @@ def test_a_frame_tracked_in_a_copy_is_tracked_where_it_is_expected(walk, monkeyp
     expected = _at(10.2)
     tracker, _, beliefs = walk
     tracker.frames[LOST].key = 1
-    beliefs[LOST] = Belief([State(expected, 4.0)], np.array([0.5]), expected)
+    beliefs[LOST] = Ranked([State(expected, 4.0)], np.array([0.5]), expected)
     frame, asked = _find(walk, monkeypatch, 10.1, "tracked", is_alone=False)
     assert asked[0].pose is expected
     assert frame.arrived.center_world[0] == pytest.approx(10.1)

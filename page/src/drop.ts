@@ -17,7 +17,7 @@ const TRIES = 6; // of a photo that a busy service sends away
 const FOV = "65"; // degrees, of most phones
 const NARROW = "(max-width: 860px)";
 const ENDING = /\.[A-Za-z0-9]{3,4}( \(\d+\))?$/;
-const NONE = ["probabilityNone", "scan", "captured", "size", "walk", "time", "contradiction", "pose", "storey", "height", "evidence", "spread"];
+const NONE = ["probabilityNone", "scan", "captured", "size", "walk", "time", "pose", "storey", "height", "evidence", "spread"];
 const words = text.drop;
 
 /** A photo that was dropped; it rests while a busy service is left alone. */
@@ -153,7 +153,7 @@ export class Drop {
     for (let k = 2; isTaken(name); k++) name = `${file.name} (${k})`;
     return {
       ...(Object.fromEntries(NONE.map((key) => [key, null])) as unknown as Photo),
-      ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, warnings: [], alternatives: [] },
+      ...{ gap: false, isOnPlan: false, hasPictures: false, confidence: 0, warnings: [], contradicts: [], alternatives: [] },
       ...{ name, short: name.replace(ENDING, "$1"), key: `dropped-${this.count++}` },
       ...{ status: "waiting", error: words.queued, thumb },
     };
@@ -215,8 +215,8 @@ export class Drop {
     const isOlder = (other: Photo) => other.name === name && !this.jobs.some((one) => one.photo === other);
     this.model.report.photos.filter(isOlder).forEach((older) => this.model.remove(older));
     job.result = result;
-    const contradicts = photo.pose ? words.contradictsPlace : words.noPlace;
-    const verdict = photo.contradiction && hasPlace(job) ? contradicts : undefined;
+    const ofPlace = photo.contradicts.includes("nowhere") ? words.noPlace : photo.contradicts.includes("near") ? words.contradictsPlace : undefined;
+    const verdict = hasPlace(job) ? ofPlace : undefined;
     this.replace(job, { ...photo, name, short, thumb, verdict });
     this.finish(job);
   }
@@ -295,7 +295,7 @@ export class Drop {
       action("close", words.remove, () => this.remove(job)),
     );
     if (!advice) return h("section", {}, buttons);
-    if (photo.contradiction && hasPlace(job)) return section(`${words.everywhere}?`, h("p", {}, words.everywhereHelp), buttons);
+    if (photo.contradicts.length && hasPlace(job)) return section(`${words.everywhere}?`, h("p", {}, words.everywhereHelp), buttons);
     return section(words.remedy, h("p", {}, advice), buttons);
   }
 

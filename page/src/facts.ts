@@ -49,7 +49,6 @@ export class Facts {
     const { photo, alternative } = this.model;
     if (!photo) return this.box.replaceChildren();
     const pose = alternative === null ? photo.pose : photo.alternatives[alternative].pose;
-    const notes = photo.warnings.filter((warning) => warning !== photo.contradiction);
     this.box.replaceChildren(
       ...[
         this.heading(photo),
@@ -61,7 +60,7 @@ export class Facts {
         photo.evidence ? this.evidence(photo) : null,
         this.about(photo),
         photo.status === "localized" ? this.remedies(photo) : null,
-        notes.length ? section(text.warnings, h("ul", { class: "notes" }, ...notes.map((note) => h("li", {}, plain(note))))) : null,
+        photo.warnings.length ? section(text.warnings, h("ul", { class: "notes" }, ...photo.warnings.map((note) => h("li", {}, plain(note))))) : null,
       ].filter((part) => part !== null),
     );
   }
@@ -74,13 +73,13 @@ export class Facts {
   private heading(photo: Photo): HTMLElement {
     const meter = h("div", { class: `meter ${photo.status}` }, h("span", { class: "meter-fill" }));
     (meter.firstElementChild as HTMLElement).style.width = `${100 * photo.confidence}%`;
-    const hasConfidence = photo.pose && !photo.contradiction; // else it is that of what was told
+    const hasConfidence = photo.pose && !photo.contradicts.length; // else it is that of what was told
     return h(
       "section",
       { class: "facts-head" },
       h("p", { class: `verdict ${photo.status}` }, badge(photo.status), verdictOf(photo)),
       h("p", { class: "meaning" }, this.meaning(photo)),
-      photo.contradiction ? h("p", {}, sentence(photo.contradiction)) : null,
+      ...photo.contradicts.map((told) => h("p", {}, text.contradictions[told])),
       hasConfidence
         ? h("div", { class: "confidence", title: text.confidenceHelp }, h("span", {}, text.confidence), h("b", {}, percent(photo.confidence)))
         : null,
@@ -89,7 +88,7 @@ export class Facts {
   }
 
   private meaning(photo: Photo): string {
-    if (photo.contradiction) return photo.pose ? text.contradictsPose : text.contradictsAll;
+    if (photo.contradicts.length) return photo.pose ? text.contradictsPose : text.contradictsAll;
     return photo.pose && !photo.isOnPlan ? text.hopeless : text.statusMeaning[photo.status];
   }
 
@@ -201,11 +200,6 @@ export class Facts {
 
 function chunked(rows: number[]): number[][] {
   return [rows.slice(0, 3), rows.slice(3, 6), rows.slice(6, 9)];
-}
-
-/** Words on what was found, as a sentence. */
-function sentence(words: string): string {
-  return `${words[0].toUpperCase()}${plain(words.slice(1))}.`;
 }
 
 export function section(title: string, ...children: (Node | null)[]): HTMLElement {

@@ -105,7 +105,7 @@ export class List {
   private facts(photo: Photo): string {
     if (this.model.report.service && photo.error) return plain(photo.error);
     const storey = this.model.report.storeys.length > 1 && photo.pose ? this.model.report.storeys[photo.storey ?? 0].name : null;
-    if (photo.contradiction) return ""; // its verdict is long, and the confidence is that of what was told
+    if (photo.contradicts.length) return ""; // its verdict is long, and the confidence is that of what was told
     const sure = photo.pose ? `${percent(photo.confidence)}` : null;
     const spread = photo.spread ? `±${length(photo.spread.largest)}` : null;
     return [sure, spread, storey].filter(Boolean).join(" · ");

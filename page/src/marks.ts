@@ -30,8 +30,8 @@ export function shape(status: Status, x = 0, y = 0, radius = 1): SVGElement {
 }
 
 /** What is said first of a photo. */
-export function verdictOf({ verdict, contradiction, status }: Photo): string {
-  return verdict ?? (contradiction ? text.contradicts : text.status[status]);
+export function verdictOf({ verdict, contradicts, status }: Photo): string {
+  return verdict ?? (contradicts.length ? text.contradicts : text.status[status]);
 }
 
 /** The shape for lines of text. */

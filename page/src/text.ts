@@ -1,5 +1,5 @@
 /** All that the page says in English, in one place: a translation replaces this file. */
-import type { Status } from "./types";
+import type { Status, Told } from "./types";
 
 const plural = (count: number, one: string, many: string): string => (count === 1 ? one : many);
 
@@ -50,7 +50,16 @@ export const text = {
   } satisfies Record<Status, string>,
   contradicts: "Contradicts what was told",
   contradictsPose: "It is shown where the photo fits the scan. If that is right, what was told is wrong.",
-  contradictsAll: "Where it was told to be, the scan has no place for a camera, so that nothing was searched.",
+  contradictions: {
+    nowhere: "Where it was told to be, the scan has no place for a camera.",
+    within: "The photo fits another scan than that told.",
+    near: "The photo fits away from the place told.",
+    height: "The photo fits at another height than told.",
+    heading: "The photo looks another way than told.",
+    calibration: "The photo shows another focal length or lens than told.",
+    camera: "All photos of the camera show another focal length than told.",
+  } satisfies Record<Told, string>,
+  contradictsAll: "Nothing was searched.",
   note: (words: string) => `Careful: ${words}.`,
   hopeless: "Most likely not of this scan: its best guess is not on the plan.",
   guess: (name: string) => `${name}, a guess`,

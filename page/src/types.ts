@@ -43,6 +43,9 @@ export interface Evidence {
   num_matches: number | null;
 }
 
+/** What may be told of a photo: reasons of piccolo/judge/reasons.py. */
+export type Told = "nowhere" | "within" | "near" | "height" | "heading" | "calibration" | "camera";
+
 export interface Photo {
   /** Its path below the folder that all share, which no other has; and as short as it can be told apart. */
   name: string;
@@ -53,8 +56,8 @@ export interface Photo {
   probabilityNone: number | null;
   error: string | null;
   warnings: string[];
-  /** That of them by which what was told of the photo can't be right; of one that is localized none. */
-  contradiction: string | null;
+  /** What was told of the photo that can't be right; of one that is localized nothing. */
+  contradicts: Told[];
   /** In place of the words for its status, if these are too wide. */
   verdict?: string;
   scan: string | null;

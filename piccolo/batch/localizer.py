@@ -28,7 +28,7 @@ from ..jobs.cluster import find_sent_file
 from ..jobs.memory import limit_memory
 from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
-from ..judge.decide import follow_consensus
+from ..judge.conclude import follow_consensus
 from ..localization.beside import SurePhoto
 from ..localization.means import Step, Trace
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json

@@ -47,8 +47,8 @@ def choose_exit_code(statuses: Collection[str]) -> int:
 
 def advise(result: Result) -> list[str]:
     """Return a line on what to do about a doubtful result; none if a warning says why nothing is certain."""
-    is_ruled_out = result.best_pose is None or result.confidence == 0.0
-    if result.status == LOCALIZED or is_ruled_out or result.probability_none is None:
+    is_ruled_out = result.best_pose is None or (result.belief is not None and result.belief.ruled_out)
+    if result.status == LOCALIZED or is_ruled_out or result.settings.get("preset") == "paper":
         return []
     focal = result.focal_length
     if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:

@@ -78,28 +78,20 @@ def none_features(std: float | None) -> Array:
 
 
 def posterior(
-    standings: Sequence[Standing],
-    std_of_fit: float | None,
-    within: float = 1.0,
-    model: ChoiceModel | None = None,
+    standings: Sequence[Standing], std_of_fit: float | None, model: ChoiceModel | None = None
 ) -> Array:
-    """Return the probabilities (K + 1,) that each of K poses, best first, is right, and that none of them is.
+    """Return the probabilities (K + 1,) that the place of each of K poses is right, and that none of them is.
 
-    `std_of_fit` is the largest deviation [m] of the best pose with an exact focal length, `within` the
-    probability that it is within 0.1 m if its place is right. The default model is that of the poses'
-    evidence. Right is within 0.1 m and 5 degrees.
-    Calibrated for queries of which half were taken in the scan. That no pose is right is more likely if the
-    best pose's deviation makes 0.1 m doubtful.
+    `std_of_fit` is the largest deviation [m] of the best pose with an exact focal length. The default model
+    is that of the poses' evidence. Calibrated for queries of which half were taken in the scan. That no place
+    is right is more likely if the best pose's deviation makes 0.1 m doubtful.
     """
     model = model or MODELS[standings[0].evidence]
     logits = [log_odds(standing, model) for standing in standings]
     of_none = none_features(std_of_fit)
     logits.append(float(of_none @ np.array(model.none_weights)))
     odds = np.exp(np.array(logits) - max(logits))
-    probabilities = odds / odds.sum()
-    probabilities[:-1] *= within
-    probabilities[-1] = 1.0 - probabilities[:-1].sum()
-    return np.asarray(probabilities)
+    return np.asarray(odds / odds.sum())
 
 
 def classify(probabilities: Array, min_confidence: float) -> str:

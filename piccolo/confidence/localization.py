@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from ..camera import Mount
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
+from ..judge.belief import NOTHING, Belief, decide
 from .confidence import NOT_LOCALIZED, Standing
 from .covariance import PoseCovariance
 from .focal_length import Opinion
@@ -34,7 +35,7 @@ class Alternative:
     pose: Pose
     score: float  # as of Evidence
     num_matches: int | None = None  # local features that agree with it
-    probability: float | None = None  # that it is right; of the preset paper none is known
+    probability: float = 0.0  # that it is right
     scan: str | None = None  # name of the scan in which it lies, of a map that names its scans
 
 
@@ -93,8 +94,7 @@ class Localization:
     """The best pose for one panorama, in world coordinates, and the evidence for and against it."""
 
     status: str = NOT_LOCALIZED
-    confidence: float = 0.0  # probability of the best pose
-    probability_none: float | None = 1.0  # that no pose listed is right; of the preset paper unknown
+    belief: Belief = NOTHING  # in the pose and the alternatives
     pose: Pose | None = None  # None, as are loss to covariance, if nothing was searched
     loss: float | None = None
     evidence: Evidence | None = None
@@ -108,7 +108,24 @@ class Localization:
     storey: int | None = None  # of the pose, 1 the lowest; None where no floor was found
     height_above_floor: float | None = None  # [m] of the pose, above the floor there
     # not in results:
-    is_ruled_out: bool = False  # whatever others say: mirrored, or what the user says is contradicted
     gaussian: PoseGaussian | None = None  # pose and covariance, in the map
     std_of_fit: float | None = None  # [m] largest deviation if focal length and stitching were exact
     standings: tuple[Standing, ...] = ()  # evidence for the pose and each alternative
+
+    @property
+    def confidence(self) -> float:
+        """Probability of the best pose; 0 if there is none."""
+        best, *others = self.belief.probabilities.tolist()
+        return float(best) if others else 0.0
+
+    @property
+    def probability_none(self) -> float:
+        """Probability that no pose listed is right."""
+        return float(self.belief.probabilities[-1])
+
+    def take_belief(self, belief: Belief, min_confidence: float) -> "Localization":
+        """Return this with what is believed of its pose and its alternatives, and the status that follows."""
+        status, probabilities = decide(belief, min_confidence)
+        pairs = zip(self.alternatives, probabilities[1:-1].tolist(), strict=True)
+        others = tuple(replace(alternative, probability=p) for alternative, p in pairs)
+        return replace(self, status=status, belief=belief, alternatives=others)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arrays import Array, Int64s, Mask
+from ..evidence.contradictions import contradictions
 from ..geometry.pose import Pose, log_so3, rotate_points, step, yaw_rotation
 from ..geometry.pose_gaussian import PoseGaussian, largest_std, turn_positions
 from ..geometry.sphere import compute_indices, find_cell, make_grid
@@ -21,7 +22,6 @@ from ..optimize.normal_equations import GRADIENT, MATRIX, NUM_SUMS
 from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
 from ..problem.photo_images import PhotoImages
-from ..problem.prior import contradictions
 from ..problem.problem import Problem
 from ..problem.profile import Profile
 from ..problem.stages import LAST, ImageName

@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 
+from ..evidence.contradictions import contradictions
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.selection import find_rivals, rank, select
-from ..problem.prior import contradictions
 from ..problem.problem import Problem
 from ..problem.profile import DRAWN_VIEW
 from .comparison import compare

@@ -10,12 +10,12 @@ import numpy as np
 
 from ..confidence.localization import Evidence
 from ..confidence.occlusion import compare_occlusion, measure_agreement
+from ..evidence.contradictions import contradictions
 from ..jobs.threads import Workers
 from ..judge.candidate import Selection
 from ..judge.case import Geometry, Measured
 from ..judge.selection import count_matches
 from ..optimize.sampling_loss import sampling_loss
-from ..problem.prior import contradictions
 from ..problem.problem import Problem
 from ..views.zbuffer import visible_points
 from .covariance import estimate_errors

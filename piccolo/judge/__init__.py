@@ -1,9 +1,11 @@
-"""Decisions: pure functions of candidates and probabilities, which search and measure nothing.
+"""Decisions: candidates and probabilities go in, a belief comes out, and its status. Nothing searches here.
 
-Photos that help each other decide nothing either; each way hands over what it knows:
-- `localization.bundle`: a pose by all photos and the probabilities of all poses, to `judge_together`;
-- `localization.beside`: the mean with the pose by another photo, and how sure that is;
-- `batch.localizer`: the focal length by all photos of a camera, an `Opinion`, to `follow_consensus`;
-- `walk.results`: the probabilities of a frame's places along the path, its pose to `take_pose`;
-- `coloring`: nothing; each photo is localized as one alone, in colours of the others.
+Whatever helps a photo changes its `Belief` in one respect, or gives a pose with errors:
+- `localization.judging`: evidence of the photo alone gives `place`, its errors `within`, its camera `doubt`;
+- `localization.bundle`: `believe_together`, by photos whose relative poses are known;
+- `localization.beside`: `believe_beside`, by a photo that shows the same;
+- `localization.localize`: `share_place` among results with several focal lengths;
+- `batch.localizer`: `follow_consensus`, `doubt` by all photos of a camera;
+- `walk.results`: `place`, by the path of the camera.
+A new way adds its function to `judge.together`, and a job that calls it.
 """

@@ -11,6 +11,7 @@ from ..geometry.pose import Pose
 from ..local_features.matching import Matches
 from ..optimize.channel_loss import CHANCE, NUM_BLOCKS
 from ..problem.photo_images import PhotoImages
+from .reasons import Contradiction
 
 CONTRADICTS = 0.1  # a block with a lower correlation is left out of the local means and deviations
 LEAST_SHARED = 0.3  # fraction of what the poorer view shows
@@ -74,7 +75,7 @@ class Candidate:
     pose: Pose  # in the map
     score: float  # of `seen`
     seen: Comparison  # of the photo with the scan there
-    contradicted: tuple[str, ...] = ()  # what was given that the pose contradicts
+    contradicted: tuple[Contradiction, ...] = ()  # what was given that the pose contradicts
     num_matches: int | None = None  # features that agree with the drawn scan; None: it was not drawn
     edge_score: float | None = None  # of the edges drawn there, in a scan without colours
     is_climbed: bool = False  # no perturbation improves it

@@ -9,6 +9,7 @@ from ..confidence.localization import Evidence, FocalLength, SphereGeometry
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian
 from .candidate import Selection
+from .reasons import Contradiction
 
 
 class Errors(NamedTuple):
@@ -32,7 +33,7 @@ class Measured(NamedTuple):
     errors: Errors
     loss: float
     evidence: Evidence
-    contradicted: tuple[str, ...]  # what was given that the pose contradicts
+    contradicted: tuple[Contradiction, ...]  # what was given that the pose contradicts
 
 
 class Geometry(NamedTuple):

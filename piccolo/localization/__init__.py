@@ -8,6 +8,6 @@ A photo's way from its file to a result:
    candidates, with their evidence (`evidence.examine`), until one is sure (`judge.selection.is_sure`);
 5. `last_descent.refine_best` refines the best candidates to the end and selects among them;
 6. `calibration` compares what the photo says of its geometry, and refines with what it finds;
-7. `judging.judge` gathers the case (measurements, copies, the mirrored photo), on which `judge.decide` decides;
+7. `judging.judge` gathers the case (measurements, copies, mirrored photo), and `judge.conclude` decides;
 8. `result.with_localization` makes the result in the world, which a command writes.
 """

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 from ..confidence.covariance import PoseCovariance
 from ..confidence.localization import Localization
+from ..evidence.contradictions import contradictions
 from ..evidence.covariance import split_errors
 from ..evidence.examine import examine
 from ..evidence.focal_length import FocalFit
@@ -19,12 +20,13 @@ from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_within, turn_positions
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.decide import reconsider, take_pose
+from ..judge.conclude import take_pose
 from ..judge.selection import SURE_MATCHES
+from ..judge.together import believe_beside
 from ..local_features.hypotheses import exact_pose, propose_poses
 from ..local_features.matching import Matches
 from ..panorama import Panorama
-from ..problem.prior import apply_prior, contradictions
+from ..problem.prior import apply_prior
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
@@ -107,13 +109,13 @@ def localize_beside(
         kept = list_agreeing(judged, found, ended.problem.beside, scan_map)
         if not kept:
             return Localization(), ()
-        factor = max(other.picture.confidence for other in kept)
+        within = None
         fused = fuse(judged, kept[0], ended)
-        if fused is not None and judged.gaussian is not None:
-            before = probability_within(judged.gaussian)
-            factor *= probability_within(fused) / before
+        if fused is not None:
+            within = probability_within(fused)
             judged = take_pose(judged, fused, scan_map)
-    return reconsider(judged, factor, settings.min_confidence), tuple(other.name for other in kept)
+        belief = believe_beside(judged.belief, [other.picture.confidence for other in kept], within)
+    return judged.take_belief(belief, settings.min_confidence), tuple(other.name for other in kept)
 
 
 def list_agreeing(
@@ -139,7 +141,7 @@ def fuse(judged: Localization, other: Neighbor, ended: Found) -> PoseGaussian | 
     """
     own = judged.gaussian
     of_photo = other.picture.gaussian
-    if own is None or of_photo is None or judged.is_ruled_out:
+    if own is None or of_photo is None or judged.belief.ruled_out:
         return None
     other_from_cam = other.pose @ of_photo.pose.inverse()
     expected = of_photo.attach(other_from_cam, match_covariance(other.matches, other.pose))

@@ -22,7 +22,9 @@ from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.belief import Belief
 from ..judge.candidate import Selection
+from ..judge.together import Shares, believe_together
 from ..panorama import Panorama
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
@@ -38,7 +40,6 @@ from .bundle_adjustment import (
     find_scale,
 )
 from .bundle_search import (
-    LEAST_NONE,
     Member,
     Support,
     find_support,
@@ -76,7 +77,7 @@ class Placed(NamedTuple):
     """The pose of a photo in a bundle that is believed."""
 
     gaussian: PoseGaussian  # in the map
-    probabilities: Array  # (K + 1,) of it, of the bundle's other poses, and of none
+    belief: Belief  # in it and the bundle's other poses, without doubt about a focal length
     warnings: tuple[str, ...]
 
 
@@ -101,7 +102,7 @@ def localize_bundle(
     def localize_alone(k: int, panorama: Panorama) -> Localization:
         problem = prepare_search(scan_map, panorama, settings, watch)
         if problem is None:
-            return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
+            return explain_nothing(scan_map, panorama, settings.prior)
         search = find_by_edges if problem.profile.has_shape else find
         found = search(problem, scan_map, means)
         judged = judge(found, means, settings.min_confidence, may_promote=False)
@@ -179,7 +180,7 @@ def judge_members(
             results[k] = placed
             continue
         found = recalibrate_at(member, supports[k], placed.gaussian.pose, elsewhere, workers)
-        one = judge_together(found, placed.gaussian, placed.probabilities, means, min_confidence)
+        one = judge_together(found, placed.gaussian, placed.belief, means, min_confidence)
         results[k] = replace(one, warnings=one.warnings + placed.warnings)
     return results
 
@@ -273,39 +274,33 @@ def place_member(
 
     `probabilities` (K + 1,) are of all poses of the bundle, the one believed first, and of none.
     """
-    if member.alone.is_ruled_out and not member.is_misplaced:
+    if member.alone.belief.ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
-    right, missed, *_ = support.shares
-    if right + missed < EVEN or number in agreed.apart:
+    shares = Shares(*support.shares[:2].tolist())
+    if shares.here < EVEN or number in agreed.apart:
         return judge_apart(member, CONTRADICTS)
     rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
     own = agreed.estimates.get(number)
     gaussian = None if own is None else own.own
-    within = 0.0
+    within_others = 0.0
     if rest:
         adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
         expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
         if gaussian is not None:
-            factor = compare_errors(expected, gaussian)
-            right, missed = np.array([right * factor, missed]) * (right + missed) / (right * factor + missed)
-        gaussian = expected if gaussian is None or right < missed else expected.fuse(gaussian)
+            shares = shares.weigh_own(compare_errors(expected, gaussian))
+        is_missed = gaussian is None or shares.right < shares.missed
+        gaussian = expected if gaussian is None or is_missed else expected.fuse(gaussian)
         offset = gaussian.pose.center_world - expected.pose.center_world
-        within = missed * probability_near(offset, expected.covariance[3:, 3:])
+        within_others = probability_near(offset, expected.covariance[3:, 3:])
     if gaussian is None:
         return judge_apart(member, NOT_FOUND)
-    of_own = probability_within(gaussian)
-    confidence = (within + right * of_own) * probabilities[0]
-    before = member.alone.gaussian
-    if member.alone.status == LOCALIZED and own and before:
-        # that others show nothing says nothing against a photo that is sure
-        gain = of_own / probability_within(before)
-        focal = member.alone.focal_length
-        doubt = focal.doubt if focal else 0.0  # which the judge takes off again
-        confidence = max(confidence, member.alone.confidence / (1.0 - doubt) * min(gain, 1.0))
-    others = probabilities[1:-1] * min(1.0, (1.0 - confidence) / max(1.0 - probabilities[0], LEAST_NONE))
-    p = np.array([confidence, *others, max(1.0 - confidence - others.sum(), 0.0)])
-    doubts = (UNSEEN,) if right < EVEN else ()
-    return Placed(gaussian, p, doubts + agreed.warnings)
+    within = probability_within(gaussian)
+    alone = None
+    if member.alone.status == LOCALIZED and own and member.alone.gaussian:
+        alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
+    belief = believe_together(shares, probabilities, within, within_others, alone)
+    doubts = (UNSEEN,) if shares.right < EVEN else ()
+    return Placed(gaussian, belief, doubts + agreed.warnings)
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:

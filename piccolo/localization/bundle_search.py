@@ -17,11 +17,12 @@ from ..evidence.examine import complete, count_agreeing, examine
 from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import ONE_IN_BUNDLE
 from ..geometry.pose import Pose, angle_between
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Errors
 from ..judge.selection import assess
+from ..judge.together import LEAST_NONE
 from ..problem.problem import Problem
 from ..problem.stages import FINE
 from .bundle_adjustment import Bundle, Estimate, RelativeErrors, adjust
@@ -33,7 +34,6 @@ MISSED = 0.25  # chosen: of photos, those without a right pose found (of BENCHMA
 MOST_UNSEEN = 1.0 / 3.0  # chosen: of photos, those that may show nothing
 SILENT = 0.05  # chosen: of photos of the bundle, those that show nothing of their place
 CHANCE = 0.02  # chosen: probability that a photo has a pose near that by a wrong pose of the bundle
-LEAST_NONE = 1e-6
 NUM_BUNDLES = 4  # poses of the bundle that are tested
 SCALES = 0.5, 2.0  # of positions in metres that are proposed, so that a wrong scale is seen
 LEAST_APART = 0.5  # [m] photos nearer to each other say nothing of the scale
@@ -58,11 +58,10 @@ class Member:
 
     @property
     def own_poses(self) -> list[tuple[Candidate, float]]:
-        """Poses in the map with their probabilities, best first; none if the best one is ruled out."""
-        if self.alone.pose is None or self.alone.is_ruled_out:
+        """Poses in the map with the probabilities of their places, best first; none of what is ruled out."""
+        if self.alone.pose is None or self.alone.belief.ruled_out:
             return []
-        own = [self.alone.confidence, *(a.probability or 0.0 for a in self.alone.alternatives)]
-        return list(zip(self.found.selection.ranked, own, strict=False))
+        return list(zip(self.found.selection.ranked, self.alone.belief.place[:-1], strict=False))
 
 
 class Support(NamedTuple):
@@ -71,8 +70,8 @@ class Support(NamedTuple):
     own: Candidate  # its own pose there
     gaussian: PoseGaussian | None  # that pose with its covariance; None where the points do not fix it
     is_found: bool  # by the photo alone
-    odds: float  # of that pose, against that none of the photo's poses is right
-    odds_elsewhere: float  # of the photo's other poses
+    odds: float  # of that pose's place, against that none of the photo's poses is right
+    odds_elsewhere: float  # of the places of the photo's other poses
     num_places: int  # of the scan where a photo alone may be
     odds_exchanged: float = 0.0  # of the places of other photos of the bundle, in the mean
 
@@ -196,8 +195,7 @@ def find_support(
         counted = ranked[k] if is_counted else count_agreeing(problem, ranked[k], workers)
         errors = estimate_errors(problem, counted, workers)
         errors = errors.widen(fit.pose_covariance) if fit else errors
-    within = probability_within(errors.gaussian)
-    p = posterior(assess(problem.profile, selection), errors.std_of_fit, within)
+    p = posterior(assess(problem.profile, selection), errors.std_of_fit)
     none = max(float(p[-1]), LEAST_NONE)
     odds_elsewhere = float(p[:-1].sum() - p[k]) / none
     num_places = len(problem.scan_map.sparse)

@@ -3,22 +3,23 @@
 Photos that help each other end here too, each with a pose and probabilities that others told.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from ..arrays import Array
 from ..confidence.confidence import posterior
 from ..confidence.localization import Localization
+from ..evidence.contradictions import contradictions
 from ..evidence.examine import complete
 from ..evidence.focal_length import FocalFit, doubt_unconfirmed, fit_focal
 from ..evidence.measuring import Fit, describe_geometry, measure
 from ..geometry.pose_gaussian import PoseGaussian, probability_within
 from ..jobs.threads import Workers
+from ..judge.belief import Belief, make_belief
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import Case
-from ..judge.decide import conclude, doubt_given
+from ..judge.conclude import conclude
 from ..judge.selection import assess, credit_copies, is_mirrored
-from ..problem.prior import contradictions
 from ..problem.problem import Problem
 from .copies import list_reported
 from .ladder import settle
@@ -53,16 +54,16 @@ def judge(found: Found, means: Means, min_confidence: float, may_promote: bool =
         return Localization()
     reported, is_copy = list_reported(problem, selection, means.effort, workers)
     standings = credit_copies(assess(problem.profile, reported), is_copy)
-    within = probability_within(measured.errors.gaussian)
-    probabilities = posterior(standings, measured.errors.std_of_fit, within)
-    likeliest = int(probabilities[:-1].argmax())
+    places = posterior(standings, measured.errors.std_of_fit)[:-1]
+    likeliest = int(places.argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.ranked[likeliest], fit, workers)
         return judge(other, means, min_confidence, may_promote=False)
     if isinstance(fit, FocalFit):
         fit = doubt_unconfirmed(fit, measured.errors.gaussian)
     case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
-    return decide_case(problem, case, probabilities, means, min_confidence)
+    belief = make_belief(places, probability_within(measured.errors.gaussian))
+    return decide_case(problem, case, belief, means, min_confidence)
 
 
 def promote(
@@ -81,15 +82,15 @@ def promote(
 def judge_together(
     found: Found,
     gaussian: PoseGaussian,
-    probabilities: Array,
+    belief: Belief,
     means: Means,
     min_confidence: float,
 ) -> Localization:
     """Return the result of a photo whose pose is what it and others say together.
 
-    `gaussian` is that pose in the map; the best candidate has the same pose. `probabilities` (K + 1,) are of
-    it, of each alternative and of none, by all photos together, each that the pose is within 0.1 m. The doubt
-    about a focal length is not in them. What the photo itself rules out stays so.
+    `gaussian` is that pose in the map; the best candidate has the same pose. `belief` is in it and each
+    alternative, by all photos together, without doubt about a focal length. What the photo itself rules out
+    stays so.
     """
     problem, selection, fit = found
     selection = complete(problem, selection, means.workers)
@@ -103,33 +104,34 @@ def judge_together(
     )
     standings = tuple(assess(problem.profile, selection))
     case = Case(selection, standings, measured, fit and describe_geometry(problem, fit))
-    return decide_case(problem, case, probabilities, means, min_confidence)
+    return decide_case(problem, case, belief, means, min_confidence)
 
 
 def decide_case(
-    problem: Problem, case: Case, probabilities: Array, means: Means, min_confidence: float
+    problem: Problem, case: Case, belief: Belief, means: Means, min_confidence: float
 ) -> Localization:
     """Return the result of a case; the mirrored photo is searched if any pose is likely."""
-    probabilities = doubt_given(probabilities, case.geometry)
+    if case.geometry is not None:  # no pose is surer than what it rests on
+        belief = replace(belief, doubt=case.geometry.doubt)
     best = case.found.best
-    if probabilities[-1] < 1.0 - WORTH_ASKING:
+    if belief.probabilities[-1] < 1.0 - WORTH_ASKING:
         mirrored = find_mirrored(problem, best, means.effort, means.workers)
         case = case._replace(is_mirrored=is_mirrored(best, mirrored))
-    means.trace.note("judged", partial(describe_case, problem, case, probabilities))
-    return conclude(problem.scan_map, case, probabilities, min_confidence)
+    found = conclude(problem.scan_map, case, belief, min_confidence)
+    means.trace.note("judged", partial(describe_case, problem, case, found.belief))
+    return found
 
 
-def describe_case(problem: Problem, case: Case, probabilities: Array) -> Step:
-    """Describe what the judge read of a photo, and the probabilities of its poses and of none."""
-    geometry = case.geometry
-    errors = case.measured.errors
+def describe_case(problem: Problem, case: Case, belief: Belief) -> Step:
+    """Describe what the judge read of a photo, and what is believed."""
     return {
-        "probabilities": probabilities.tolist(),
+        "place": list(belief.place),
+        "within": belief.within,
+        "doubt": belief.doubt,
+        "ruled_out": sorted(belief.ruled_out),
         "standings": [standing._asdict() for standing in case.standings],
-        "within": probability_within(errors.gaussian),
-        "std_of_fit": errors.std_of_fit,
-        "doubt": geometry.doubt if geometry else 0.0,
-        "conflict": geometry.conflict if geometry else 0.0,
+        "std_of_fit": case.measured.errors.std_of_fit,
+        "conflict": case.geometry.conflict if case.geometry else 0.0,
         "is_mirrored": case.is_mirrored,
         **describe_selection(problem, case.found),
     }

@@ -12,9 +12,11 @@ from ..evidence.focal_length import WIDE
 from ..geometry.nearness import CONFIRMED
 from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
+from ..judge.belief import NOTHING, make_belief
 from ..judge.candidate import Candidate, Selection
-from ..judge.decide import reconsider
+from ..judge.reasons import Reason
 from ..judge.selection import is_faint, rank
+from ..judge.together import share_place
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
 from ..photo import Prior
@@ -51,7 +53,7 @@ def localize(
     means = Means(settings.effort, workers, watch, trace)
     problem = prepare_search(scan_map, panorama, settings, watch)
     if problem is None:
-        return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
+        return explain_nothing(scan_map, panorama, settings.prior)
     with watch.stage("search"):
         problem.photo.images.search()  # each search begins with it
     search = find_by_edges if problem.profile.has_shape else find
@@ -71,10 +73,13 @@ def prepare_search(
         return prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
 
 
-def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> tuple[str, ...]:
-    """Return why there is nothing to search, as warnings."""
-    is_left = len(apply_prior(scan_map, prior).sparse) > 0
-    return (NO_PIXEL,) if is_left else (nothing_allowed(scan_map, prior),)
+def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> Localization:
+    """Return the result where there is nothing to search, with the reason."""
+    if len(apply_prior(scan_map, prior).sparse) > 0:
+        return Localization(warnings=(NO_PIXEL,))
+    is_told = len(scan_map.centers) > 0  # else the scan has no position at all
+    belief = NOTHING.rule_out(Reason.NOWHERE) if is_told else NOTHING
+    return Localization(belief=belief, warnings=(nothing_allowed(scan_map, prior),))
 
 
 def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
@@ -190,16 +195,22 @@ def select_likeliest(found: Sequence[Localization], settings: CoarseToFineSettin
     for one in sorted(found, key=lambda f: -f.confidence):
         if not any(one.pose is None or is_same_place(f, one.pose, one.focal_length) for f in places):
             places.append(one)
-    best, *others_found = places
-    total = best.confidence + sum(f.confidence for f in others_found)
-    if total <= best.confidence:
-        return best
-    fraction = best.confidence / total
+    best, *elsewhere = places
     others = [
-        Alternative(f.pose, f.evidence.score, f.evidence.num_matches, f.confidence)
-        for f in others_found
+        (Alternative(f.pose, f.evidence.score, f.evidence.num_matches), f.confidence)
+        for f in elsewhere
         if f.pose and f.evidence
     ]
-    of_best = (a for a in best.alternatives if not any(CONFIRMED.holds(o.pose, a.pose) for o in others))
-    listed = replace(best, alternatives=(*others, *of_best)[:MAX_ALTERNATIVES])
-    return reconsider(listed, fraction, settings.min_confidence)
+    if not any(confidence for _, confidence in others):
+        return best
+    factor, shared = share_place(best.belief, [best.confidence, *(confidence for _, confidence in others)])
+    own = [
+        (alternative, factor * place)
+        for alternative, place in zip(best.alternatives, best.belief.place[1:-1], strict=True)
+        if not any(CONFIRMED.holds(other.pose, alternative.pose) for other, _ in others)
+    ]
+    listed = [*zip([other for other, _ in others], shared, strict=True), *own][:MAX_ALTERNATIVES]
+    alternatives = tuple(alternative for alternative, _ in listed)
+    belief = make_belief([factor * best.belief.place[0], *(p for _, p in listed)])
+    belief = replace(best.belief, place=belief.place)
+    return replace(best, alternatives=alternatives).take_belief(belief, settings.min_confidence)

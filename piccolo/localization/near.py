@@ -5,17 +5,17 @@ from typing import NamedTuple
 
 from ..confidence.confidence import Standing, posterior
 from ..evidence.comparison import compare
+from ..evidence.contradictions import contradictions
 from ..evidence.covariance import estimate_covariance
 from ..evidence.examine import complete
 from ..evidence.verification import draw_near, verify
 from ..geometry.nearness import RIGHT
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..geometry.pose_gaussian import PoseGaussian
 from ..jobs.threads import Workers
 from ..judge.candidate import Candidate, Selection
 from ..judge.case import UNKNOWN_ERRORS
 from ..judge.selection import assess_alone
-from ..problem.prior import contradictions
 from ..problem.problem import Problem
 from ..problem.stages import FULL, NEARLY
 from .ladder import climb_from_afar, refine, settle
@@ -27,7 +27,7 @@ class Near(NamedTuple):
 
     end: Candidate
     gaussian: PoseGaussian | None  # the pose with its covariance; None where the points do not fix it
-    probability: float  # that the pose is right
+    place: float  # probability that its place is right
 
 
 def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
@@ -45,10 +45,8 @@ def refine_near(problem: Problem, start: Pose, workers: Workers) -> Near:
     if end.score >= HOPELESS_SCORE:
         sees_same = end.pose.distance(middle) < NEARLY
         errors = estimate_covariance(problem, end, workers, middle if sees_same else None)
-    within = probability_within(errors.gaussian)
-    standing = assess_end(problem, end, workers)
-    probability = float(posterior([standing], errors.std_of_fit, within)[0])
-    return Near(end, errors.gaussian, probability)
+    place = float(posterior([assess_end(problem, end, workers)], errors.std_of_fit)[0])
+    return Near(end, errors.gaussian, place)
 
 
 def assess_end(problem: Problem, end: Candidate, workers: Workers) -> Standing:

@@ -11,13 +11,7 @@ from ..arrays import Array, Array32, Mask
 from ..cloud.soa import LocalCloud, PackedPoints, pack_points
 from ..cloud.stream import Cloud
 from ..confidence.alternatives import Hypothesis, alternative_poses, best_distinct
-from ..confidence.confidence import (
-    AMBIGUOUS,
-    LEAST_SCORE,
-    LOCALIZED,
-    NOT_LOCALIZED,
-    check_confidence,
-)
+from ..confidence.confidence import LEAST_SCORE, check_confidence
 from ..confidence.localization import Alternative, Evidence, Localization
 from ..confidence.occlusion import compare_occlusion, measure_agreement
 from ..errors import InputError
@@ -25,6 +19,7 @@ from ..geometry.nearness import Nearness
 from ..geometry.pose import Gravity, Pose, uniform_rotations, uniform_yaws
 from ..geometry.sphere import solid_angles
 from ..jobs.threads import Stopwatch, Workers
+from ..judge.belief import Belief, make_belief
 from ..optimize.refine import DescentSettings, Loss, Refined, make_sampling_loss, refine
 from ..panorama import Panorama
 from ..panorama.model import shrink
@@ -219,13 +214,20 @@ def localize(
         return Localization()
     with watch.stage("refine"):
         evidence, others = evaluate(points, panorama, best, refined)
-    confidence = paper_confidence(evidence)
+    found = Localization(
+        pose=paper_map.to_world(best.pose),
+        loss=best.loss,
+        evidence=evidence,
+        alternatives=tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others),
+    )
+    return found.take_belief(believe(evidence, len(others)), settings.min_confidence)
+
+
+def believe(evidence: Evidence, num_others: int) -> Belief:
+    """Return a rough belief in the best pose and in others, which share alike what their scores cost it."""
+    best = paper_confidence(evidence)
     alone = paper_confidence(replace(evidence, margin=1.0))
-    otherwise = AMBIGUOUS if others and alone >= settings.min_confidence else NOT_LOCALIZED
-    status = LOCALIZED if confidence >= settings.min_confidence else otherwise
-    in_world = tuple(Alternative(paper_map.to_world(h.pose), h.score) for h in others)
-    pose = paper_map.to_world(best.pose)
-    return Localization(status, confidence, None, pose, best.loss, evidence, in_world)
+    return make_belief([best, *[(alone - best) / max(num_others, 1)] * num_others])
 
 
 def evaluate(

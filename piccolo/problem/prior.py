@@ -1,16 +1,11 @@
 """Prior knowledge of the user: it leaves fewer positions and rotations to search."""
 
-import math
-
 import numpy as np
 
 from ..arrays import Array, Mask
-from ..geometry.pose import MAX_ANGLE, MAX_DISTANCE, Pose
 from ..photo import Prior
 from ..scan_map.camera_positions import COARSE_SPACING, heights_above_floor
-from ..scan_map.scan_map import ScanMap, candidates_within, find_scan_at
-
-STEEP = 0.2  # cosine of an elevation: what looks up or down more steeply has no heading
+from ..scan_map.scan_map import ScanMap, candidates_within
 
 
 def allow_by_option(scan_map: ScanMap, prior: Prior) -> dict[str, Mask]:
@@ -74,37 +69,3 @@ def heading_errors(R_cam_from_world: Array, heading_deg: float) -> Array:
     forward = R_cam_from_world[:, 0]  # of the camera's +x, in the world
     heading = np.arctan2(forward[:, 0], forward[:, 1])
     return np.asarray(np.abs((heading - np.radians(heading_deg) + np.pi) % (2.0 * np.pi) - np.pi))
-
-
-def contradictions(scan_map: ScanMap, pose: Pose, prior: Prior) -> tuple[str, ...]:
-    """Say how a pose of the map's frame contradicts the prior by more than a right pose may be off."""
-    if prior.is_empty:
-        return ()
-    world = scan_map.to_world(pose)
-    found = []
-    if prior.within and (scan := find_scan_at(scan_map, pose.center_world)) not in prior.within:
-        found.append(f"the pose found is in the scan {scan!r}, not in {', '.join(map(repr, prior.within))}")
-    if prior.near is not None and prior.radius is not None:
-        given = [value for value in prior.near if value is not None]
-        gap = math.dist(world.center_world[: len(given)], given)
-        if gap > prior.radius + MAX_DISTANCE:
-            found.append(f"the pose found is {gap:.2f} m from the place given, not within {prior.radius:g} m")
-    if prior.height is not None:
-        height = float(heights_above_floor(scan_map.octree, pose.center_world[None])[0])
-        low, high = prior.height
-        if not low - MAX_DISTANCE <= height <= high + MAX_DISTANCE:
-            found.append(f"the pose found is {height:.2f} m above the floor, not {low:g} to {high:g} m")
-    found += find_contradicted_heading(world, prior)
-    return tuple(found)
-
-
-def find_contradicted_heading(pose_world: Pose, prior: Prior) -> list[str]:
-    """Say how a pose contradicts a heading; cameras looking steeply up or down have none."""
-    forward = pose_world.R_cam_from_world[0]
-    if prior.heading_deg is None or math.hypot(forward[0], forward[1]) < STEEP:
-        return []
-    off = math.degrees(float(heading_errors(pose_world.R_cam_from_world[None], prior.heading_deg)[0]))
-    if off <= prior.tolerance_deg + math.degrees(MAX_ANGLE):
-        return []
-    limit = f"more than {prior.tolerance_deg:g} deg"
-    return [f"the pose found looks {off:.0f} deg away from the heading given, {limit}"]

@@ -25,6 +25,7 @@ from ..errors import printable
 from ..files.atomic import check_output_folder, write_atomically
 from ..geometry.pose import Pose, heading_pitch_roll_deg
 from ..geometry.pose_gaussian import turn_positions
+from ..judge.reasons import Reason
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
 
@@ -41,8 +42,7 @@ POLICY = (
 OWN = "'self' file:"
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
 LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
-# beginnings of warnings of localization/prior.py and judge.py
-CONTRADICTIONS = "the pose found is", "the pose found looks", "no position is left", "the picture has a focal"
+NOT_TOLD = {Reason.MIRRORED, Reason.SPHERE}  # reasons that rule out poses, not by what was told of the photo
 ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations
 EVIDENCE = ("score", "margin", "explained_fraction", "seen_fraction", "contradicted_fraction", "num_matches")
@@ -96,9 +96,9 @@ def shorten_names(names: Sequence[str]) -> list[str]:
 def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> dict[str, Any]:
     """Return what the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
-    contradiction = find_contradiction(result)
+    contradicts = list_contradicted(result)
     is_unlikely = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
-    is_hopeless = is_unlikely and not contradiction
+    is_hopeless = is_unlikely and not contradicts
     return {
         "name": name,
         "key": key,
@@ -107,7 +107,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
         "probabilityNone": _round(result.probability_none, 5),
         "error": result.error and _below(result.error, result.pano, name),
         "warnings": [_below(warning, result.pano, name) for warning in result.warnings],
-        "contradiction": contradiction,
+        "contradicts": contradicts,
         "isOnPlan": result.best_pose is not None and not is_hopeless,
         "scan": result.scan,
         "captured": result.source.capture_time,
@@ -119,11 +119,9 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
     }
 
 
-def find_contradiction(result: Result) -> str | None:
-    """Return the warning that what was told of a photo that is not localized does not fit it."""
-    if result.status != NOT_LOCALIZED:
-        return None
-    return next((warning for warning in result.warnings if warning.startswith(CONTRADICTIONS)), None)
+def list_contradicted(result: Result) -> list[Reason]:
+    """List what was told of a photo that rules its poses out."""
+    return sorted(result.belief.ruled_out - NOT_TOLD) if result.belief else []
 
 
 def document_of_found(result: Result, best_pose: Pose, scan_map: ScanMap) -> dict[str, Any]:

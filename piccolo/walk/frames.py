@@ -20,7 +20,7 @@ from ..confidence.localization import Localization
 from ..errors import InputError
 from ..geometry.nearness import ONE_ANSWER
 from ..geometry.pose import Pose
-from ..geometry.pose_gaussian import PoseGaussian, probability_within
+from ..geometry.pose_gaussian import PoseGaussian
 from ..judge.candidate import Candidate
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
@@ -82,22 +82,13 @@ class Frame:
 
 def list_states(scan_map: ScanMap, found: Localization) -> list[State]:
     """List a frame's poses by its own localization; alternatives, whose covariance is unknown, are rough."""
-    if found.pose is None or found.probability_none is None or found.evidence is None:
+    if found.pose is None or found.evidence is None:
         return []
-    total = 1.0 - found.probability_none
-    known = [(found.pose, found.confidence), *((a.pose, a.probability or 0.0) for a in found.alternatives)]
-    odds = [log_odds_of_place(probability, total, found.gaussian) for _, probability in known]
-    best, *others = [State(scan_map.from_world(pose), o) for (pose, _), o in zip(known, odds, strict=True)]
+    poses = [found.pose, *(alternative.pose for alternative in found.alternatives)]
+    *places, none = found.belief.sound_places.tolist()
+    odds = [log_ratio(place, none) for place in places]
+    best, *others = [State(scan_map.from_world(pose), o) for pose, o in zip(poses, odds, strict=True)]
     return [replace(best, score=found.evidence.score, gaussian=found.gaussian), *others]
-
-
-def log_odds_of_place(probability: float, total: float, gaussian: PoseGaussian | None) -> float:
-    """Return the log odds that a pose is of the right place, from the probability that the pose is right.
-
-    `total` is the probability that any of the frame's poses is.
-    """
-    within = max(probability_within(gaussian), 1e-9)
-    return log_ratio(probability / within, 1.0 - total / within)
 
 
 def log_ratio(probability: float, other: float) -> float:

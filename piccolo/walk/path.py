@@ -281,7 +281,7 @@ def build_lattice(
     return lattice
 
 
-class Belief(NamedTuple):
+class Ranked(NamedTuple):
     """A frame's poses, best first."""
 
     states: list[State]
@@ -294,10 +294,10 @@ class Belief(NamedTuple):
         return len(self.states) > 0 and self.states[0].is_refined and bool(self.probabilities[0] > EVEN)
 
 
-NOTHING = Belief([], np.empty(0))
+NOTHING = Ranked([], np.empty(0))
 
 
-def believe(frames: Sequence[Frame], path: Path, k: int) -> Belief:
+def believe(frames: Sequence[Frame], path: Path, k: int) -> Ranked:
     """Return what a path says of a frame: a key frame's places, or where it was tracked to from one."""
     frame = frames[k]
     if frame.is_key:
@@ -305,13 +305,13 @@ def believe(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     return NOTHING if frame.key is None else believe_tracked(frames, path, k)
 
 
-def believe_key(states: Sequence[State], probabilities: Array) -> Belief:
+def believe_key(states: Sequence[State], probabilities: Array) -> Ranked:
     """Return the states of a key frame, the likeliest first."""
     order = np.argsort(-probabilities, kind="stable")
-    return Belief([states[j] for j in order], probabilities[order])
+    return Ranked([states[j] for j in order], probabilities[order])
 
 
-def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
+def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Ranked:
     """Return the poses to which a frame was tracked, from each place where its key frame may be."""
     frame = frames[k]
     key = frame.key
@@ -325,10 +325,10 @@ def believe_tracked(frames: Sequence[Frame], path: Path, k: int) -> Belief:
     carried = [carry(frame.arrived, departed, state.pose) for state in at_key.states]
     states = [State(pose, own.log_odds) for pose in carried]
     if ONE_ANSWER.holds(carried[0], own.pose):
-        return Belief([own, *states[1:]], probabilities)
+        return Ranked([own, *states[1:]], probabilities)
     expected = carried[0] if probabilities[0] > EVEN else None
     probabilities[0] = min(probabilities[0], EVEN)  # nothing was seen there
-    return Belief(states, probabilities, expected)
+    return Ranked(states, probabilities, expected)
 
 
 def probability_of_next(frames: Sequence[Frame], path: Path, k: int) -> float:

@@ -20,14 +20,16 @@ from ..confidence.confidence import LOCALIZED
 from ..confidence.covariance import describe_errors
 from ..confidence.focal_length import MOST_CONFLICT
 from ..confidence.localization import Alternative, Localization
+from ..evidence.contradictions import contradictions
 from ..geometry.pose import Pose, carry
 from ..geometry.pose_gaussian import PoseGaussian, add, probability_within
 from ..jobs.threads import Progress, no_progress, one_blas_thread
-from ..judge.decide import decide, take_pose
-from ..problem.prior import contradictions
+from ..judge.belief import make_belief
+from ..judge.conclude import take_pose
+from ..judge.reasons import explain
 from ..problem.problem import Problem
 from .frames import Frame
-from .path import EVEN, Belief, Gap, Path, believe, build_lattice
+from .path import EVEN, Gap, Path, Ranked, believe, build_lattice
 from .tracker import Expected, Followed, Tracker, find_near, refine_state
 
 LEAST_WALKED = 2.0  # [m] between frames by which an odometry is checked
@@ -111,31 +113,28 @@ def describe_frame(frames: Sequence[Frame], k: int, gap: Gap | None) -> WalkFram
     return WalkFrame(frame.time, k, frame.how, alone, gap)
 
 
-def make_localization(tracker: Tracker, frame: Frame, belief: Belief) -> Localization:
+def make_localization(tracker: Tracker, frame: Frame, ranked: Ranked) -> Localization:
     """Make a frame's result from its poses and the probabilities that the walk gives them."""
-    if not belief.states:
+    if not ranked.states:
         return frame.alone or Localization()
-    best, *others = belief.states
+    best, *others = ranked.states
+    others = others[:MAX_ALTERNATIVES]
     scan_map = tracker.scan_map
-    within = probability_within(best.gaussian)
-    rest = within * belief.probabilities[1 : 1 + MAX_ALTERNATIVES]
-    p = np.array([within * belief.probabilities[0], *rest, 0.0])
-    p[-1] = max(1.0 - p.sum(), 0.0)
     is_own = frame.alone and frame.states and best is frame.states[0]
     own = frame.alone if is_own and frame.alone else Localization()
-    warnings = contradictions(scan_map, best.pose, tracker.settings.prior)
-    alternatives = [Alternative(scan_map.to_world(s.pose), s.score or 0.0) for s in others[:MAX_ALTERNATIVES]]
+    contradicted = contradictions(scan_map, best.pose, tracker.settings.prior)
+    belief = make_belief(ranked.probabilities[: 1 + len(others)], probability_within(best.gaussian))
     described = Localization(
         pose=scan_map.to_world(best.pose),
         loss=own.loss,
         evidence=own.evidence,
-        alternatives=tuple(alternatives),
+        alternatives=tuple(Alternative(scan_map.to_world(s.pose), s.score or 0.0) for s in others),
         covariance=describe_errors(best.gaussian, scan_map.R_map_from_world.T),
-        warnings=warnings,
-        is_ruled_out=bool(warnings),
+        warnings=tuple(map(explain, contradicted)),
         gaussian=best.gaussian,
     )
-    return decide(described, p, tracker.settings.min_confidence)
+    belief = belief.rule_out(*(c.reason for c in contradicted))
+    return described.take_belief(belief, tracker.settings.min_confidence)
 
 
 def smooth_positions(
@@ -199,7 +198,7 @@ def move_pose(located: PoseGaussian, move: Array, variance: Array) -> PoseGaussi
 
 
 @one_blas_thread()
-def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Belief]]:
+def finish(tracker: Tracker, show: Progress) -> tuple[Path, list[Ranked]]:
     """Find the path of all frames of a tracker, and what each may be.
 
     The likely places of key frames are refined, frames that were tracked elsewhere are tracked there, and
@@ -252,7 +251,7 @@ def _refine(tracker: Tracker, path: Path, k: int) -> None:
             frame.states = refine_state(problem, frame.states, rough, tracker.workers)
 
 
-def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int) -> None:
+def _find_lost(tracker: Tracker, path: Path, beliefs: list[Ranked], k: int) -> None:
     """Track a frame that is not sure from where it is to be expected, or look for it near sure ones."""
     frames = tracker.frames
     ways = _list_ways(tracker, beliefs, k)
@@ -269,7 +268,7 @@ def _find_lost(tracker: Tracker, path: Path, beliefs: list[Belief], k: int) -> N
             return
 
 
-def _is_walked(tracker: Tracker, beliefs: Sequence[Belief], k: int, pose: Pose) -> bool:
+def _is_walked(tracker: Tracker, beliefs: Sequence[Ranked], k: int, pose: Pose) -> bool:
     """Return True if a frame's pose is within reach of the nearest sure frames."""
     frames = tracker.frames
     nearest = [side[0] for side in _list_sure(frames, beliefs, k)]
@@ -278,7 +277,7 @@ def _is_walked(tracker: Tracker, beliefs: Sequence[Belief], k: int, pose: Pose) 
     return all(d <= reach for d, reach in zip(distances, reaches, strict=True))
 
 
-def _list_ways(tracker: Tracker, beliefs: Sequence[Belief], k: int) -> list[tuple[int, Find]]:
+def _list_ways(tracker: Tracker, beliefs: Sequence[Ranked], k: int) -> list[tuple[int, Find]]:
     """List the frames from which a frame may be found, and how."""
     frame = tracker.frames[k]
     belief = beliefs[k]
@@ -292,7 +291,7 @@ def _list_ways(tracker: Tracker, beliefs: Sequence[Belief], k: int) -> list[tupl
     return ways
 
 
-def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Belief], k: int) -> list[list[int]]:
+def _list_sure(frames: Sequence[Frame], beliefs: Sequence[Ranked], k: int) -> list[list[int]]:
     """List the two nearest sure frames after and before a frame, the side that is nearer in time first."""
     ways = range(k + 1, len(frames)), range(k - 1, -1, -1)
     sides = [list(islice((m for m in way if beliefs[m].is_sure), 2)) for way in ways]

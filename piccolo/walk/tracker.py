@@ -36,7 +36,6 @@ from .frames import (
     Motion,
     State,
     list_states,
-    log_odds_of_place,
     log_ratio,
     put_state,
 )
@@ -352,7 +351,7 @@ def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
         first = ends[0].end
         drawn = draw_near(problem, first.pose, first.drawn, workers).matches
         ends.append(refine_near(problem, verify(problem, first.pose, drawn).pose, workers))
-    odds = [log_odds_of_place(near.probability, near.probability, near.gaussian) for near in ends]
+    odds = [log_ratio(near.place, 1.0 - near.place) for near in ends]
     best = int(np.argmax(odds))
     end, gaussian, _ = ends[best]
     is_wrong = odds[best] < 0.0 or end.score < LEAST_SCORE

@@ -20,6 +20,7 @@ from piccolo.files.json_file import parse_lines, read_bytes
 from piccolo.geometry.nearness import RIGHT
 from piccolo.geometry.pose import MAX_DISTANCE
 from piccolo.geometry.pose_gaussian import probability_of_ball, subtract
+from piccolo.judge.belief import make_belief
 
 from ..evaluation.tables import Table, reliability_table
 from ..scene import pose_of
@@ -66,7 +67,8 @@ class Outcome(NamedTuple):
         within = 1.0
         if self.covariance is not None:
             within = probability_of_ball(self.covariance.matrix[3:, 3:], MAX_DISTANCE)
-        return confidence.posterior(self.standings, self.std_of_fit, within, model)
+        places = confidence.posterior(self.standings, self.std_of_fit, model)[:-1]
+        return make_belief(places, within).probabilities
 
 
 def read_outcome(line: str) -> Outcome | None:

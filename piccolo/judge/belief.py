@@ -1,0 +1,71 @@
+"""The belief in a photo's poses, and the status that follows from it.
+
+Three questions have answers of their own: which place is right, whether the pose is within 0.1 m there, and
+whether what was given, as a focal length, holds. Only `Belief.probabilities` multiplies them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from ..confidence.confidence import NOT_LOCALIZED, classify
+from .reasons import Reason
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Probabilities of a photo's poses, the best one first."""
+
+    place: tuple[float, ...]  # (K + 1,) that the place of each of K poses is right, and that none of them is
+    within: float = 1.0  # that the best pose is within 0.1 m if its place is right
+    doubt: float = 0.0  # that what was given of the photo's geometry is wrong
+    ruled_out: frozenset[Reason] = frozenset()  # why no pose is right, whatever others say
+
+    @property
+    def sound_places(self) -> Array:
+        """Probabilities (K + 1,) that a place and what was given are right; 0 for all that is ruled out."""
+        sound = 0.0 if self.ruled_out else 1.0 - self.doubt
+        return _complete(sound * np.array(self.place[:-1]))
+
+    @property
+    def probabilities(self) -> Array:
+        """Probabilities (K + 1,) that each pose is right, within 0.1 m, and that none of them is."""
+        return _complete(self.within * self.sound_places[:-1])
+
+    def scale(self, factor: float) -> "Belief":
+        """Return this with the probabilities of all places multiplied by a factor."""
+        return replace(self, place=make_belief(factor * np.array(self.place[:-1])).place)
+
+    def rule_out(self, *reasons: Reason) -> "Belief":
+        """Return this with further reasons why no pose is right."""
+        return replace(self, ruled_out=self.ruled_out.union(reasons))
+
+
+def make_belief(places: Sequence[float] | Array, within: float = 1.0, doubt: float = 0.0) -> Belief:
+    """Return a belief in places (K,), of which none is right with the rest of the probability."""
+    return Belief(tuple(_complete(np.asarray(places, np.float64)).tolist()), within, doubt)
+
+
+def _complete(poses: Array) -> Array:
+    """Append to probabilities (K,) the rest, that none of them holds."""
+    return np.append(poses, max(1.0 - poses.sum(), 0.0))
+
+
+NOTHING = make_belief([])
+
+
+class Decision(NamedTuple):
+    """A status, and the probabilities (K + 1,) from which it follows."""
+
+    status: str
+    probabilities: Array
+
+
+def decide(belief: Belief, min_confidence: float) -> Decision:
+    """Decide whether a photo is localized; one without poses is not."""
+    probabilities = belief.probabilities
+    has_poses = len(probabilities) > 1
+    return Decision(classify(probabilities, min_confidence) if has_poses else NOT_LOCALIZED, probabilities)

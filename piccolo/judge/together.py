@@ -1,0 +1,68 @@
+"""Changes of the belief in a photo by photos that help it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from ..arrays import Array
+from .belief import Belief, make_belief
+
+LEAST_NONE = 1e-6
+
+
+class Shares(NamedTuple):
+    """Probabilities of a photo in a bundle: where the others put it, and what its own pose is worth there."""
+
+    right: float  # it belongs there, and its own pose is right
+    missed: float  # it belongs there, and its own pose is missing or a local optimum near the right one
+
+    @property
+    def here(self) -> float:
+        """Probability that the photo belongs where the others put it."""
+        return self.right + self.missed
+
+    def weigh_own(self, likelihood_ratio: float) -> "Shares":
+        """Return these by how much likelier the own pose is as the right one than as a local optimum."""
+        right = self.right * likelihood_ratio
+        here = self.here / (right + self.missed)
+        return Shares(right * here, self.missed * here)
+
+
+def believe_together(
+    shares: Shares, bundles: Array, within_own: float, within_others: float, alone: Belief | None = None
+) -> Belief:
+    """Return the belief in a photo's poses in a bundle, of which the first is believed.
+
+    `bundles` (K + 1,) are the probabilities of K poses of the bundle, and of none. How likely the pose is
+    within 0.1 m is `within_own` if the photo's own pose is right, else `within_others`, by the pose that the
+    others expect. `alone` is the belief of a photo that is sure by itself: that others show nothing says
+    nothing against it.
+    """
+    place = shares.here * float(bundles[0])
+    within = (shares.right * within_own + shares.missed * within_others) / shares.here
+    if alone is not None and alone.place[0] * alone.within > place * within:
+        place = alone.place[0]
+        within = alone.within
+    left = min(1.0, (1.0 - place) / max(1.0 - float(bundles[0]), LEAST_NONE))
+    return make_belief([place, *(left * bundles[1:-1])], within)
+
+
+def believe_beside(alone: Belief, confidences: Sequence[float], within: float | None) -> Belief:
+    """Return the belief in a photo beside others, which is no surer than the surest of them.
+
+    `within` is that of the mean of its own pose and the one by them; None if there is no mean.
+    """
+    belief = alone.scale(max(confidences))
+    return belief if within is None else replace(belief, within=within)
+
+
+def share_place(best: Belief, confidences: Sequence[float]) -> tuple[float, list[float]]:
+    """Divide the place of the best of several results among them, in proportion to their confidences.
+
+    The results are at different places. Returns the factor of the best's own places, and the places of the
+    others.
+    """
+    shares = np.array(confidences) / sum(confidences)
+    return float(shares[0]), (best.place[0] * shares[1:]).tolist()
