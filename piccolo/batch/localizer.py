@@ -29,6 +29,7 @@ from ..jobs.memory import limit_memory
 from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..judge.conclude import follow_consensus
+from ..judge.sure import SURE_CONFIDENCE
 from ..localization.beside import SurePhoto
 from ..localization.means import Step, Trace
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
@@ -42,7 +43,6 @@ from ..views.pictures import encode_image, overlay_png
 from .inputs import PriorTable
 
 MOST_PICTURES = 200  # beside which a photo is looked at again
-LEAST_CONFIDENCE = 0.95  # of these: about the log odds of 3 that frames of walks need
 BETTER = 0.7  # others' deviation must be below this fraction of the photo's own
 ONE_CAMERA = 1.02  # largest ratio of neighbouring given focal lengths of one camera: focusing changes them
 TOLD_CHANGE = 1e-3  # of a confidence: a smaller one is not written again
@@ -147,7 +147,7 @@ def list_looks_beside(texts: Sequence[str]) -> list[Look]:
     sure = [
         k
         for k, result in enumerate(results)
-        if result.status == LOCALIZED and result.confidence >= LEAST_CONFIDENCE and result.beside is None
+        if result.status == LOCALIZED and result.confidence >= SURE_CONFIDENCE and result.beside is None
     ]
     looks = []
     for k, result in enumerate(results):

@@ -21,6 +21,7 @@ from ..jobs.cluster import Cluster, connect
 from ..jobs.memory import GB, memory_left, memory_taken
 from ..jobs.processes import Here, Processes, WorkerLostError
 from ..jobs.threads import num_cores
+from ..judge.sure import WORTH_A_LOOK
 from ..opened_scan import OpenedScan
 from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.map_file import save_map
@@ -31,7 +32,6 @@ from .options import PHOTOS_OF_A_JOB
 from .start import for_terminal
 
 EXIT_SOME_NOT = 1
-MIN_FIT = 0.1  # confidence, below it the best pose is not worth a look
 QUERY_MEMORY = 0.5e9  # [byte] of a process beside the map
 SIGNALS: dict[int, str] = {signal.SIGINT: "Ctrl-C", signal.SIGTERM: "SIGTERM"}
 Item = TypeVar("Item")
@@ -51,11 +51,11 @@ def advise(result: Result) -> list[str]:
     if result.status == LOCALIZED or is_ruled_out or result.settings.get("preset") == "paper":
         return []
     focal = result.focal_length
-    if result.confidence >= MIN_FIT and focal is not None and focal.given_std_px > WIDE * focal.given_px:
+    if result.confidence >= WORTH_A_LOOK and focal is not None and focal.given_std_px > WIDE * focal.given_px:
         return ["  if other photos of this camera are localized, repeat with --focal, the mean of theirs"]
     if result.status == AMBIGUOUS:
         return ["  to decide, give --near or --heading, or localize several photos of a walk (--walk)"]
-    if result.confidence >= MIN_FIT:
+    if result.confidence >= WORTH_A_LOOK:
         others = "add photos taken beside it" if result.cameras else "localize photos of a walk (--walk)"
         return [f"  to be sure, look at the --overlay, give --near, or {others}"]
     lens = ", a wrong focal length" if result.cameras else ""

@@ -10,9 +10,9 @@ from ..confidence.alternatives import alternative_poses, sort_by_score
 from ..confidence.confidence import CONTRADICTED, Standing, log_odds
 from ..problem.profile import Profile
 from .candidate import MAX_COMPARED, NOTHING, Candidate, Selection
+from .sure import SURE_ODDS
 
 FAINT_SCORE = 0.1  # a pose with less ends no search: the scan is not drawn to see whether it is sure
-SURE_ODDS = 3.0  # [log] least odds of the best pose against any elsewhere: 20 to 1
 CLEAR_MARGIN = 0.5  # least margin by whole views
 CHANCE_MATCHES = 6  # may agree with a wrong pose, mostly none do
 SURE_MATCHES = 12  # of a right pose; wrong ones have about 5, in repeated places more, but then several do

@@ -26,6 +26,7 @@ from ..files.atomic import check_output_folder, write_atomically
 from ..geometry.pose import Pose, heading_pitch_roll_deg
 from ..geometry.pose_gaussian import turn_positions
 from ..judge.reasons import Reason
+from ..judge.sure import SHOWN
 from ..result import FAILED, UNREADABLE, Result, read_results
 from ..scan_map.scan_map import ScanMap
 
@@ -41,7 +42,6 @@ POLICY = (
 )
 OWN = "'self' file:"
 CHI_SQUARE_95 = 5.991  # of two degrees of freedom
-LEAST_CONFIDENCE = 0.05  # of a photo that is not localized: a best guess below it is on no plan
 NOT_TOLD = {Reason.MIRRORED, Reason.SPHERE}  # reasons that rule out poses, not by what was told of the photo
 ENDING = re.compile(r"\.[A-Za-z0-9]{3,4}( \(\d+\))?$")
 DIGITS = 6  # of positions [m] and rotations
@@ -97,7 +97,7 @@ def document_of_entry(entry: Entry, name: str, key: str, scan_map: ScanMap) -> d
     """Return what the page knows of a result before it is opened; angles in degrees, lengths in metres."""
     result = entry.result
     contradicts = list_contradicted(result)
-    is_unlikely = result.status == NOT_LOCALIZED and result.confidence < LEAST_CONFIDENCE
+    is_unlikely = result.status == NOT_LOCALIZED and result.confidence < SHOWN
     is_hopeless = is_unlikely and not contradicts
     return {
         "name": name,

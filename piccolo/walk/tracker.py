@@ -16,6 +16,7 @@ from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
 from ..judge.selection import assess
+from ..judge.sure import SURE_ODDS
 from ..localization.attempts import is_whole
 from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.localize import localize
@@ -163,7 +164,7 @@ class Tracker:
         A narrow photo is matched with those of them that are sure by themselves.
         """
         if problem.profile.is_narrow:
-            sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= MOST_EXPECTED]
+            sure = [(k, pose) for k, pose in near if self.frames[k].log_odds >= SURE_ODDS]
             others = [(other, pose) for k, pose in sure if (other := self.problem_of(k))]
             located = (place_keypoints(*other, self.workers) for other in others)
             beside = tuple(match_beside(problem, one, self.workers) for one in located)
@@ -317,7 +318,7 @@ def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | 
     end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
     if end is None and not is_alike and problem.profile.is_narrow:
         last = track(problem, expected.pose, workers)
-        is_sure = last is not None and last.log_odds >= MOST_EXPECTED and is_acceptable(last, expected)
+        is_sure = last is not None and last.log_odds >= SURE_ODDS and is_acceptable(last, expected)
         end = last if is_sure else None
     if end is None:
         return None
@@ -337,7 +338,7 @@ def compute_gain(problem: Problem, near: Problem) -> float:
 
 def is_acceptable(state: State, expected: Expected) -> bool:
     """Return True for a pose within reach that is where it was expected, or sure by itself."""
-    is_sure = state.log_odds >= MOST_EXPECTED or ONE_PLACE.holds(state.pose, expected.pose)
+    is_sure = state.log_odds >= SURE_ODDS or ONE_PLACE.holds(state.pose, expected.pose)
     return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
