@@ -154,7 +154,7 @@ def judge_members(
     if not bundles or probabilities[best] < EVEN:
         is_any_sure = any(member.alone.status == LOCALIZED for member in members.values())
         reason = DOUBTED if is_any_sure and len(members) > 1 else NOT_FOUND
-        return {k: judge_apart(member, reason) for k, member in members.items()}
+        return {k: refuse(member, reason) for k, member in members.items()}
     supports = tested[best]
     agreed = agree(members, bundles[best], supports, errors)
     if not isinstance(agreed, str):  # photos that were not found are refined again from where they now belong
@@ -169,7 +169,7 @@ def judge_members(
         agreed = agree(members, near, supports, errors)
         probabilities = weigh_bundles([list(one.values()) for one in tested], list(members.values()))
     if isinstance(agreed, str):
-        return {k: judge_apart(member, agreed) for k, member in members.items()}
+        return {k: refuse(member, agreed) for k, member in members.items()}
     others = [i for i in range(len(bundles)) if i != best]
     ranked = probabilities[[best, *others, -1]]
     elsewhere = [bundles[i] for i in others]
@@ -260,11 +260,41 @@ def describe_scale(log_scale: float) -> str:
 
 
 def judge_apart(member: Member, reason: str) -> Localization:
-    """Return a photo's own result, with the reason; if it is not sure, a pose only for CONTRADICTS."""
-    alone = member.alone
-    if alone.status != LOCALIZED and reason is not CONTRADICTS:
-        return Localization(warnings=(*alone.warnings, reason))
-    return replace(alone, warnings=(*alone.warnings, reason))
+    """Return a photo's own result, with the reason."""
+    return replace(member.alone, warnings=(*member.alone.warnings, reason))
+
+
+def refuse(member: Member, reason: str) -> Localization:
+    """Return a photo's own result if it is sure, else none, with the reason."""
+    if member.alone.status == LOCALIZED:
+        return judge_apart(member, reason)
+    return Localization(warnings=(*member.alone.warnings, reason))
+
+
+class Placed(NamedTuple):
+    """The pose of a photo in a bundle."""
+
+    gaussian: PoseGaussian | None  # in the map; None if neither the photo nor others tell it
+    shares: Shares
+    within_others: float  # probability that it is within 0.1 m if the pose that the others expect is right
+
+
+def place_member(member: Member, number: int, shares: Shares, agreed: Agreed) -> Placed:
+    """Return the mean of a photo's own pose and the one that the others expect, or the likelier of them."""
+    rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
+    estimate = agreed.estimates.get(number)
+    own = None if estimate is None else estimate.own
+    if not rest:
+        return Placed(own, shares, 0.0)
+    adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
+    expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
+    gaussian = expected
+    if own is not None:
+        shares = shares.weigh_own(compare_errors(expected, own))
+        if shares.right >= shares.missed:
+            gaussian = expected.fuse(own)
+    offset = gaussian.pose.center_world - expected.pose.center_world
+    return Placed(gaussian, shares, probability_near(offset, expected.covariance[3:, 3:]))
 
 
 def place_member(
@@ -276,27 +306,15 @@ def place_member(
     """
     if member.alone.belief.ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
-    shares = Shares(*support.shares[:2].tolist())
-    if shares.here < EVEN or number in agreed.apart:
+    belongs = Shares(*support.shares[:2].tolist())
+    if belongs.here < EVEN or number in agreed.apart:
         return judge_apart(member, CONTRADICTS)
-    rest = [estimate for k, estimate in agreed.estimates.items() if k != number]
-    own = agreed.estimates.get(number)
-    gaussian = None if own is None else own.own
-    within_others = 0.0
-    if rest:
-        adjusted = adjust(agreed.adjusted.bundle, rest, agreed.errors)
-        expected = adjusted.predict(member.cam_from_bundle, agreed.errors)
-        if gaussian is not None:
-            shares = shares.weigh_own(compare_errors(expected, gaussian))
-        is_missed = gaussian is None or shares.right < shares.missed
-        gaussian = expected if gaussian is None or is_missed else expected.fuse(gaussian)
-        offset = gaussian.pose.center_world - expected.pose.center_world
-        within_others = probability_near(offset, expected.covariance[3:, 3:])
+    gaussian, shares, within_others = place_member(member, number, belongs, agreed)
     if gaussian is None:
-        return judge_apart(member, NOT_FOUND)
+        return refuse(member, NOT_FOUND)
     within = probability_within(gaussian)
     alone = None
-    if member.alone.status == LOCALIZED and own and member.alone.gaussian:
+    if member.alone.status == LOCALIZED and number in agreed.estimates and member.alone.gaussian:
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
     belief = believe_together(shares, probabilities, within, within_others, alone)
     doubts = (UNSEEN,) if shares.right < EVEN else ()
