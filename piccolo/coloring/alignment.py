@@ -17,11 +17,11 @@ import numpy as np
 from ..arrays import Array, Array32, Int32s, Int64s
 from ..cloud.octree import Octree
 from ..geometry.pose import Pose, step, step_between
+from ..geometry.robust import geman_mcclure, inline_geman_mcclure
 from ..geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, kernel, whole
 from ..local_features.view_image import render_gray
-from ..optimize.channel_loss import geman_mcclure
 from ..optimize.gauss_newton import Equations, descend
 from ..panorama import Panorama, texels
 from ..panorama.model import resize
@@ -262,7 +262,7 @@ def add_pairs(
                     square += (values[a, c] - values[b, c]) ** 2
                 if not square >= F0:  # NaN: masked
                     continue
-                loss, weight = geman_mcclure(square, per_scale2)
+                loss, weight = inline_geman_mcclure(square, per_scale2)
                 weight /= end - begin
                 total += loss / (end - begin)
                 i, j = 6 * photo[a], 6 * photo[b]
@@ -318,7 +318,7 @@ def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> A
     gains = np.zeros((num_photos, 3))
     for _ in range(NUM_ROUNDS):
         errors = ratios - (gains[i] - gains[j])
-        weights = 1.0 / (1.0 + (errors**2).sum(axis=1) / SCALE**2) ** 2
+        _, weights = geman_mcclure((errors**2).sum(axis=1), SCALE**-2)
         gains = solve(i, j, ratios * weights[:, None], weights, num_photos)
     return np.exp(gains).astype(np.float32)
 
