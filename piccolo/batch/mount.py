@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..geometry.pose import Pose, exp_so3, log_so3, orthonormal
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, subtract
 from ..localization.bundle_adjustment import (
     RelativeErrors,
@@ -47,9 +47,7 @@ class Trajectory(NamedTuple):
         before = self.poses[k - 1]
         after = self.poses[k]
         share = (time - self.times[k - 1]) / (self.times[k] - self.times[k - 1])
-        turn = share * log_so3(after.R_cam_from_world @ before.R_cam_from_world.T)
-        center = before.center_world + share * (after.center_world - before.center_world)
-        return Pose(orthonormal(exp_so3(turn) @ before.R_cam_from_world), center)
+        return add(before, share * subtract(after, before))
 
 
 class Sighting(NamedTuple):
