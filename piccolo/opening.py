@@ -10,11 +10,10 @@ import numpy as np
 
 from .arguments import check_fields, check_kind
 from .arrays import Floats, Values
-from .cloud.settings import BY_FILE, METRES, WITHOUT_COLORS, CloudSettings, UpAxis
+from .cloud.settings import METRES, CloudSettings, UpAxis
 from .cloud.stream import ARRAYS, CloudStream, open_cloud, stream_of_arrays
 from .errors import InputError
 from .files.cache import sha256_of_files
-from .geometry.colors import Labels
 from .jobs.threads import ProgressCallback, Stopwatch, Workers, no_progress, num_cores, report_progress
 from .opened_scan import OpenedScan, Settings
 from .paper.localize import PaperMap, prepare as prepare_by_paper
@@ -101,11 +100,15 @@ class Cloud:
     @property
     def settings(self) -> CloudSettings:
         """Settings with which the scan is read."""
-        channels = WITHOUT_COLORS if self.ignore_colors else BY_FILE.channels
-        labels = Labels(tuple(sorted(set(self.ignore_labels)))) if self.labels else None
-        columns = tuple(self.columns)
-        scale = METRES[self.units] if self.units else None
-        return CloudSettings(scale, self.up, channels, labels, self.crs, self.color_range, columns)
+        return CloudSettings.of_options(
+            self.ignore_colors,
+            self.ignore_labels if self.labels else None,
+            scale=METRES[self.units] if self.units else None,
+            up=self.up,
+            crs=self.crs,
+            color_range=self.color_range,
+            columns=tuple(self.columns),
+        )
 
 
 def open_scan(

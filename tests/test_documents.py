@@ -3,6 +3,7 @@
 import csv
 import doctest
 import hashlib
+import itertools
 import json
 import re
 import runpy
@@ -10,6 +11,7 @@ import shlex
 import subprocess
 import sys
 import textwrap
+from dataclasses import fields
 from importlib import import_module
 from pathlib import Path
 
@@ -21,6 +23,8 @@ import piccolo
 from piccolo.cloud.stream import FORMATS
 from piccolo.export.formats import FORMATS as EXPORTS
 from piccolo.kernels.jit import COMPILE_TIME
+from piccolo.opening import Cloud
+from piccolo.photo import Photo, Prior
 from research.synthetic import make_room
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -218,6 +222,14 @@ def test_docstrings(name, folder, monkeypatch):
     failures, tried = doctest.testmod(import_module(name), extraglobs=known, optionflags=FLAGS)
     assert failures == 0
     assert tried > 0
+
+
+@pytest.mark.parametrize(("kind", "own"), [(Cloud, {"source"}), (Photo, {"picture"}), (Prior, set())])
+def test_the_tables_of_options_name_all(kind, own):
+    page = (ROOT / "docs/API.md").read_text()
+    table = page.partition(f"| option of `{kind.__name__}`")[2].partition("\n\n")[0]
+    named = [re.findall(r"`([a-z_]+)`", line.split("|")[1]) for line in table.splitlines()[2:]]
+    assert sorted(itertools.chain(*named)) == sorted({f.name for f in fields(kind)} - own)
 
 
 def test_the_table_of_formats_names_what_is_read():

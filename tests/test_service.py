@@ -8,6 +8,7 @@ import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import fields
 from importlib import import_module
 from io import BytesIO
 from pathlib import Path
@@ -18,8 +19,10 @@ from batches import workers_of
 from services import serving
 
 from piccolo.cli import localize
+from piccolo.photo import Photo, Prior
 from piccolo.result import Result
 from piccolo.service.asking import clean_name
+from piccolo.service.description import describe_service
 
 NEEDED = ("status", "confidence", "center_world", "R_cam_from_world", "covariance", "alternatives")
 
@@ -198,6 +201,26 @@ def test_nothing_but_the_page_can_be_read(service):
     assert service.ask("GET", f"/{plan}")[2].startswith(b"\x89PNG")
     for name in ("app.js", "app.css", "report.js"):
         assert service.ask("GET", f"/{name}")[0] == 200
+
+
+def test_the_description_has_the_options_of_photos_and_priors():
+    schemas = describe_service()["components"]["schemas"]
+    found = {name: schemas[name]["properties"] for name in ("PhotoOptions", "PriorOptions")}
+    for kind, left_out in ((Photo, {"picture", "mask", "rig"}), (Prior, set())):
+        properties = found[f"{kind.__name__}Options"]
+        assert properties.keys() == {f.name for f in fields(kind)} - left_out
+        for name, schema in properties.items():
+            assert schema["oneOf"][-1] == {"type": "null"}, name
+            assert len(schema["description"]) > 10, name
+    kinds = {name: schema["oneOf"][:-1] for part in found.values() for name, schema in part.items()}
+    number = {"type": "number"}
+    z = {"oneOf": [number, {"type": "null"}]}
+    assert kinds["near"] == [{"type": "array", "items": z, "minItems": 3, "maxItems": 3}]
+    assert kinds["gravity_vector"] == [{"type": "array", "items": number, "minItems": 3, "maxItems": 3}]
+    assert kinds["within"] == [{"type": "array", "items": {"type": "string"}}]
+    assert kinds["use_gps"] == [{"type": "boolean"}]
+    assert "cylindrical" in kinds["projection"][0]["enum"]
+    assert kinds["camera"] == [{"type": "object", "additionalProperties": True}]
 
 
 def test_a_client_is_generated_from_the_description(service, photo, expected, tmp_path, monkeypatch):

@@ -1,8 +1,8 @@
 """Boresight calibration: how a camera sits on what carries it, from photos that were localized.
 
 With body_from_world(t) the given poses: cam_from_world(t) = cam_from_body @ body_from_world(t + clock). The
-rotation and lever arm of cam_from_body and the clock offset are fitted by Gauss and Newton, robustly. Errors
-of the given poses are estimated from what is left.
+rotation and lever arm of cam_from_body and the clock offset are fitted robustly. Errors of the given poses
+are estimated from what is left.
 """
 
 import math
@@ -13,20 +13,21 @@ import numpy as np
 
 from ..arrays import Array
 from ..errors import InputError
-from ..geometry.pose import Pose, exp_so3, log_so3, orthonormal
+from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, subtract
 from ..localization.bundle_adjustment import (
     RelativeErrors,
     choose_agreed,
     find_odd,
     match_median,
-    weigh_robustly,
+    robustly,
 )
+from ..optimize.gauss_newton import Equations, descend, sum_observations, whiten
 
 LEAST_PHOTOS = 4
 NUM_ROUNDS = 5  # in which errors and the mount are estimated in turn
 MOST_ALIKE = 0.9  # correlation of errors of neighbouring photos
-NUM_STEPS = 8  # of Gauss and Newton, at most
+NUM_STEPS = 8  # at most
 SETTLED = 1e-6  # [rad, m, s] of a step, after which there is none
 NEAR_S = 0.01  # [s] on either side, over which a velocity is taken
 MARGIN_S = 1.0  # [s] chosen: by which clocks may differ where a photo is at an end of the trajectory
@@ -46,9 +47,7 @@ class Trajectory(NamedTuple):
         before = self.poses[k - 1]
         after = self.poses[k]
         share = (time - self.times[k - 1]) / (self.times[k] - self.times[k - 1])
-        turn = share * log_so3(after.R_cam_from_world @ before.R_cam_from_world.T)
-        center = before.center_world + share * (after.center_world - before.center_world)
-        return Pose(orthonormal(exp_so3(turn) @ before.R_cam_from_world), center)
+        return add(before, share * subtract(after, before))
 
 
 class Sighting(NamedTuple):
@@ -57,6 +56,13 @@ class Sighting(NamedTuple):
     pose: Pose
     covariance: Array  # (6, 6)
     time: float  # by the photos' clock, or of its given pose
+
+
+class Mount(NamedTuple):
+    """The unknowns: how a camera sits, and its clock."""
+
+    cam_from_body: Pose
+    clock: float  # [s] to be added to photos' times
 
 
 class MountFit(NamedTuple):
@@ -79,31 +85,36 @@ def fit_mount(sightings: Sequence[Sighting], trajectory: Trajectory) -> MountFit
         _check_times(np.array([sighting.time for sighting in sightings]), trajectory.times)
     own = [sighting.covariance for sighting in sightings]
     errors = RelativeErrors()
-    mount = _begin(sightings, trajectory, errors)
-    clock = 0.0
+    mount = Mount(_begin(sightings, trajectory, errors), 0.0)
     for _ in range(NUM_ROUNDS):
-        for _ in range(NUM_STEPS):
-            information = np.diag([LOOSE] * 7)
-            gradient = np.zeros(7)
-            for sighting in sightings:
-                J, step = _compare(mount, clock, sighting, trajectory)
-                weighted = J.T @ weigh_robustly(step, sighting.covariance + errors.covariance)
-                information = information + weighted @ J
-                gradient = gradient + weighted @ step
-            covariance = np.linalg.inv(information)
-            delta = np.asarray(covariance @ gradient)
-            mount = add(mount, delta[:6])
-            clock += float(delta[6])
-            if np.abs(delta).max() < SETTLED:
-                break
-        steps = np.array([_compare(mount, clock, sighting, trajectory)[1] for sighting in sightings])
+        mount, covariance = _adjust(mount, sightings, trajectory, errors)
+        steps = np.array([-_compare(mount, sighting, trajectory)[0] for sighting in sightings])
         errors = match_median(own, steps, errors)
     if errors.turn > MOST_ERRORS.turn or errors.move > MOST_ERRORS.move:
         off = f"{errors.move:.2g} m and {math.degrees(errors.turn):.2g} deg"
         wanted = "wanted those of one rigid mount in the scan's coordinates"
         raise InputError(f"found given poses that are off by {off}, {wanted}")
     is_odd = find_odd(own, steps, errors)
-    return MountFit(mount, clock, covariance * _repeat(own, steps, errors, is_odd), errors, is_odd, steps)
+    covariance = covariance * _repeat(own, steps, errors, is_odd)
+    return MountFit(mount.cam_from_body, mount.clock, covariance, errors, is_odd, steps)
+
+
+def _adjust(
+    begin: Mount, sightings: Sequence[Sighting], trajectory: Trajectory, errors: RelativeErrors
+) -> tuple[Mount, Array]:
+    """Adjust a mount to photos; those far off count less. Return also its covariance (7, 7)."""
+    spreads = np.array([sighting.covariance + errors.covariance for sighting in sightings])
+
+    def equations(at: Mount) -> Equations:
+        compared = [_compare(at, sighting, trajectory) for sighting in sightings]
+        off, J = (whiten(spreads, np.array(values)) for values in zip(*compared, strict=True))
+        return sum_observations(off, J, robustly).add_known(np.zeros(7), LOOSE * np.eye(7))
+
+    def move(at: Mount, step: Array) -> Mount:
+        return Mount(add(at.cam_from_body, step[:6]), at.clock + float(step[6]))
+
+    mount, found = descend(equations, move, begin, NUM_STEPS, SETTLED)
+    return mount, np.asarray(np.linalg.inv(found.matrix))
 
 
 def _check_times(times: Array, clock: Array) -> None:
@@ -123,9 +134,7 @@ def _repeat(own: Sequence[Array], steps: Array, errors: RelativeErrors, is_odd: 
 
     Given poses drift: those of neighbouring photos are off in the same way, which is not averaged away.
     """
-    roots = [np.linalg.cholesky(covariance + errors.covariance) for covariance in own]
-    whitened = np.array([np.linalg.solve(root, step) for root, step in zip(roots, steps, strict=True)])
-    whitened = whitened[~np.array(is_odd)]
+    whitened = whiten(np.array(own) + errors.covariance, steps)[~np.array(is_odd)]
     alike = float((whitened[1:] * whitened[:-1]).sum() / max(np.square(whitened).sum(), 1e-12))
     alike = min(max(alike, 0.0), MOST_ALIKE)
     return (1.0 + alike) / (1.0 - alike)
@@ -137,14 +146,15 @@ def _begin(sightings: Sequence[Sighting], trajectory: Trajectory, errors: Relati
     return choose_agreed(mounts, lambda mount: np.array([subtract(m, mount) for m in mounts]), errors)
 
 
-def _compare(mount: Pose, clock: float, sighting: Sighting, trajectory: Trajectory) -> tuple[Array, Array]:
-    """Return the derivative (6, 7) of a photo's pose by mount and clock, and its step (6,) from there."""
+def _compare(mount: Mount, sighting: Sighting, trajectory: Trajectory) -> tuple[Array, Array]:
+    """Return the step (6,) from a photo's pose to where the mount puts it, and its derivative (6, 7)."""
+    cam_from_body, clock = mount
     time = sighting.time + clock
     body = trajectory.at(time)
     J = np.zeros((6, 7))
     J[:3, :3] = np.eye(3)
     J[3:, 3:6] = body.R_cam_from_world.T
     if trajectory.has_clock:
-        ends = [mount @ trajectory.at(time + side) for side in (-NEAR_S, NEAR_S)]
+        ends = [cam_from_body @ trajectory.at(time + side) for side in (-NEAR_S, NEAR_S)]
         J[:, 6] = subtract(ends[1], ends[0]) / (2.0 * NEAR_S)
-    return J, subtract(sighting.pose, mount @ body)
+    return subtract(cam_from_body @ body, sighting.pose), J

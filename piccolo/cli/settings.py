@@ -6,31 +6,31 @@ from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 from ..batch.localizer import Localizer
-from ..cloud.settings import BY_FILE, WITHOUT_COLORS, CloudSettings
+from ..cloud.settings import CloudSettings
 from ..errors import InputError
-from ..geometry.colors import Labels
-from ..opened_scan import Settings
+from ..opened_scan import ONLY_DEFAULT, Settings
 from ..panorama import check_labels
 from ..paper.localize import PaperSettings
-from ..photo import Photo, Prior
+from ..photo import NOTHING_KNOWN, Photo, Prior
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.open_map import CachePolicy
 from .command import Arguments
 from .options import NONE
 
 PRESETS: dict[str, type[Settings]] = {"default": CoarseToFineSettings, "paper": PaperSettings}
-ONLY_DEFAULT = ("near", "height", "heading", "within", "gravity_vector", "refine_focal")
 
 
 def cloud_settings_from(arguments: Arguments) -> CloudSettings:
     """Return the options of add_cloud_reading_options."""
     crs = vars(arguments).get("crs")  # not of commands without photos
-    crs = None if crs == NONE else crs
-    channels = WITHOUT_COLORS if arguments.ignore_colors else BY_FILE.channels
-    labels = None if arguments.labels is None else Labels(tuple(sorted(set(arguments.labels))))
-    color_range = None if arguments.color_range == "auto" else float(arguments.color_range)
-    return CloudSettings(
-        arguments.units, arguments.up, channels, labels, crs, color_range, tuple(arguments.columns)
+    return CloudSettings.of_options(
+        arguments.ignore_colors,
+        arguments.labels,
+        scale=arguments.units,
+        up=arguments.up,
+        crs=None if crs == NONE else crs,
+        color_range=None if arguments.color_range == "auto" else float(arguments.color_range),
+        columns=tuple(arguments.columns),
     )
 
 
@@ -58,13 +58,16 @@ def settings_from(arguments: Arguments) -> Settings:
     asked = {"gravity": arguments.gravity, "min_confidence": arguments.min_confidence}
     given |= {name: value for name, value in asked.items() if value is not None}
     options = vars(arguments)
+    prior = prior_from(options)
     if name == "paper":
-        foreign = [option for option in ONLY_DEFAULT if options.get(option) not in (None, False)]
+        told = [f.name for f in fields(Prior) if getattr(prior, f.name) != getattr(NOTHING_KNOWN, f.name)]
+        foreign = [option for option in told if option != "use_gps"]
+        foreign += [option for option in ONLY_DEFAULT if options.get(option)]
         foreign += ["up"] if arguments.up != "auto" else []
         if foreign:
-            raise InputError(f"--{foreign[0].replace('_', '-')}: not an option of the preset paper")
+            raise InputError(f"`{foreign[0]}`: not an option of the preset paper")
     else:
-        given["prior"] = prior_from(options)
+        given["prior"] = prior
     return PRESETS[name](**given)
 
 

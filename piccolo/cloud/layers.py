@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array, Int8s, Int64s
+from ..geometry.robust import weigh_absolute
 from ..jobs.threads import Workers, one_blas_thread
 from .octree import Octree
 from .profiles import BIN, NUM_BINS, Profiles, measure_profiles
@@ -244,7 +245,7 @@ def refine(patches: Patches, motion: Array) -> Array:
         is_near = np.abs(patches.gap - np.abs(expected)) <= tolerance * BIN
         rows = by_motion[is_near]
         gaps = np.where(expected < 0.0, -patches.gap, patches.gap)[is_near]
-        weights = 1.0 / np.maximum(np.abs(gaps - expected[is_near]), LEAST_RESIDUAL)
+        weights = weigh_absolute(gaps - expected[is_near], LEAST_RESIDUAL)
         normal_matrix = (rows * weights[:, None]).T @ rows + np.diag(RIDGE * (weights.sum() + 1.0))
         moved = np.asarray(np.linalg.solve(normal_matrix, rows.T @ (weights * gaps)))
         found = score(patches, patches.by_motion, moved[None])[0]

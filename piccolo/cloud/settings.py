@@ -1,6 +1,7 @@
 """Settings for reading the files of a cloud."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -32,6 +33,15 @@ class CloudSettings:
     crs: str | None = None  # coordinate system, such as EPSG:25832; None: what the file names
     color_range: float | None = None  # the value of full brightness; None: by the file
     columns: tuple[str, ...] = ()  # names of the numbers of a line, such as x y z i r g b; none: by the file
+
+    @classmethod
+    def of_options(
+        cls, ignore_colors: bool, ignored_labels: Iterable[int] | None, **others: Any
+    ) -> "CloudSettings":
+        """Return the settings that options of users ask for; None for colours in place of labels."""
+        channels = WITHOUT_COLORS if ignore_colors else BY_FILE.channels
+        labels = None if ignored_labels is None else Labels(tuple(sorted(set(ignored_labels))))
+        return cls(channels=channels, labels=labels, **others)
 
     def __post_init__(self) -> None:
         if self.labels and "colors" not in self.channels:

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..arrays import Array, Array32, Int32s, Integers
 from ..geometry.colors import colors_of_edges
+from ..geometry.robust import weigh_absolute
 from ..jobs.threads import Workers
 from .octree import Octree, recolor
 
@@ -189,7 +190,7 @@ def fit_tensor(normals: Array, variances: Array) -> Array:
         weighted = design * weights[:, None]
         normal_matrix = design.T @ weighted + RIDGE * weights.sum() * np.diag(twice)
         found = np.linalg.solve(normal_matrix, weighted.T @ variances)
-        weights = 1.0 / np.maximum(np.abs(design @ found - variances), LEAST_RESIDUAL)
+        weights = weigh_absolute(design @ found - variances, LEAST_RESIDUAL)
     tensor[rows, columns] = tensor[columns, rows] = found
     values, axes = np.linalg.eigh(tensor)
     return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T)

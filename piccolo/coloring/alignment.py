@@ -16,13 +16,13 @@ import numpy as np
 
 from ..arrays import Array, Array32, Int32s, Int64s
 from ..cloud.octree import Octree
-from ..geometry.pose import Pose, log_so3, step
+from ..geometry.pose import Pose, step, step_between
+from ..geometry.robust import geman_mcclure, inline_geman_mcclure
 from ..geometry.sphere import direction_to_pixel, pixel_jacobian, pixel_rays
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, kernel, whole
 from ..local_features.view_image import render_gray
-from ..optimize.channel_loss import geman_mcclure
-from ..optimize.levenberg_marquardt import FALL, FIRST_DAMPING, RISE
+from ..optimize.gauss_newton import Equations, descend
 from ..panorama import Panorama, texels
 from ..panorama.model import resize
 
@@ -127,7 +127,7 @@ def align(
         read = partial(read_all, points, sightings, images, workers)
         values = read(poses, np.ones_like(gains)).values
         gains = balance(sightings.point, sightings.photo, values, len(poses))
-        poses = descend(partial(read, gains=gains), sightings, poses, anchors)
+        poses = agree(partial(read, gains=gains), sightings, poses, anchors)
     return poses, gains
 
 
@@ -181,47 +181,28 @@ def read_all(
     return readings
 
 
-def descend(
+def agree(
     read: Callable[[Sequence[Pose]], Readings], sightings: Sightings, poses: list[Pose], anchors: list[Anchor]
 ) -> list[Pose]:
-    """Return the poses at which photos agree best: Levenberg-Marquardt on all of them."""
+    """Return the poses at which photos agree best, near their anchors."""
+    count = 6 * len(poses)
+    information = np.zeros((count, count))
+    for k, anchor in enumerate(anchors):
+        information[6 * k : 6 * k + 6, 6 * k : 6 * k + 6] = anchor.information
 
-    def equations(at: Sequence[Pose]) -> tuple[float, Array, Array]:
-        readings = read(at)
-        matrix = np.zeros((6 * len(at), 6 * len(at)))
-        gradient = np.zeros(6 * len(at))
-        loss = add_pairs(sightings.first, sightings.photo, *readings, LOSS_SCALE, matrix, gradient)
+    def equations(at: list[Pose]) -> Equations:
+        matrix = np.zeros((count, count))
+        gradient = np.zeros(count)
+        loss = add_pairs(sightings.first, sightings.photo, *read(at), LOSS_SCALE, matrix, gradient)
         variance = NUM_ALIKE * NOISE**2
-        loss /= variance
-        matrix /= variance
-        gradient /= variance
-        for k, (pose, anchor) in enumerate(zip(at, anchors, strict=True)):
-            own = slice(6 * k, 6 * k + 6)
-            turn = log_so3(pose.R_cam_from_world @ anchor.pose.R_cam_from_world.T)
-            move = anchor.pose.R_cam_from_world @ (pose.center_world - anchor.pose.center_world)
-            away = np.concatenate([turn, move])
-            loss += 0.5 * float(away @ anchor.information @ away)
-            matrix[own, own] += anchor.information
-            gradient[own] += anchor.information @ away
-        return loss, matrix, gradient
+        found = Equations(loss / variance, gradient / variance, matrix / variance)
+        away = [step_between(anchor.pose, pose) for pose, anchor in zip(at, anchors, strict=True)]
+        return found.add_known(np.concatenate(away), information)
 
-    loss, matrix, gradient = equations(poses)
-    damping = FIRST_DAMPING
-    for _ in range(NUM_STEPS):
-        delta = np.asarray(
-            np.linalg.solve(matrix + damping * np.diag(np.diag(matrix)), -gradient), np.float64
-        )
-        moved = [step(pose, delta[6 * k : 6 * k + 6]) for k, pose in enumerate(poses)]
-        found = equations(moved)
-        if found[0] < loss:
-            poses = moved
-            loss, matrix, gradient = found
-            damping *= FALL
-        else:
-            damping *= RISE
-        if np.abs(delta).max() < SETTLED:
-            break
-    return poses
+    def move(at: list[Pose], delta: Array) -> list[Pose]:
+        return [step(pose, delta[6 * k : 6 * k + 6]) for k, pose in enumerate(at)]
+
+    return descend(equations, move, poses, NUM_STEPS, SETTLED)[0]
 
 
 @kernel
@@ -281,7 +262,7 @@ def add_pairs(
                     square += (values[a, c] - values[b, c]) ** 2
                 if not square >= F0:  # NaN: masked
                     continue
-                loss, weight = geman_mcclure(square, per_scale2)
+                loss, weight = inline_geman_mcclure(square, per_scale2)
                 weight /= end - begin
                 total += loss / (end - begin)
                 i, j = 6 * photo[a], 6 * photo[b]
@@ -337,7 +318,7 @@ def balance(point: Int64s, photo: Int64s, values: Array32, num_photos: int) -> A
     gains = np.zeros((num_photos, 3))
     for _ in range(NUM_ROUNDS):
         errors = ratios - (gains[i] - gains[j])
-        weights = 1.0 / (1.0 + (errors**2).sum(axis=1) / SCALE**2) ** 2
+        _, weights = geman_mcclure((errors**2).sum(axis=1), SCALE**-2)
         gains = solve(i, j, ratios * weights[:, None], weights, num_photos)
     return np.exp(gains).astype(np.float32)
 

@@ -6,12 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..geometry.robust import geman_mcclure
+
 WRONG_SHARE = 0.02  # chosen: of given focal lengths, those that are wrong
 WRONG_DEVIATION = 0.1  # chosen: deviation of the logarithm of a wrong one
 MOST_LOG = 20.0  # of odds
 MOST_CONFLICT = 4.0  # deviations between the focal length found and that given: more contradict it
 LEAST_PHOTOS = 3  # that make a consensus
-OUTLYING = 3.0  # deviations: photos that differ more have less than a quarter of their weight
+OUTLYING = 3.0  # deviations, the scale of weights: photos that differ more have less than a quarter
 SHARED_DEVIATION = 0.003  # of an error that all photos of a camera share, as that of a calibration
 NUM_UPDATES = 20  # of the weights
 
@@ -46,7 +48,7 @@ class Opinion(NamedTuple):
 class Consensus:
     """The focal length of one camera by all of its photos together.
 
-    Photos at a wrong place find any focal length: weights are those of Geman and McClure's loss, from the
+    Photos at a wrong place find any focal length: weights are those of Geman and McClure, from the
     median on. None stands for a photo that says nothing.
     """
 
@@ -59,7 +61,7 @@ class Consensus:
         self._weights = self._precision
         for _ in range(NUM_UPDATES if told else 0):
             square = self._precision * (self._off - middle) ** 2
-            self._weights = self._precision / (1.0 + square / OUTLYING**2) ** 2
+            self._weights = self._precision * geman_mcclure(square, OUTLYING**-2)[1]
             middle = self._weights @ self._off / self._weights.sum()
 
     def opinion(self, without: int | None = None, least: int = LEAST_PHOTOS) -> Opinion | None:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..arrays import Array32, Bytes, Mask
 from ..cloud.soa import PackedPoints
 from ..geometry.pose import Pose
+from ..geometry.robust import geman_mcclure
 from ..geometry.sphere import solid_angles
 from ..kernels.jit import F0, F1, kernel
 from ..panorama import Panorama, local_normalization
@@ -71,7 +72,7 @@ def compare_occlusion(points: PackedPoints, panorama: Panorama, pose: Pose) -> O
         low = _extreme(np.where(is_seen, contrast, np.float32(9.0)), cv2.erode)
         high = _extreme(np.where(is_seen, contrast, np.float32(-9.0)), cv2.dilate)
         write_squares(of_photo, photo, scan, low, high, difference)
-        weight = np.asarray(shared / (1.0 + difference / CONTRADICTING) ** 2, np.float32)
+        weight = shared * geman_mcclure(difference, 1.0 / CONTRADICTING)[1]
     is_compared = small.is_valid & _extreme(is_shared.view(np.uint8), cv2.dilate).astype(bool)
     return Occlusion(small.is_valid, is_compared, is_compared & (difference > CONTRADICTING))
 

@@ -1,5 +1,6 @@
 """Corrections of a lens by the matches of a photo with the scan as it is drawn at a pose."""
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -9,8 +10,10 @@ from ..camera import Mount
 from ..camera.corrections import FOCAL, LENS, Corrections
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LOOSE, add, differentiate_rays
+from ..geometry.robust import geman_mcclure
 from ..judge.selection import SURE_MATCHES
 from ..local_features.matching import Matches
+from ..optimize.gauss_newton import sum_observations
 from ..optimize.self_calibration import NUM_OF_POSE
 from .self_calibration import Estimate, invert
 from .verification import LEAST_ERROR
@@ -49,22 +52,24 @@ def fit_matches(camera: Mount, pose: Pose, matches: Matches, widths: tuple[float
         return MatchFit(np.zeros(len(LENS)), 0.0, pose)
     corrections = Corrections(camera)
     prior = np.diag([0.0] * NUM_OF_POSE + list((LEAST_ERROR / np.array(widths)) ** 2))
+    prior += LOOSE * np.eye(len(prior))
     end = pose
     values = np.zeros(len(LENS))
     for scale in MATCH_SCALES:
         rays, of_pose = differentiate_rays(matches.points, end)
         shown = corrections.displace(np.ascontiguousarray(rays.T, np.float32), values)
-        J = np.concatenate([of_pose, shown.moves.transpose(2, 1, 0)], axis=2)
-        residuals = shown.points.T - matches.rays
-        weights = shown.is_shown / (1.0 + (residuals**2).sum(axis=1) / scale**2) ** 2  # of Geman and McClure
-        slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
-        inverse = np.linalg.inv(
-            np.einsum("n,nij,nik->jk", weights, J, J) + prior + LOOSE * np.eye(len(prior))
-        )
-        step = inverse @ (slopes.sum(axis=0) + prior.diagonal() * [*np.zeros(NUM_OF_POSE), *values])
-        end = add(end, -step[:NUM_OF_POSE])
-        values = np.clip(values - step[NUM_OF_POSE:], -MOST, MOST)
-    of_focal = inverse[NUM_OF_POSE + FOCAL]
+        is_shown = shown.is_shown[:, None].astype(np.float64)
+        J = np.concatenate([of_pose, shown.moves.transpose(2, 1, 0)], axis=2) * is_shown[..., None]
+        residuals = (shown.points.T - matches.rays) * is_shown
+        robust = partial(geman_mcclure, inverse_scale2=scale**-2)
+        found = sum_observations(residuals, J, robust)
+        found = found.add_known(np.concatenate([np.zeros(NUM_OF_POSE), values]), prior)
+        step = found.solve()
+        end = add(end, step[:NUM_OF_POSE])
+        values = np.clip(values + step[NUM_OF_POSE:], -MOST, MOST)
+    weights = is_shown[:, 0] * robust(np.square(residuals).sum(axis=1))[1]
+    slopes = np.einsum("n,nij,ni->nj", weights, J, residuals)
+    of_focal = np.linalg.inv(found.matrix)[NUM_OF_POSE + FOCAL]
     variance = INFLATION * float(np.square(slopes @ of_focal).sum()) + MATCHED_DEVIATION**2
     is_known = (weights > AGREES).sum() >= SURE_MATCHES and abs(values[FOCAL]) < LIMIT
     return MatchFit(values, float(is_known / variance), end)

@@ -11,8 +11,9 @@ import numpy as np
 
 from ..arrays import Array, Array32, Int64s
 from ..camera.corrections import Corrections
-from ..geometry.pose import Pose, exp_so3, orthonormal
+from ..geometry.pose import Pose, step
 from ..optimize.channel_loss import ChannelProblem
+from ..optimize.gauss_newton import Equations, descend
 from ..optimize.self_calibration import NUM_OF_POSE, FreeSums, sum_free_equations
 from ..panorama.local_normalization import LEVELS_PER_UNIT, to_levels
 from ..panorama.texels import Texels
@@ -20,11 +21,7 @@ from ..problem.stages import Limits
 from ..views.view import Cells
 from .covariance import jackknife_gradients, sort_by_block, take
 
-FIRST_DAMPING = 1e-3
-RISE = 6.0  # of the damping, after a step that does not lower the loss
-FALL = 0.2
-LEAST_DAMPING = 1e-6
-MOST_DAMPING = 1e3
+LOOSE = 1e-9  # information that makes matrices invertible
 MASKED_LOSS = 0.25  # of a point on masked pixels, times the square of the loss's scale
 # of the matrix of Gauss and Newton, which ignores that the loss flattens: with it, 95 % of true corrections
 # of 48 crops of three scenes lie within two deviations
@@ -99,46 +96,29 @@ def relate_to_chance(sums: FreeSums) -> float:
 def descend_freely(
     cells: Cells, image: Texels, freedom: Freedom, pose: Pose, values: Array, limits: Limits
 ) -> FreeEnd:
-    """Descend from a pose and corrections (p,), both free, by Levenberg and Marquardt."""
+    """Descend from a pose and corrections (p,), both free."""
     points = sort_points(cells, pose)
     scale = limits.loss_scale * LEVELS_PER_UNIT
     total_weight = float(points.around.weights.sum())
-    precision = np.zeros(NUM_OF_POSE + len(values))
 
     def at(where: Pose, corrected: Array) -> FreeEnd:
         sums = evaluate(points, image, scale, freedom.corrections, where, corrected)
         masked = MASKED_LOSS * scale * scale * (total_weight - float(sums.weight.sum()))
-        of_values = 0.5 * float(precision[NUM_OF_POSE:] @ corrected**2)
-        return FreeEnd(where, corrected, float(sums.loss.sum()) + masked + of_values, sums)
+        return FreeEnd(where, corrected, float(sums.loss.sum()) + masked, sums)
 
-    end = at(pose, values)
-    precision[NUM_OF_POSE:] = freedom.deviations**-2.0 / relate_to_chance(end.sums)
-    end = end._replace(loss=end.loss + 0.5 * float(precision[NUM_OF_POSE:] @ values**2))
-    damping = FIRST_DAMPING
-    for _ in range(limits.num_iterations):
-        matrix = end.sums.matrices.sum(axis=0) + np.diag(precision)
-        slopes = end.sums.gradients.sum(axis=0)
-        slopes[NUM_OF_POSE:] += precision[NUM_OF_POSE:] * end.values
-        step = -np.linalg.solve(matrix + np.diag(damping * matrix.diagonal() + 1e-9), slopes)
-        corrected = np.clip(end.values + step[NUM_OF_POSE:], -freedom.most, freedom.most)
-        after = at(take_step(end.pose, step), corrected)
-        if after.loss > end.loss:
-            damping *= RISE
-            if damping > MOST_DAMPING:
-                break
-            continue
-        length = float(np.linalg.norm([*step[:NUM_OF_POSE], *(corrected - end.values)]))
-        end = after
-        damping = max(FALL * damping, LEAST_DAMPING)
-        if length < limits.tolerance:
-            break
-    return end
+    def equations(end: FreeEnd) -> Equations:
+        found = Equations(end.loss, end.sums.gradients.sum(axis=0), end.sums.matrices.sum(axis=0))
+        return found.add_known(np.concatenate([np.zeros(NUM_OF_POSE), end.values]), known)
 
+    def move(end: FreeEnd, by: Array) -> FreeEnd:
+        corrected = np.clip(end.values + by[NUM_OF_POSE:], -freedom.most, freedom.most)
+        return at(step(end.pose, by[:NUM_OF_POSE]), corrected)
 
-def take_step(pose: Pose, step: Array) -> Pose:
-    """Apply a step of the normal equations: turn [rad] and move [m], both in the camera's axes."""
-    R = pose.R_cam_from_world
-    return Pose(orthonormal(exp_so3(step[:3]) @ R), pose.center_world + R.T @ step[3:NUM_OF_POSE])
+    start = at(pose, values)
+    precision = freedom.deviations**-2.0 / relate_to_chance(start.sums)
+    known = np.diag([*np.zeros(NUM_OF_POSE), *precision]) + LOOSE * np.eye(NUM_OF_POSE + len(values))
+    end, found = descend(equations, move, start, limits.num_iterations, limits.tolerance)
+    return end._replace(loss=found.loss)
 
 
 def estimate_corrections(end: FreeEnd, curvature: float = CURVATURE) -> Estimate:

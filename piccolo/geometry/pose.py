@@ -149,6 +149,12 @@ def step(pose: Pose, delta: Array) -> Pose:
     return Pose(orthonormal(exp_so3(delta[:3]) @ pose.R_cam_from_world), center_world)
 
 
+def step_between(pose: Pose, other: Pose) -> Array:
+    """Return the `delta` (6,) by which `step` moves a pose to another."""
+    turn = log_so3(other.R_cam_from_world @ pose.R_cam_from_world.T)
+    return np.concatenate([turn, pose.R_cam_from_world @ (other.center_world - pose.center_world)])
+
+
 def orthonormal(R: Array) -> Array:
     """Return the rotation (3, 3) nearest to `R` (3, 3), which differs from it by rounding or a few per cent.
 

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from ..arrays import Array, Array32, Int64s
 from ..geometry.nearness import MATCHED, VOTED, non_maximum_suppression
 from ..geometry.pose import Pose
+from ..geometry.robust import inline_geman_mcclure
 from ..geometry.vectors import cross, dot, minus, rotate, row
 from ..jobs.threads import Workers
 from ..kernels.jit import F0, Scalar, inline_kernel, kernel
-from ..optimize.channel_loss import geman_mcclure
 from ..optimize.levenberg_marquardt import levenberg_marquardt
 from ..optimize.normal_equations import COUNT, GRADIENT, LOSS, MATRIX
 from .matching import Matches
@@ -70,7 +70,7 @@ def angular_equations(
         z *= inverse
         bx, by, bz = row(bearings, n)
         square = (x - bx) ** 2 + (y - by) ** 2 + (z - bz) ** 2
-        loss, w = geman_mcclure(square, inverse_scale2)
+        loss, w = inline_geman_mcclure(square, inverse_scale2)
         sums[LOSS] += loss
         sums[COUNT] += 1.0
         v = w * inverse

@@ -9,6 +9,7 @@ others keeps its own result; if the relative poses contradict photos that are su
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +23,6 @@ from ..evidence.focal_length import FocalFit
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import PoseGaussian, probability_near, probability_within, subtract
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
-from ..judge.belief import Belief
 from ..judge.candidate import Selection
 from ..judge.together import Shares, believe_together
 from ..panorama import Panorama
@@ -70,14 +70,6 @@ class Agreed(NamedTuple):
     errors: RelativeErrors
     estimates: dict[int, Estimate]  # own poses of the photos that agree with it
     apart: frozenset[int]  # photos that contradict it
-    warnings: tuple[str, ...]
-
-
-class Placed(NamedTuple):
-    """The pose of a photo in a bundle that is believed."""
-
-    gaussian: PoseGaussian  # in the map
-    belief: Belief  # in it and the bundle's other poses, without doubt about a focal length
     warnings: tuple[str, ...]
 
 
@@ -173,16 +165,8 @@ def judge_members(
     others = [i for i in range(len(bundles)) if i != best]
     ranked = probabilities[[best, *others, -1]]
     elsewhere = [bundles[i] for i in others]
-    results = {}
-    for k, member in members.items():
-        placed = place_member(member, k, supports[k], agreed, ranked)
-        if isinstance(placed, Localization):
-            results[k] = placed
-            continue
-        found = recalibrate_at(member, supports[k], placed.gaussian.pose, elsewhere, workers)
-        one = judge_together(found, placed.gaussian, placed.belief, means, min_confidence)
-        results[k] = replace(one, warnings=one.warnings + placed.warnings)
-    return results
+    judge_one = partial(judge_member, agreed=agreed, elsewhere=elsewhere, probabilities=ranked, means=means)
+    return {k: judge_one(members[k], k, supports[k], min_confidence) for k in members}
 
 
 def list_neighbors(members: dict[int, Member], k: int) -> list[Pose]:
@@ -297,12 +281,19 @@ def place_member(member: Member, number: int, shares: Shares, agreed: Agreed) ->
     return Placed(gaussian, shares, probability_near(offset, expected.covariance[3:, 3:]))
 
 
-def place_member(
-    member: Member, number: int, support: Support, agreed: Agreed, probabilities: Array
-) -> Placed | Localization:
-    """Return the pose of a photo in a bundle that is believed, or its own result if it does not belong there.
+def judge_member(
+    member: Member,
+    number: int,
+    support: Support,
+    min_confidence: float,
+    agreed: Agreed,
+    elsewhere: Sequence[Bundle],
+    probabilities: Array,
+    means: Means,
+) -> Localization:
+    """Return the result of a photo in a bundle that is believed.
 
-    `probabilities` (K + 1,) are of all poses of the bundle, the one believed first, and of none.
+    `elsewhere` are the other poses of the bundle; `probabilities` (K + 1,) are of all of them, and of none.
     """
     if member.alone.belief.ruled_out and not member.is_misplaced:
         return replace(member.alone, warnings=member.alone.warnings + agreed.warnings)
@@ -317,8 +308,10 @@ def place_member(
     if member.alone.status == LOCALIZED and number in agreed.estimates and member.alone.gaussian:
         alone = replace(member.alone.belief, within=min(within, member.alone.belief.within))
     belief = believe_together(shares, probabilities, within, within_others, alone)
+    found = recalibrate_at(member, support, gaussian.pose, elsewhere, means.workers)
+    result = judge_together(found, gaussian, belief, means, min_confidence)
     doubts = (UNSEEN,) if shares.right < EVEN else ()
-    return Placed(gaussian, belief, doubts + agreed.warnings)
+    return replace(result, warnings=result.warnings + doubts + agreed.warnings)
 
 
 def compare_errors(expected: PoseGaussian, own: PoseGaussian) -> float:

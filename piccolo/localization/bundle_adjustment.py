@@ -6,6 +6,7 @@ tell how large these are, whether the positions are too long, and which photo do
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
@@ -13,10 +14,13 @@ import numpy as np
 from ..arrays import Array
 from ..geometry.pose import Pose
 from ..geometry.pose_gaussian import LIKELY, LOOSE, PoseGaussian, add, differentiate, mean_of, subtract
+from ..geometry.robust import redescend
+from ..optimize.gauss_newton import Equations, descend, sum_observations, whiten
 
 RelativeScale = Literal["metres", "unknown"]  # of the positions of relative poses
 UNKNOWN_SCALE = 10.0  # deviation of the logarithm of a scale that is not known
-NUM_ADJUSTMENTS = 6
+NUM_ADJUSTMENTS = 6  # steps, at most
+SETTLED = 1e-6  # [rad, m] of a step, after which there is none
 NUM_ROUNDS = 4  # in which errors of relative poses and the bundle are estimated in turn
 TELLING = 10.0  # ratio of variances (F) by which one photo differs from the others: it contradicts them
 MEDIAN = 2.366  # of chi square of 3
@@ -39,6 +43,7 @@ class RelativeErrors(NamedTuple):
 LOOSER = 0.04  # chosen: of the information of a given pose that counts before scale or clock are known
 Item = TypeVar("Item")
 LEAST_ERRORS = RelativeErrors(math.radians(0.01), 0.001)  # chosen: no given pose is better
+robustly = partial(redescend, limit=LIKELY)
 
 
 class Bundle(NamedTuple):
@@ -87,30 +92,23 @@ def differentiate_bundle(bundle: Bundle, cam_from_bundle: Pose) -> Array:
     return J
 
 
-def weigh_robustly(step: Array, covariance: Array) -> Array:
-    """Return the information (6, 6) of a step with a covariance, less if the step is improbable."""
-    information = np.linalg.inv(covariance)
-    square = float(step @ information @ step)
-    return np.asarray(information * min(1.0, LIKELY / max(square, 1e-9)) ** 2)
-
-
 def adjust(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> Adjusted:
-    """Adjust pose and scale of a bundle to the photos' own poses by Gauss-Newton steps."""
-    covariance = np.eye(7)
-    for _ in range(NUM_ADJUSTMENTS):
-        information = np.diag([LOOSE] * 6 + [errors.log_scale**-2])
-        gradient = np.zeros(7)
-        gradient[6] = -bundle.log_scale * errors.log_scale**-2
-        for own, cam_from_bundle in estimates:
-            J = differentiate_bundle(bundle, cam_from_bundle)
-            step = subtract(own.pose, bundle.place(cam_from_bundle))
-            weighted = J.T @ weigh_robustly(step, own.own + errors.covariance)
-            information = information + weighted @ J
-            gradient = gradient + weighted @ step
-        covariance = np.linalg.inv(information)
-        delta = np.asarray(covariance @ gradient)
-        bundle = Bundle(add(bundle.pose, delta[:6]), bundle.log_scale + float(delta[6]))
-    return Adjusted(bundle, covariance, mean_of([own.common for own, _ in estimates]))
+    """Adjust pose and scale of a bundle to the photos' own poses; those far off count less."""
+    spreads = np.array([own.own + errors.covariance for own, _ in estimates]).reshape(-1, 6, 6)
+    known = np.diag([LOOSE] * 6 + [errors.log_scale**-2])
+
+    def equations(at: Bundle) -> Equations:
+        off = np.array([subtract(at.place(cam), own.pose) for own, cam in estimates]).reshape(-1, 6)
+        J = np.array([differentiate_bundle(at, cam) for _, cam in estimates]).reshape(-1, 6, 7)
+        found = sum_observations(whiten(spreads, off), whiten(spreads, J), robustly)
+        return found.add_known(np.array([*np.zeros(6), at.log_scale]), known)
+
+    def move(at: Bundle, step: Array) -> Bundle:
+        return Bundle(add(at.pose, step[:6]), at.log_scale + float(step[6]))
+
+    adjusted, found = descend(equations, move, bundle, NUM_ADJUSTMENTS, SETTLED)
+    common = mean_of([own.common for own, _ in estimates])
+    return Adjusted(adjusted, np.asarray(np.linalg.inv(found.matrix)), common)
 
 
 def sum_squares(bundle: Bundle, estimates: Sequence[Estimate], errors: RelativeErrors) -> Array:

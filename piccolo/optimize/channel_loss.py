@@ -1,7 +1,7 @@
 """The loss of the default method: locally normalised channels of points against those of the panorama.
 
-A residual's loss is that of Geman and McClure (1985), 1/2 e^2 / (1 + e^2 / s^2): residuals far above the
-scale s [8-bit levels] have no influence. A point on masked pixels costs half of the largest loss.
+A residual's loss is that of Geman and McClure, of a scale [8-bit levels]. A point on masked pixels costs half
+of the largest loss.
 """
 
 import math
@@ -10,8 +10,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array, Array32, Int32s, Int64s
+from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import BLOCK_RINGS, make_grid
-from ..kernels.jit import F1, HALF, Scalar, inline_kernel, kernel
+from ..kernels.jit import Scalar, inline_kernel, kernel
 from ..panorama.local_normalization import ZERO_LEVEL
 from ..panorama.texels import CHUNK, make_chunk, project, sample
 from .levenberg_marquardt import levenberg_marquardt
@@ -44,19 +45,12 @@ def read_channels(
 
 
 @inline_kernel
-def geman_mcclure(square: Scalar, inverse_scale2: Scalar) -> tuple[Scalar, Scalar]:
-    """Return the loss of a residual of this squared length, and its weight."""
-    s = F1 / (F1 + square * inverse_scale2)
-    return HALF * square * s, s * s
-
-
-@inline_kernel
 def beyond_chance(correlation: float) -> float:
     """Return the part of a block's correlation that exceeds those of wrong poses, in [0, 1]."""
     return max(correlation - CHANCE, 0.0) / (1.0 - CHANCE)
 
 
-add_channels = block_adder(read_channels, geman_mcclure)
+add_channels = block_adder(read_channels, inline_geman_mcclure)
 
 
 @kernel

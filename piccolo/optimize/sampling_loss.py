@@ -17,6 +17,7 @@ import numpy as np
 from ..arrays import Array, Array32, Int32s
 from ..cloud.soa import FARTHEST, PackedPoints
 from ..geometry.pose import Pose
+from ..geometry.robust import inline_absolute
 from ..kernels.jit import F0, F1, Scalar, inline_kernel, kernel
 from ..panorama.texels import CHUNK, Texels, bilinear_weights, blend, channel, is_valid, make_chunk, project
 from .normal_equations import GRADIENT, MATRIX, NUM_SUMS, block_adder
@@ -68,17 +69,7 @@ def read_packed(rgbx: Int32s, i: np.uintp) -> tuple[Scalar, Scalar, Scalar, Scal
     return channel(c, 0), channel(c, 8), channel(c, 16), F1
 
 
-@inline_kernel
-def norm(square: Scalar, least: Scalar) -> tuple[Scalar, Scalar]:
-    """Return a residual's length, and its weight 1 / length, for iteratively reweighted least squares.
-
-    A residual shorter than `least` has the weight 1 / `least`.
-    """
-    length = math.sqrt(square)
-    return length, F1 / max(length, least)
-
-
-add_packed = block_adder(read_packed, norm)
+add_packed = block_adder(read_packed, inline_absolute)
 
 
 @kernel

@@ -9,10 +9,11 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Array, Array32, Int64s
+from ..geometry.robust import inline_geman_mcclure
 from ..geometry.sphere import pixel_jacobian
 from ..kernels.jit import F0, kernel
 from ..panorama.texels import CHUNK, blend_with_gradient, is_valid, make_chunk, project
-from .channel_loss import ChannelProblem, geman_mcclure
+from .channel_loss import ChannelProblem
 
 NUM_OF_POSE = 6
 
@@ -74,7 +75,7 @@ def write_free_equations(
                 e0 -= channels[0][lo + i]
                 e1 -= channels[1][lo + i]
                 e2 -= channels[2][lo + i]
-                cost, w = geman_mcclure(e0 * e0 + e1 * e1 + e2 * e2, inverse_scale2)
+                cost, w = inline_geman_mcclure(e0 * e0 + e1 * e1 + e2 * e2, inverse_scale2)
                 loss[k] += loaded * cost
                 weight[k] += loaded
                 w *= loaded

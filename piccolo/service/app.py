@@ -31,6 +31,7 @@ from ..result import FAILED, UNREADABLE, Result
 from ..scan_map.scan_map import ScanMap
 from .access import Access
 from .asking import FORM, apply_options, make_photo, parse_options, read_form
+from .description import describe_service
 from .desk import Desk, Drawing, Limits, content_of, look_at
 from .guard import COOKIE, RETRY, SHORTAGE, Guard, refusal_of, refuse, refusing
 from .keep import Keep
@@ -108,8 +109,7 @@ class Service:
 
     async def describe(self, request: Request) -> Response:
         """Return the OpenAPI description."""
-        text = (files("piccolo.service") / "openapi.json").read_text(encoding="utf-8")
-        return Response(text.replace("{{version}}", __version__), media_type="application/json")
+        return JSONResponse(describe_service())
 
     async def docs(self, request: Request) -> Response:
         """Return a page on which a request can be tried."""
