@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
+from . import __version__
 from .arrays import Array
 from .camera import Mount
 from .camera.calibration import document_of as camera_document, read_mounts

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .. import __version__
+from . import __version__
 from .arguments import check_kind
 from .arrays import Bytes
 from .confidence.localization import Localization
