@@ -7,10 +7,10 @@ from .confidence.localization import (
 )
 from .errors import InputError as InputError
 from .geometry.pose import Pose as Pose
-from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .opening import Cloud as Cloud, open_scan as open_scan
 from .paper.localize import PaperSettings as PaperSettings
 from .photo import GpsPrior as GpsPrior, Photo as Photo, Prior as Prior
+from .problem.settings import CoarseToFineSettings as CoarseToFineSettings
 from .report.build import ReportSettings as ReportSettings, write_report as write_report
 from .result import Result as Result, Source as Source
 from .scan import Scan as Scan

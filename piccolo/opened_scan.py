@@ -24,6 +24,7 @@ from .localization.beside import SurePhoto, localize_beside, place_sure
 from .localization.bundle import localize_bundle
 from .localization.bundle_adjustment import UNKNOWN_SCALE, RelativeErrors, RelativeScale
 from .localization.localize import has_guessed_focal, localize, localize_guessed
+from .localization.means import NO_TRACE, Trace
 from .panorama import Panorama, check_labels, read_panorama
 from .panorama.photo import PhotoFacts, read_photo_facts, sha256_of
 from .paper.localize import PaperMap, PaperSettings, localize as localize_by_paper
@@ -64,8 +65,17 @@ class OpenedScan:
         """Read a photo, of labels if the scan is one of labels."""
         return read_panorama(photo, self.cloud_settings.labels)
 
-    def localize(self, photo: Photo, settings: Settings, focal: FocalLength | None = None) -> Result:
-        """Localize a photo; `focal` is its focal length as found with those of others, which counts then."""
+    def localize(
+        self,
+        photo: Photo,
+        settings: Settings,
+        focal: FocalLength | None = None,
+        trace: Trace = NO_TRACE,
+    ) -> Result:
+        """Localize a photo; `focal` is its focal length as found with those of others, which counts then.
+
+        `trace` notes the steps of the default method.
+        """
         watch = Stopwatch()
         self.check_options(photo, settings)
         picture, facts = self._take(photo, focal, watch)
@@ -80,10 +90,10 @@ class OpenedScan:
             found = Localization()
             if gps is not None:
                 near = replace(settings, prior=gps.apply_to(settings.prior))
-                found = run(self.prepared, picture, near, self.workers, watch)
+                found = run(self.prepared, picture, near, self.workers, watch, trace)
             if found.status != LOCALIZED:
                 gps = gps and replace(gps, is_used=False)
-                found = run(self.prepared, picture, settings, self.workers, watch)
+                found = run(self.prepared, picture, settings, self.workers, watch, trace)
         if focal is not None:
             found = replace(found, focal_length=focal.update(found.focal_length))
         blank = self.make_blank(photo, picture, facts, settings, watch.seconds)

@@ -30,6 +30,7 @@ from ..jobs.processes import WorkerLostError
 from ..jobs.threads import Workers
 from ..judge.decide import follow_consensus
 from ..localization.beside import SurePhoto
+from ..localization.means import Step, Trace
 from ..opened_scan import OpenedScan, Settings, make_failed_result, settings_json
 from ..opening import open_files
 from ..photo import Photo, Vector
@@ -209,6 +210,7 @@ class Answer(NamedTuple):
     warnings: tuple[str, ...] = ()  # of the photo, without those of the scan
     overlay: bytes | None = None  # PNG
     occlusion_mask: bytes | None = None  # PNG
+    steps: tuple[Step, ...] = ()  # of the search
 
 
 @dataclass(frozen=True)
@@ -225,6 +227,7 @@ class Localizer:
     max_memory: float | None = None  # [10^9 byte], of a process
     makes_overlays: bool = False
     makes_occlusion_masks: bool = False
+    is_traced: bool = False
     folder: Path = Path()  # which paths are relative to
     map_name: str | None = None  # of a map's file: absolute, or as a cluster's workers have been sent it
     sends_photos: bool = False
@@ -299,10 +302,11 @@ class Localizer:
         `place_keypoints` returns a photo that is sure by its result's JSON.
         """
         name = task.photo.name
+        trace = Trace(self.is_traced)
         with task.place(self.folder) as photo, reading_once():
             try:
                 if task.look is None:
-                    found = scan.localize(photo, task.settings)
+                    found = scan.localize(photo, task.settings, trace=trace)
                 else:
                     found = look_again(scan, photo, task.settings, task.look, place_keypoints)
                 overlay, mask = self._pictures(scan, photo, found)
@@ -310,7 +314,7 @@ class Localizer:
                 return Answer(make_failed_result(scan, photo, error, task.settings, name))
         warnings = tuple(warning.replace(photo.name, name) for warning in found.warnings)
         result = replace(found, pano=name, warnings=warnings)
-        return Answer(result, warnings[len(scan.warnings) :], overlay, mask)
+        return Answer(result, warnings[len(scan.warnings) :], overlay, mask, tuple(trace.steps))
 
     def place_keypoints(self, scan: OpenedScan, line: str) -> SurePhoto | None:
         """Return a photo that is sure, by the JSON of its result; None if it is another or none any more."""

@@ -58,6 +58,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     option(group, "--occlusion-mask PNG", text + folder)
     text = "colour the scan by the photos (.ply, .las, .laz, .e57), and localize each by the others' colours"
     option(group, "--color-scan FILE", text)
+    text = "write how each photo was searched to this file: attempts, candidates, evidence (JSON lines)"
+    option(group, "--trace FILE", text)
     option(group, "--cache FOLDER", CACHE_TEXT)
     add_method_options(parser)
     add_prior_options(parser)

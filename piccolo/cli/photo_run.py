@@ -1,6 +1,7 @@
 """The work of localize.py: its photos, one by one or together, and its results."""
 
 import itertools
+import json
 import os
 import sys
 from collections import Counter
@@ -76,14 +77,14 @@ def check_files(arguments: Arguments, panoramas: list[Path], total: int | None) 
     given = filter(None, (a.mask, a.priors, a.camera, a.rig, *(a.video or ()), a.relative, a.odometry))
     lists = [Path(word[1:]) for word in arguments.pano if word.startswith("@")]
     pictures = {"--overlay": arguments.overlay, "--occlusion-mask": arguments.occlusion_mask}
-    outputs = {"--out": a.out or STDOUT, "--color-scan": a.color_scan, **pictures}
+    outputs = {"--out": a.out or STDOUT, "--color-scan": a.color_scan, "--trace": a.trace, **pictures}
     check_distinct(outputs, [*arguments.cloud, *panoramas, *lists, *given])
     mask = arguments.mask and Path(arguments.mask)
     if mask and mask.is_dir() and panoramas and total and not any(find_mask(mask, p) for p in panoramas):
         raise InputError(f"{mask}: found no mask of {panoramas[0].name} or another photo, wanted NAME.png")
     check_output(arguments.out or STDOUT)
-    if arguments.color_scan:
-        check_output(arguments.color_scan)
+    for path in filter(None, (arguments.color_scan, arguments.trace)):
+        check_output(path)
     for option, path in pictures.items():
         if path is None or path.is_dir():
             continue
@@ -110,6 +111,7 @@ def prepare_run(arguments: Arguments) -> Run:
     masks = arguments.occlusion_mask is not None
     overlays = arguments.overlay is not None
     localizer = replace(localizer, priors=priors, makes_overlays=overlays, makes_occlusion_masks=masks)
+    localizer = replace(localizer, is_traced=arguments.trace is not None)
     rig = localizer.photo.instant
     is_one = rig.is_instant if rig else is_cube
     left_out = Counter[str]()
@@ -178,10 +180,19 @@ def record(run: Run, answer: Answer, write: Write) -> None:
         if path and png is not None:
             write_atomically(path / f"{name}.png" if path.is_dir() else path, png)
     execution.print_result(arguments, result, answer.warnings)
+    write_steps(arguments, answer)
     write(result.to_json())
     run.counts[result.status] += 1
     if result.best_pose is not None and result.pose is None and not result.cameras:
         run.doubtful.append(result.pano)
+
+
+def write_steps(arguments: Arguments, answer: Answer) -> None:
+    """Append the steps of a photo's search to the file of --trace, if it was searched."""
+    if arguments.trace and answer.steps:
+        lines = [json.dumps({"pano": answer.result.pano, **step}) for step in answer.steps]
+        with arguments.trace.open("a", encoding="utf-8") as file:
+            file.write("\n".join(lines) + "\n")
 
 
 def localize_all(
@@ -342,6 +353,8 @@ def localize_photos(arguments: Arguments) -> int:
             executor, run.localizer = place
             if isinstance(output, FileOutput):
                 output.begin()
+            if arguments.trace:
+                arguments.trace.write_bytes(b"")
             rest = itertools.chain([first] if first else [], left)
             interruption = localize_all(run, records, rest, executor, output.write)
             if run.looks_again and not interruption.number:

@@ -39,11 +39,12 @@ from .command import Arguments, UsageError
 from .execution import EXIT_SOME_NOT, Interruption, choose_exit_code, interruptible, print_result
 from .options import DEFAULT_EVERY
 
+OF_LOOP = ("jobs", "dask", "overlay", "occlusion_mask", "trace")  # options of photos that come one by one
 NOT_WITH = {  # options that do not go with what is asked for
     "a video": ("times",),
-    "a walk": ("jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal"),
-    "--relative": ("walk", "video", "jobs", "dask", "overlay", "occlusion_mask", "priors", "refine_focal"),
-    "--color-scan": ("walk", "video", "relative", "jobs", "dask", "overlay", "occlusion_mask", "labels"),
+    "a walk": (*OF_LOOP, "priors", "refine_focal"),
+    "--relative": ("walk", "video", *OF_LOOP, "priors", "refine_focal"),
+    "--color-scan": ("walk", "video", "relative", *OF_LOOP, "labels"),
 }
 ONLY_WITH_WALKS = ("times", "max_speed", "odometry")
 LEAST_LOST = 0.25  # chosen: of the frames, that may be those of a time lapse

@@ -8,14 +8,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 
 from ..evidence.examine import check_prior, choose, choose_among, examine
 from ..evidence.verification import Verified, draw_near, verify
 from ..geometry.pose import Pose
-from ..jobs.threads import Once, Stopwatch, Workers
+from ..jobs.threads import Once, Workers
 from ..judge.candidate import Candidate
 from ..judge.selection import CHANCE_MATCHES, FAINT_SCORE, is_clear, is_sure, rank
 from ..local_features.hypotheses import count_matches, propose_poses
@@ -28,6 +28,7 @@ from ..problem.settings import Effort
 from ..scan_map.camera_positions import COARSE_SPACING
 from ..scan_map.scan_map import ScanMap
 from .beam import refine_matches, refine_starts, score_mirror, score_starts
+from .means import Means
 from .search import Tilts, search_poses
 
 MIRROR_RATIO = 1.1  # least ratio of first scores, photo to mirrored photo
@@ -37,14 +38,6 @@ FEW_CELLS = 200  # of the grid; if a prior leaves fewer, all of them are searche
 ENOUGH_MATCHES = 40  # of a part of the features: if the pose is sure, the others are not asked
 NUM_MATCHED = 6  # poses from matches that are refined
 COS_TILT = math.cos(math.radians(12.0))  # most angle between their vertical and a known one
-
-
-class Means(NamedTuple):
-    """With what a photo is searched."""
-
-    effort: Effort
-    workers: Workers
-    watch: Stopwatch
 
 
 class Attempt(Protocol):
@@ -90,7 +83,7 @@ def plan_attempts(problem: Problem) -> list[tuple[Problem, Attempt]]:
 
 def look_first(problem: Problem, known: list[Candidate], means: Means) -> tuple[list[Candidate], bool]:
     """Search briefly by whole views; True if one pose alone is clear and beats the mirrored photo."""
-    effort, workers, watch = means
+    effort, workers, watch, _ = means
     of_mirror = Once(score_mirror, problem, effort, workers)
     with workers.beside(of_mirror):
         with watch.stage("search"):

@@ -32,6 +32,7 @@ from .attempts import add_verified
 from .judging import Found, judge
 from .last_descent import refine_best
 from .localize import fit_camera
+from .means import Means
 
 MOST_BESIDE = 3  # photos whose matches count, those with the most
 
@@ -94,14 +95,15 @@ def localize_beside(
         found = [other for other, _ in sorted(matched, key=lambda pair: -pair[1])[:MOST_BESIDE]]
     if not found:
         return Localization(), ()
+    means = Means(settings.effort, workers, watch)
     with watch.stage("refine"):
         problem = replace(problem, beside=tuple(other.matches for other in found))
         poses = [*known, *(other.pose for other in found)]
         candidates = add_verified(problem, [examine(problem, pose) for pose in poses], workers)
-        ended = fit_camera(problem, refine_best(problem, candidates, workers), workers)
+        ended = fit_camera(problem, refine_best(problem, candidates, workers), means)
         if isinstance(ended.fit, FocalFit):  # the photo beside confirms the pose
             ended = ended._replace(fit=ended.fit._replace(of_picture=None))
-        judged = judge(ended, settings, workers)
+        judged = judge(ended, means, settings.min_confidence)
         kept = list_agreeing(judged, found, ended.problem.beside, scan_map)
         if not kept:
             return Localization(), ()

@@ -49,6 +49,7 @@ from .bundle_search import (
 from .calibration import calibrate
 from .judging import Found, judge, judge_together
 from .localize import explain_nothing, find_alone
+from .means import Means
 
 EVEN = 0.5
 LOCAL_ERRORS = np.diag(np.repeat([math.radians(2.0) ** 2, 0.15**2], 3))  # chosen: of local optima, [rad, m]
@@ -95,12 +96,13 @@ def localize_bundle(
     """
     cams_from_bundle = move_origin_near(cams_from_bundle)
     members: dict[int, Member] = {}
+    means = Means(settings.effort, workers, watch)
 
     def localize_alone(k: int, panorama: Panorama) -> Localization:
-        found = find_alone(scan_map, panorama, settings, workers, watch)
+        found = find_alone(scan_map, panorama, settings, means)
         if found is None:
             return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
-        judged = judge(found, settings, workers, may_promote=False)
+        judged = judge(found, means, settings.min_confidence, may_promote=False)
         members[k] = Member(found.forget(), judged, cams_from_bundle[k])
         return judged
 
@@ -110,7 +112,7 @@ def localize_bundle(
         alone[k] = localize_alone(k, panorama)
     members = dict(sorted(members.items()))
     with watch.stage("refine"):
-        together = judge_members(members, errors, settings, workers)
+        together = judge_members(members, errors, means, settings.min_confidence)
     return [together.get(k, one) for k, one in enumerate(alone)]
 
 
@@ -134,9 +136,10 @@ def expect_focal(panoramas: Sequence[Panorama], alone: Sequence[Localization]) -
 
 
 def judge_members(
-    members: dict[int, Member], errors: RelativeErrors, settings: CoarseToFineSettings, workers: Workers
+    members: dict[int, Member], errors: RelativeErrors, means: Means, min_confidence: float
 ) -> dict[int, Localization]:
     """Return the results of photos together, or each by itself with the reason."""
+    workers = means.workers
     bundles = propose_bundles(list(members.values()), errors)
     tested = [dict[int, Support]() for _ in bundles]
     for k, member in members.items():
@@ -174,7 +177,7 @@ def judge_members(
             results[k] = placed
             continue
         found = recalibrate_at(member, supports[k], placed.gaussian.pose, elsewhere, workers)
-        one = judge_together(found, placed.gaussian, placed.probabilities, settings, workers)
+        one = judge_together(found, placed.gaussian, placed.probabilities, means, min_confidence)
         results[k] = replace(one, warnings=one.warnings + placed.warnings)
     return results
 

@@ -3,6 +3,7 @@
 Photos that help each other end here too, each with a pose and probabilities that others told.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 from ..arrays import Array
@@ -19,9 +20,9 @@ from ..judge.decide import conclude, doubt_given
 from ..judge.selection import assess, credit_copies, is_mirrored
 from ..problem.prior import contradictions
 from ..problem.problem import Problem
-from ..problem.settings import CoarseToFineSettings
 from .copies import list_reported
 from .ladder import settle
+from .means import Means, Step, describe_selection
 from .mirror import find_mirrored
 
 WORTH_ASKING = 0.2  # least probability of all poses together, for which the mirrored photo is tried
@@ -39,30 +40,29 @@ class Found(NamedTuple):
         return Found(self.problem.forget(), self.selection.forget(), self.fit)
 
 
-def judge(
-    found: Found, settings: CoarseToFineSettings, workers: Workers, may_promote: bool = True
-) -> Localization:
+def judge(found: Found, means: Means, min_confidence: float, may_promote: bool = True) -> Localization:
     """Return the result for the best pose of a photo by itself.
 
     If `may_promote`, a copy of the best pose's place that turns out likelier becomes the best.
     """
     problem, selection, fit = found
+    workers = means.workers
     selection = complete(problem, selection, workers)
     measured = measure(problem, selection, fit, workers)
     if measured is None:
         return Localization()
-    reported, is_copy = list_reported(problem, selection, settings.effort, workers)
+    reported, is_copy = list_reported(problem, selection, means.effort, workers)
     standings = credit_copies(assess(problem.profile, reported), is_copy)
     within = probability_within(measured.errors.gaussian)
     probabilities = posterior(standings, measured.errors.std_of_fit, within)
     likeliest = int(probabilities[:-1].argmax())
     if likeliest and is_copy[likeliest] and may_promote:
         other = promote(problem, selection, reported.ranked[likeliest], fit, workers)
-        return judge(other, settings, workers, may_promote=False)
+        return judge(other, means, min_confidence, may_promote=False)
     if isinstance(fit, FocalFit):
         fit = doubt_unconfirmed(fit, measured.errors.gaussian)
     case = Case(reported, tuple(standings), measured, fit and describe_geometry(problem, fit))
-    return decide_case(problem, case, probabilities, settings, workers)
+    return decide_case(problem, case, probabilities, means, min_confidence)
 
 
 def promote(
@@ -82,8 +82,8 @@ def judge_together(
     found: Found,
     gaussian: PoseGaussian,
     probabilities: Array,
-    settings: CoarseToFineSettings,
-    workers: Workers,
+    means: Means,
+    min_confidence: float,
 ) -> Localization:
     """Return the result of a photo whose pose is what it and others say together.
 
@@ -92,8 +92,8 @@ def judge_together(
     about a focal length is not in them. What the photo itself rules out stays so.
     """
     problem, selection, fit = found
-    selection = complete(problem, selection, workers)
-    measured = measure(problem, selection, fit, workers)
+    selection = complete(problem, selection, means.workers)
+    measured = measure(problem, selection, fit, means.workers)
     if measured is None:
         return Localization()
     measured = measured._replace(
@@ -103,16 +103,33 @@ def judge_together(
     )
     standings = tuple(assess(problem.profile, selection))
     case = Case(selection, standings, measured, fit and describe_geometry(problem, fit))
-    return decide_case(problem, case, probabilities, settings, workers)
+    return decide_case(problem, case, probabilities, means, min_confidence)
 
 
 def decide_case(
-    problem: Problem, case: Case, probabilities: Array, settings: CoarseToFineSettings, workers: Workers
+    problem: Problem, case: Case, probabilities: Array, means: Means, min_confidence: float
 ) -> Localization:
     """Return the result of a case; the mirrored photo is searched if any pose is likely."""
     probabilities = doubt_given(probabilities, case.geometry)
     best = case.found.best
     if probabilities[-1] < 1.0 - WORTH_ASKING:
-        mirrored = find_mirrored(problem, best, settings.effort, workers)
+        mirrored = find_mirrored(problem, best, means.effort, means.workers)
         case = case._replace(is_mirrored=is_mirrored(best, mirrored))
-    return conclude(problem.scan_map, case, probabilities, settings.min_confidence)
+    means.trace.note("judged", partial(describe_case, problem, case, probabilities))
+    return conclude(problem.scan_map, case, probabilities, min_confidence)
+
+
+def describe_case(problem: Problem, case: Case, probabilities: Array) -> Step:
+    """Describe what the judge read of a photo, and the probabilities of its poses and of none."""
+    geometry = case.geometry
+    errors = case.measured.errors
+    return {
+        "probabilities": probabilities.tolist(),
+        "standings": [standing._asdict() for standing in case.standings],
+        "within": probability_within(errors.gaussian),
+        "std_of_fit": errors.std_of_fit,
+        "doubt": geometry.doubt if geometry else 0.0,
+        "conflict": geometry.conflict if geometry else 0.0,
+        "is_mirrored": case.is_mirrored,
+        **describe_selection(problem, case.found),
+    }

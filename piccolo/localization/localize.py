@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 from ..confidence.alternatives import MAX_ALTERNATIVES
 from ..confidence.confidence import LOCALIZED
@@ -13,7 +14,7 @@ from ..geometry.pose import Pose
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Candidate, Selection
 from ..judge.decide import reconsider
-from ..judge.selection import is_faint
+from ..judge.selection import is_faint, rank
 from ..panorama import Panorama
 from ..panorama.edges import find_axes
 from ..photo import Prior
@@ -21,10 +22,11 @@ from ..problem.prior import apply_prior, nothing_allowed
 from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings
 from ..scan_map.scan_map import ScanMap
-from .attempts import Means, plan_attempts, search_beyond_prior
+from .attempts import Attempt, plan_attempts, search_beyond_prior
 from .calibration import calibrate, calibrate_sphere
 from .judging import Found, judge
 from .last_descent import refine_best
+from .means import NO_TRACE, Means, Step, Trace, describe_candidates, describe_selection
 from .shape import align_level, find_tilts, is_explained, is_tilt_known
 
 GUESSES = (
@@ -43,31 +45,32 @@ def localize(
     settings: CoarseToFineSettings,
     workers: Workers,
     watch: Stopwatch,
+    trace: Trace = NO_TRACE,
 ) -> Localization:
     """Localize a panorama: search until one attempt is sure, refine the best poses, judge the best one."""
-    found = find_alone(scan_map, panorama, settings, workers, watch)
+    means = Means(settings.effort, workers, watch, trace)
+    found = find_alone(scan_map, panorama, settings, means)
     if found is None:
         return Localization(warnings=explain_nothing(scan_map, panorama, settings.prior))
     with watch.stage("refine"):
-        return judge(found, settings, workers)
+        return judge(found, means, settings.min_confidence)
 
 
 def find_alone(
     scan_map: ScanMap,
     panorama: Panorama,
     settings: CoarseToFineSettings,
-    workers: Workers,
-    watch: Stopwatch,
+    means: Means,
 ) -> Found | None:
     """Find the poses of a photo by itself, refined; None if there is nothing to search."""
-    with watch.stage("search"):
+    with means.watch.stage("search"):
         allowed_map = apply_prior(scan_map, settings.prior)
         if len(allowed_map.sparse) == 0 or not panorama.is_valid.any():
             return None
         problem = prepare_problem(panorama, allowed_map, settings.prior, settings.gravity)
         problem.photo.images.search()  # each search begins with it
     search = find_by_edges if problem.profile.has_shape else find
-    return search(problem, scan_map, Means(settings.effort, workers, watch))
+    return search(problem, scan_map, means)
 
 
 def explain_nothing(scan_map: ScanMap, panorama: Panorama, prior: Prior) -> tuple[str, ...]:
@@ -89,11 +92,30 @@ def find(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
         asked = problem
         for asked, attempt in plan_attempts(problem):
             candidates, is_enough = attempt(asked, candidates, means)
+            means.trace.note("attempt", partial(describe_attempt, asked, attempt, candidates, is_enough))
             if is_enough:
                 break
         candidates += search_beyond_prior(asked, scan_map, means)
         with means.watch.stage("refine"):
-            return fit_camera(asked, refine_best(asked, candidates, workers), workers)
+            refined = refine_best(asked, candidates, workers)
+            means.trace.note("refined", partial(describe_selection, asked, refined))
+            return fit_camera(asked, refined, means)
+
+
+def describe_attempt(
+    problem: Problem, attempt: Attempt, candidates: Sequence[Candidate], is_enough: bool
+) -> Step:
+    """Describe what was found after an attempt."""
+    how = attempt.keywords if isinstance(attempt, partial) else {}
+    function = attempt.func if isinstance(attempt, partial) else attempt
+    return {
+        "name": getattr(function, "__name__", ""),
+        "options": how,
+        "evidence": problem.profile.evidence,
+        "num_positions": len(problem.scan_map.sparse),
+        "is_enough": is_enough,
+        "candidates": describe_candidates(problem, rank(candidates).ranked if candidates else []),
+    }
 
 
 def find_by_edges(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
@@ -113,7 +135,7 @@ def find_by_edges(problem: Problem, scan_map: ScanMap, means: Means) -> Found:
     return max([best, in_any_heading], key=lambda one: one.selection.best.score)
 
 
-def fit_camera(problem: Problem, found: Selection, workers: Workers) -> Found:
+def fit_camera(problem: Problem, found: Selection, means: Means) -> Found:
     """Compare what a photo says of its geometry with the scan, and refine the poses, unless they are faint.
 
     Photos of several cameras are taken as they say; so are edges, which lie beside those of the scan.
@@ -121,10 +143,10 @@ def fit_camera(problem: Problem, found: Selection, workers: Workers) -> Found:
     if is_faint(problem.profile, found):
         return Found(problem, found, None)
     if problem.given.focal_prior is not None:
-        return Found(*calibrate(problem, found, workers))
+        return Found(*calibrate(problem, found, means.workers))
     if problem.given.cameras or problem.profile.has_shape:
         return Found(problem, found, None)
-    return Found(*calibrate_sphere(problem, found, workers))
+    return Found(*calibrate_sphere(problem, found, means.workers))
 
 
 def has_guessed_focal(panorama: Panorama) -> bool:
@@ -133,7 +155,12 @@ def has_guessed_focal(panorama: Panorama) -> bool:
 
 
 def localize_guessed(
-    scan_map: ScanMap, panorama: Panorama, settings: CoarseToFineSettings, workers: Workers, watch: Stopwatch
+    scan_map: ScanMap,
+    panorama: Panorama,
+    settings: CoarseToFineSettings,
+    workers: Workers,
+    watch: Stopwatch,
+    trace: Trace = NO_TRACE,
 ) -> Localization:
     """Localize a photo with several focal lengths around a guess, until one result is sure."""
     camera = panorama.cameras[0].camera
@@ -141,7 +168,7 @@ def localize_guessed(
     found: list[Localization] = []
     for guess in GUESSES:
         photo = panorama.resample(camera.change(guess), width)
-        found.append(localize(scan_map, photo, settings, workers, watch))
+        found.append(localize(scan_map, photo, settings, workers, watch, trace))
         if found[-1].status == LOCALIZED:
             break
     return select_likeliest(found, settings)

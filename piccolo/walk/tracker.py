@@ -16,9 +16,10 @@ from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
 from ..judge.selection import assess
-from ..localization.attempts import Means, is_whole
+from ..localization.attempts import is_whole
 from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.localize import localize
+from ..localization.means import Means
 from ..localization.near import refine_near
 from ..panorama import Panorama
 from ..problem.prior import apply_prior
