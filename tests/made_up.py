@@ -8,6 +8,7 @@ import numpy as np
 from piccolo.confidence.alternatives import Hypothesis
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.judge.candidate import Candidate, Comparison, Selection
+from piccolo.local_features.matching import Matches
 from piccolo.optimize.channel_loss import CHANCE
 from piccolo.photo import NOTHING_KNOWN
 from piccolo.problem.problem import Problem
@@ -65,3 +66,22 @@ def seen(explains, num_blocks=4):
     beyond = CHANCE + (1.0 - CHANCE) * explains
     area = np.full(num_blocks, 0.01)
     return Comparison(np.full(num_blocks, beyond), area, area, 0.01 * num_blocks)
+
+
+def exact_matches(pose, count, num_wrong=0, seed=0):
+    """Matches that a camera at the pose would have, seen from right there; the last ones of any points."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-3, 3, (count, 3))
+    directions = points - pose.center_world
+    ranges = np.linalg.norm(directions, axis=1)
+    directions /= ranges[:, None]
+    tangents = np.cross(directions, rng.normal(size=(count, 3)))
+    tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
+    angles = rng.uniform(0.02, 0.2, count)
+    rays, ray_tangents = directions @ pose.R_cam_from_world.T, tangents @ pose.R_cam_from_world.T
+    wrong = slice(count - num_wrong, count)
+    points[wrong] = rng.uniform(-3, 3, (num_wrong, 3))
+    values = rays, ray_tangents, angles, points, directions, tangents, angles * ranges
+    some = [np.asarray(a, np.float32) for a in values]
+    weights = rng.choice(np.float32([0.5, 1.0]), count)
+    return Matches(np.arange(count, dtype=np.int32), *some, weights)

@@ -16,8 +16,8 @@ from piccolo.cloud.voxels import VoxelTable, morton_order
 from piccolo.cloud.writers import vertex_rows, writing_ply
 from piccolo.geometry.pose import Pose, angle_between
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.localization.attempts import Means
 from piccolo.localization.localize import localize
+from piccolo.localization.means import Means, Trace
 from piccolo.opened_scan import OpenedScan
 from piccolo.panorama import Panorama
 from piccolo.problem.problem import prepare_problem
@@ -118,9 +118,20 @@ def ask(panorama, scan_map, settings=AUTO):
     return prepare_problem(panorama, scan_map, settings.prior, settings.gravity)
 
 
-def means(settings=AUTO, num_threads=2):
-    """With what a photo is searched."""
-    return Means(settings.effort, Workers(num_threads), Stopwatch())
+def means(settings=AUTO, workers=WORKERS):
+    """With what a photo is searched; its steps are noted."""
+    return Means(settings.effort, workers, Stopwatch(), Trace(is_wanted=True))
+
+
+def listen():
+    """Workers of one thread, and a list of all that they are asked to do."""
+    asked = []
+
+    def show(values, total, label):
+        asked.append(label)
+        yield from values
+
+    return Workers(1, show), asked
 
 
 def locate(panorama, scan_map, settings=AUTO, num_threads=2):

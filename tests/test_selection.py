@@ -11,7 +11,7 @@ from made_up import PROBLEM, WHOLE, make_candidate, make_selection, place, place
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.localization import Localization
 from piccolo.evidence.examine import count_agreeing, examine
-from piccolo.geometry.pose import Pose, step
+from piccolo.geometry.pose import step
 from piccolo.jobs.threads import Workers
 from piccolo.judge.candidate import Selection
 from piccolo.judge.selection import assess, credit_copies, select
@@ -22,6 +22,7 @@ from piccolo.localization.copies import put_first
 from piccolo.localization.judging import Found, judge
 from piccolo.localization.ladder import FINE, refine
 from piccolo.localization.last_descent import refine_best
+from piccolo.panorama.texels import pack_texels
 
 ALONE = Workers(1)
 
@@ -216,9 +217,9 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     best, *others = (examine(problem, step(true, np.array(delta))) for delta in steps)
     num_best, *nums = (count_agreeing(problem, h, rooms.WORKERS).num_matches for h in (best, *others))
 
-    def judged(*candidates, rival_ratio=0.0):
+    def judged(*candidates, rival_ratio=0.0, asked=problem):
         selection = make_selection(*candidates, rival_ratio=rival_ratio)
-        return judge(Found(problem, selection, None), rooms.AUTO, rooms.WORKERS)
+        return judge(Found(asked, selection, None), rooms.means(), 0.9)
 
     found = judged(best, *others, rival_ratio=0.3)
     e = found.evidence
@@ -237,5 +238,5 @@ def test_evidence_counts_what_agrees_with_the_pose_and_elsewhere():
     assert found.status == "localized"
     alone = judged(best)
     assert (alone.evidence.margin, alone.evidence.alternative_matches) == (1.0, 0)
-    no_point_is_seen = replace(best, pose=Pose(np.eye(3), np.array([0.0, 0.0, 1000.0])))
-    assert judged(no_point_is_seen) == Localization()
+    nothing = pack_texels(panorama.rgb, np.zeros_like(panorama.is_valid))
+    assert judged(best, asked=replace(problem, colors=lambda: nothing)) == Localization()  # no point is seen
