@@ -12,6 +12,7 @@ from piccolo.jobs.threads import Workers
 from piccolo.local_features import feature_map
 from piccolo.local_features.keypoints import Keypoints
 from piccolo.local_features.matching import FAR, NUM_NEIGHBORS, match, nearest_lists, search_lists
+from piccolo.localization.attempts import join_features
 
 
 def _descriptors(rng, count):
