@@ -124,11 +124,11 @@ def means(settings=AUTO, workers=WORKERS):
 
 
 def listen():
-    """Workers of one thread, and a list of all that they are asked to do."""
+    """Workers of one thread, and a list of what they are asked to do, and how often."""
     asked = []
 
     def show(values, total, label):
-        asked.append(label)
+        asked.append((label, total))
         yield from values
 
     return Workers(1, show), asked
