@@ -167,7 +167,7 @@ def test_copies_are_looked_for_among_poses_that_could_win():
 
 @pytest.mark.parametrize("is_copy", [True, False])
 def test_a_copy_of_its_place_that_is_likelier_becomes_the_best(is_copy):
-    """The likelier pose is the true one; that found is at its twin, half a metre beside or turned away."""
+    """The likelier pose is the true one; the best is a little beside its twin, or turned away."""
     problem = _beside_its_twin()
     here = problem.scan_map.from_world(_narrow()[1])
     R = here.R_cam_from_world if is_copy else yaw_rotation(2.0) @ here.R_cam_from_world
