@@ -9,12 +9,11 @@ import cv2
 import numpy as np
 import psutil
 import pytest
-from piccolo.localization.query import prepare_query
 from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
 from refusals import assert_input_error
-from rooms import as_panorama, query, room, scan_map, stream
+from rooms import AUTO, ask as ask_photo, as_panorama, query, room, scan_map, stream
 
 from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays
@@ -25,7 +24,6 @@ from piccolo.localization.search import search_poses
 from piccolo.panorama import read_panorama
 from piccolo.panorama.photo import read_photo_facts
 from piccolo.panorama.video import frames_of
-from piccolo.problem.settings import CoarseToFineSettings
 from piccolo.scan_map.scan_map import prepare_map
 from piccolo.views.candidate_views import SEARCH_VIEW, render_views, render_wide
 
@@ -166,7 +164,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
     rng = np.random.default_rng(0)
     table = voxels_module.VoxelTable("a.ply")
     workers = Workers(1)
-    asked = prepare_query(taken, whole, CoarseToFineSettings(), workers)
+    asked = ask_photo(taken, whole)
     monkeypatch.setattr(memory, "memory_left", lambda: 1e5)
     monkeypatch.setattr(memory, "KNOWN", [])
     spread, colors = rng.uniform(0, 90, (50_000, 3)), np.full((50_000, 3), 9, np.uint8)
@@ -176,7 +174,7 @@ def test_all_that_grows_asks_first(monkeypatch, tmp_path):
         ("voxels of 2 cm needs", lambda: prepare_map(stream(room(1)[1]), workers)),
         ("prepared views", lambda: render_wide(whole.octree, whole.centers, SEARCH_VIEW, workers)),
         ("[0-9] views needs", lambda: render_views(whole.octree, whole.centers, SEARCH_VIEW, workers)),
-        ("rotations needs .*num_yaws", lambda: search_poses(asked, "known")),
+        ("rotations needs .*num_yaws", lambda: search_poses(asked, "known", AUTO.effort, workers)),
     ):
         assert_input_error(text, ask)
 
