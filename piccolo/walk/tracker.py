@@ -20,7 +20,7 @@ from ..localization.attempts import is_whole
 from ..localization.beam import Ends, descend_briefly, score_briefly, score_mirror, score_near
 from ..localization.localize import localize
 from ..localization.means import Means
-from ..localization.near import refine_near
+from ..localization.near import Near, refine_near
 from ..panorama import Panorama
 from ..problem.prior import apply_prior
 from ..problem.problem import Problem, prepare_problem
@@ -57,6 +57,13 @@ class Expected(NamedTuple):
     last: Pose  # of the other frame, moved by the odometry if there is one
     reach: float  # [m] from there
     pose: Pose  # predicted
+
+
+class Start(NamedTuple):
+    """A pose from which a frame is tracked."""
+
+    pose: Pose
+    must_be_sure: bool  # the end counts only if the photo is sure of it by itself
 
 
 class Followed(NamedTuple):
@@ -310,21 +317,36 @@ def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | 
         return None
     score = score_near(problem, expected.pose, workers)
     best_score = max(ends.best_score, score)
-    is_alike = log_behind(problem, score, best_score) > -COPY_LOG_ODDS
-    places = [pose for pose, behind in list_places(problem, ends, best_score) if behind > -COPY_LOG_ODDS]
-    alike = [pose for pose in places if pose.distance(expected.last) <= expected.reach]
-    starts = [expected.pose, *alike[:1]] if is_alike else alike[:1]
-    found = (track(problem, start, workers) for start in starts)
-    end = next((state for state in found if state is not None and is_acceptable(state, expected)), None)
-    if end is None and not is_alike and problem.profile.is_narrow:
-        last = track(problem, expected.pose, workers)
-        is_sure = last is not None and last.log_odds >= MOST_EXPECTED and is_acceptable(last, expected)
-        end = last if is_sure else None
-    if end is None:
-        return None
+    behind = log_behind(problem, score, best_score)
+    alike = list_alike(expected, list_places(problem, ends, best_score))
+    for start in list_starts(expected, behind, alike, problem.profile.is_narrow):
+        end = track(problem, start.pose, workers)
+        if end is not None and is_acceptable(end, expected, start.must_be_sure):
+            return describe_end(replace(end, gain=compute_gain(problem, near)), expected, alike)
+    return None
+
+
+def list_alike(expected: Expected, places: Sequence[Place]) -> list[Pose]:
+    """Return the places within reach that look hardly worse than the best one, as copies do."""
+    alike = [pose for pose, behind in places if behind > -COPY_LOG_ODDS]
+    return [pose for pose in alike if pose.distance(expected.last) <= expected.reach]
+
+
+def list_starts(expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool) -> list[Start]:
+    """Return from where a frame is tracked, in order, until an end holds.
+
+    `behind` are the odds [log] by which the expected pose looks worse than the best place.
+    """
+    best = [Start(pose, False) for pose in alike[:1]]
+    if behind > -COPY_LOG_ODDS:
+        return [Start(expected.pose, False), *best]
+    return [*best, Start(expected.pose, True)] if is_narrow else best
+
+
+def describe_end(end: State, expected: Expected, alike: Sequence[Pose]) -> Followed:
+    """Describe how a frame was found."""
     how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
-    state = replace(end, gain=compute_gain(problem, near))
-    return Followed(state, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
+    return Followed(end, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
 
 
 def compute_gain(problem: Problem, near: Problem) -> float:
@@ -336,9 +358,10 @@ def compute_gain(problem: Problem, near: Problem) -> float:
     return 0.0 if problem.profile.is_partial else min(-math.log(share), MOST_EXPECTED)
 
 
-def is_acceptable(state: State, expected: Expected) -> bool:
-    """Return True for a pose within reach that is where it was expected, or sure by itself."""
-    is_sure = state.log_odds >= MOST_EXPECTED or ONE_PLACE.holds(state.pose, expected.pose)
+def is_acceptable(state: State, expected: Expected, must_be_sure: bool) -> bool:
+    """Return True for a pose within reach that is sure by itself or, if it need not be, was expected."""
+    is_expected = not must_be_sure and ONE_PLACE.holds(state.pose, expected.pose)
+    is_sure = state.log_odds >= MOST_EXPECTED or is_expected
     return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
@@ -352,6 +375,11 @@ def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
         first = ends[0].end
         drawn = draw_near(problem, first.pose, first.drawn, workers).matches
         ends.append(refine_near(problem, verify(problem, first.pose, drawn).pose, workers))
+    return choose_end(ends)
+
+
+def choose_end(ends: Sequence[Near]) -> State | None:
+    """Return the likeliest end; None if it more likely is wrong than right, or explains nothing."""
     odds = [log_odds_of_place(near.probability, near.probability, near.gaussian) for near in ends]
     best = int(np.argmax(odds))
     end, gaussian, _ = ends[best]
