@@ -147,7 +147,10 @@ def test_views_and_points_count_from_their_place():
     place = points_around.round_position(pose)
     expected = rooms.view(problem.scan_map.octree, place, FINE, FINE_CELLS)
     points = visible_points(problem.scan_map.octree, place, FULL, FINE_CELLS.tobytes(), EVERYWHERE, 30_000)
-    for found, wanted in ((problem.view_at(pose, "fine"), expected), (problem.view_at(pose, "points"), points)):
+    for found, wanted in (
+        (problem.view_at(pose, "fine"), expected),
+        (problem.view_at(pose, "points"), points),
+    ):
         for values, others in zip(found, wanted, strict=True):
             np.testing.assert_array_equal(values, others)
     assert problem.view_at(pose, "points") is problem.view_at(_pose(0.3135, 0.1875, 0.302), "points")

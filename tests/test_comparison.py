@@ -209,7 +209,8 @@ def test_a_photo_that_was_turned_over_is_told(fov_deg, asks_map):
 
 
 @pytest.mark.parametrize(
-    ("score", "num_matches", "expected"), [(0.49, 30, False), (0.52, 30, False), (0.53, 30, True), (0.53, 20, False)]
+    ("score", "num_matches", "expected"),
+    [(0.49, 30, False), (0.52, 30, False), (0.53, 30, True), (0.53, 20, False)],
 )
 def test_a_photo_that_views_explain_as_well_is_not_mirrored_by_its_matches(score, num_matches, expected):
     """The mirrored photo has more matches, as in a place that looks alike in a mirror."""

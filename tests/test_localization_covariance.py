@@ -250,9 +250,7 @@ def test_points_that_occluders_hide_are_removed():
 def test_a_view_from_nearby_tells_the_covariance_without_what_occluders_hide(found):
     prepared, pose, _ = found
     clear = examine(prepared, pose)
-    own, near = (
-        covariance.estimate_covariance(prepared, clear, WORKERS, place) for place in (None, pose)
-    )
+    own, near = (covariance.estimate_covariance(prepared, clear, WORKERS, place) for place in (None, pose))
     assert near.gaussian.covariance.tobytes() == own.gaussian.covariance.tobytes()
     rgb = query(2).rgb.copy()
     rgb[120:180, 100:180] = np.random.default_rng(0).integers(0, 256, (60, 80, 3))

@@ -13,7 +13,7 @@ from PIL import Image
 from PIL.ExifTags import IFD, Base
 from PIL.PngImagePlugin import PngImageFile
 from refusals import assert_input_error
-from rooms import AUTO, ask as ask_photo, as_panorama, query, room, scan_map, stream
+from rooms import AUTO, as_panorama, ask as ask_photo, query, room, scan_map, stream
 
 from piccolo.cloud import octree, voxels as voxels_module
 from piccolo.cloud.stream import stream_of_arrays

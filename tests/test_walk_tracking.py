@@ -17,23 +17,18 @@ from piccolo.localization import ladder, near
 from piccolo.localization.beam import score_briefly, score_mirror
 from piccolo.localization.near import Near
 from piccolo.walk import tracker
-from piccolo.walk.frames import Frame, Motion, State
-from piccolo.walk.tracker import (
+from piccolo.walk.expectation import (
     Expected,
     Start,
-    choose_end,
     describe_end,
     expect,
-    find_near,
-    find_places,
     is_acceptable,
     list_alike,
     list_starts,
-    narrow_down,
     predict,
-    refine_state,
-    track,
 )
+from piccolo.walk.frames import Frame, Motion, State
+from piccolo.walk.tracker import choose_end, find_near, find_places, narrow_down, refine_state, track
 
 SEED = 1
 EFFORT = rooms.AUTO.effort

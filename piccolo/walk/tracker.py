@@ -4,7 +4,6 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from itertools import compress
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,7 +11,7 @@ from ..confidence.confidence import MODELS, Standing, pose_features, posterior
 from ..evidence.examine import complete, examine
 from ..evidence.verification import draw_near, match_beside, place_keypoints, verify
 from ..geometry.nearness import ONE_ANSWER, ONE_PLACE, non_maximum_suppression
-from ..geometry.pose import Pose, carry, exp_so3, log_so3, uniform_yaws
+from ..geometry.pose import Pose, uniform_yaws
 from ..jobs.threads import Stopwatch, Workers, one_blas_thread
 from ..judge.candidate import Selection
 from ..judge.selection import assess
@@ -27,12 +26,21 @@ from ..problem.problem import Problem, prepare_problem
 from ..problem.settings import CoarseToFineSettings, Effort
 from ..scan_map.camera_positions import FreeSpace
 from ..scan_map.scan_map import ScanMap
+from .expectation import (
+    Expected,
+    Followed,
+    Place,
+    describe_end,
+    expect,
+    is_acceptable,
+    list_alike,
+    list_starts,
+)
 from .frames import (
     MOST_EXPECTED,
     MOST_ODDS,
     REACH_SLACK,
     Frame,
-    How,
     Motion,
     State,
     list_states,
@@ -42,36 +50,12 @@ from .frames import (
 )
 from .path import COPY_LOG_ODDS, EVEN, Lattice
 
-Place = tuple[Pose, float]  # in the map, as rough as the grid of candidates; log odds against the frame's own
 Read = Callable[[int], Panorama | None]  # the picture of a frame; None if it can't be read
 LEAST_SCORE = 0.05  # of a tracked pose: with less it explains nothing
 NUM_KEPT = 4  # problems, of the frames that were asked for last
 BETWEEN_KEYS = ONE_PLACE.distance  # [m] key frames are so far apart
 MOST_PLACES = 64  # of a frame: the rooms of a hotel that look alike
 ELSEWHERE = ONE_PLACE.distance + 2.0 * REACH_SLACK  # [m] reach beyond which a camera may be at another place
-
-
-class Expected(NamedTuple):
-    """The pose that a frame is expected to have, from the pose of another, and its limits."""
-
-    last: Pose  # of the other frame, moved by the odometry if there is one
-    reach: float  # [m] from there
-    pose: Pose  # predicted
-
-
-class Start(NamedTuple):
-    """A pose from which a frame is tracked."""
-
-    pose: Pose
-    must_be_sure: bool  # the end counts only if the photo is sure of it by itself
-
-
-class Followed(NamedTuple):
-    """The pose of a frame that was found from another's."""
-
-    state: State
-    how: How
-    is_alone: bool  # False if it may be at another place within reach
 
 
 class Tracker:
@@ -276,32 +260,6 @@ def refine_state(problem: Problem, states: Sequence[State], rough: State, worker
     return put_state(others, replace(end, log_odds=best.log_odds + log_ratio(float(second), float(first))))
 
 
-def expect(frame: Frame, near: Sequence[tuple[Frame, Pose]], motion: Motion) -> Expected:
-    """Predict where a frame is from others, the last of them first: by odometry or at constant velocity."""
-    before, last = near[0]
-    seconds = frame.time - before.time
-    reach = motion.reach(seconds)
-    if frame.odometry is not None and before.odometry is not None:
-        moved = carry(frame.odometry, before.odometry, last)
-        return Expected(moved, reach, moved)
-    if len(near) == 1:
-        return Expected(last, reach, last)
-    earlier, pose = near[1]
-    return Expected(last, reach, predict(last, pose, seconds / (before.time - earlier.time), reach))
-
-
-def predict(last: Pose, earlier: Pose, ratio: float, max_distance: float) -> Pose:
-    """Predict a camera's pose at constant velocity from an earlier pose and the last.
-
-    `ratio` is the time since the last pose divided by the time between the two. The prediction is at most
-    `max_distance` [m] away.
-    """
-    move = ratio * (last.center_world - earlier.center_world)
-    move *= min(1.0, max_distance / max(float(np.linalg.norm(move)), 1e-9))
-    turn = ratio * log_so3(last.R_cam_from_world @ earlier.R_cam_from_world.T)
-    return Pose(exp_so3(turn) @ last.R_cam_from_world, last.center_world + move)
-
-
 def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | None:
     """Track a frame from the expected pose, if that looks hardly worse than the best place within reach.
 
@@ -326,29 +284,6 @@ def find_near(problem: Problem, expected: Expected, means: Means) -> Followed | 
     return None
 
 
-def list_alike(expected: Expected, places: Sequence[Place]) -> list[Pose]:
-    """Return the places within reach that look hardly worse than the best one, as copies do."""
-    alike = [pose for pose, behind in places if behind > -COPY_LOG_ODDS]
-    return [pose for pose in alike if pose.distance(expected.last) <= expected.reach]
-
-
-def list_starts(expected: Expected, behind: float, alike: Sequence[Pose], is_narrow: bool) -> list[Start]:
-    """Return from where a frame is tracked, in order, until an end holds.
-
-    `behind` are the odds [log] by which the expected pose looks worse than the best place.
-    """
-    best = [Start(pose, False) for pose in alike[:1]]
-    if behind > -COPY_LOG_ODDS:
-        return [Start(expected.pose, False), *best]
-    return [*best, Start(expected.pose, True)] if is_narrow else best
-
-
-def describe_end(end: State, expected: Expected, alike: Sequence[Pose]) -> Followed:
-    """Describe how a frame was found."""
-    how: How = "tracked" if ONE_PLACE.holds(end.pose, expected.pose) else "near"
-    return Followed(end, how, all(ONE_PLACE.holds(pose, end.pose) for pose in alike))
-
-
 def compute_gain(problem: Problem, near: Problem) -> float:
     """Return what a frame gains [log] if it is found among some places: the fewer, the less it is by chance.
 
@@ -356,13 +291,6 @@ def compute_gain(problem: Problem, near: Problem) -> float:
     """
     share = len(near.scan_map.sparse) / len(problem.scan_map.sparse)
     return 0.0 if problem.profile.is_partial else min(-math.log(share), MOST_EXPECTED)
-
-
-def is_acceptable(state: State, expected: Expected, must_be_sure: bool) -> bool:
-    """Return True for a pose within reach that is sure by itself or, if it need not be, was expected."""
-    is_expected = not must_be_sure and ONE_PLACE.holds(state.pose, expected.pose)
-    is_sure = state.log_odds >= MOST_EXPECTED or is_expected
-    return is_sure and state.pose.distance(expected.last) <= expected.reach
 
 
 def track(problem: Problem, start: Pose, workers: Workers) -> State | None:
