@@ -8,24 +8,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rooms
-from made_up import at
+from made_up import PROBLEM, at
 from poses import tilted_poses
 
 from piccolo.confidence.localization import Alternative, Localization
 from piccolo.geometry.pose import Pose, exp_so3, pose_errors, yaw_rotation
 from piccolo.geometry.pose_gaussian import PoseGaussian, add
 from piccolo.jobs.threads import Stopwatch, Workers
-from piccolo.judge.selection import Selection
+from piccolo.judge.candidate import Selection
 from piccolo.localization import bundle_search
 from piccolo.localization.bundle import (
     CONTRADICTS,
     NOT_FOUND,
     UNSEEN,
     compare_errors,
-    judge_member,
     localize_bundle,
+    place_member,
 )
 from piccolo.localization.bundle_adjustment import UNKNOWN_SCALE, Bundle, RelativeErrors
+from piccolo.localization.judging import Found
 from piccolo.panorama import Panorama
 from research.synthetic.world import mask_outside_field, photograph
 
@@ -45,9 +46,8 @@ def _alone(*probabilities):
     likely = list(zip(poses, probabilities, strict=True))
     alternatives = tuple(Alternative(h.pose, h.score, None, p) for h, p in likely[1:])
     alone = Localization(pose=poses[0].pose, confidence=probabilities[0], alternatives=alternatives)
-    return bundle_search.Member(
-        None, Selection(poses[0], tuple(poses[1:])), None, alone, tilted_poses(1, NEAR)[0]
-    )
+    found = Found(None, Selection(poses[0], tuple(poses[1:])), None)
+    return bundle_search.Member(found, alone, tilted_poses(1, NEAR)[0])
 
 
 MISSES = _support(0.0, is_found=False)
@@ -98,16 +98,17 @@ def test_sure_photos_elsewhere_speak_against_the_relative_poses():
 
 @pytest.mark.parametrize(("conflict", "is_measured"), [(5.0, True), (5.0, False), (3.0, True), (None, True)])
 def test_what_a_photo_rules_out_stays_so_unless_others_know_its_focal_length(conflict, is_measured):
-    query = SimpleNamespace(given=SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured)))
+    given = SimpleNamespace(focal_prior=SimpleNamespace(is_measured=is_measured))
     fit = conflict and SimpleNamespace(conflict=conflict)
     alone = Localization(is_ruled_out=True, warnings=("mirrored",), confidence=0.0)
     member = _alone(0.9)
-    member = replace(member, query=query, fit=fit, alone=alone)
+    found = member.found._replace(problem=replace(PROBLEM, given=given), fit=fit)
+    member = replace(member, found=found, alone=alone)
     assert member.own_poses == []
     assert member.is_misplaced == (conflict == 5.0 and is_measured)
     if not member.is_misplaced:
         agreed = SimpleNamespace(warnings=("scale",))
-        result = judge_member(member, 0, SURE, agreed, [], np.array([1.0, 0.0]))
+        result = place_member(member, 0, SURE, agreed, np.array([1.0, 0.0]))
         assert result == replace(alone, warnings=("mirrored", "scale"))
 
 
@@ -139,7 +140,7 @@ def test_an_own_pose_far_from_the_one_expected_is_doubted():
 def _members(far):
     """Two photos whose common frame begins `far` [m] from them."""
     cams = [Pose(pose.R_cam_from_world, pose.center_world + far) for pose in tilted_poses(2, NEAR)]
-    return [bundle_search.Member(None, None, None, Localization(), cam) for cam in cams]
+    return [bundle_search.Member(Found(None, None, None), Localization(), cam) for cam in cams]
 
 
 @pytest.mark.parametrize("far", [0.0, 1e3])

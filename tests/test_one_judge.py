@@ -1,11 +1,11 @@
 """The judge's decisions; and photos that help each other never overrule what it has ruled out."""
 
 from dataclasses import replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import rooms
+from made_up import PROBLEM, make_candidate, make_selection
 from test_focal_length import TRUE
 from test_localize_cameras import place, scan
 from test_walk import _walk_through
@@ -13,15 +13,13 @@ from test_walk import _walk_through
 import piccolo
 from piccolo.camera import Mount
 from piccolo.camera.model import pinhole
-from piccolo.confidence.alternatives import Hypothesis
 from piccolo.confidence.confidence import Standing
 from piccolo.confidence.localization import Alternative, FocalLength, Localization
-from piccolo.evidence.covariance import UNKNOWN_ERRORS
 from piccolo.geometry.pose import Pose, yaw_rotation
 from piccolo.jobs.threads import Workers
-from piccolo.judge import decide as judging
-from piccolo.judge.decide import MIRRORED
-from piccolo.judge.selection import Selection
+from piccolo.judge.case import UNKNOWN_ERRORS, Case, Geometry, Measured
+from piccolo.judge.decide import MIRRORED, decide, reconsider
+from piccolo.localization import judging
 from research.synthetic.world import photograph, render_picture
 
 HERE, AWAY = (Pose(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 3.0))
@@ -38,17 +36,17 @@ JUDGED = Localization(pose=HERE, alternatives=(Alternative(AWAY, 0.3, 4),))
     ],
 )
 def test_a_status_is_that_of_its_probabilities_but_what_is_ruled_out_has_none(probabilities, status):
-    found = judging.decide(JUDGED, np.array(probabilities), 0.9)
+    found = decide(JUDGED, np.array(probabilities), 0.9)
     told = found.confidence, found.alternatives[0].probability, found.probability_none
     assert (found.status, told) == (status, probabilities)
-    again = judging.reconsider(found, 0.5, 0.9)
+    again = reconsider(found, 0.5, 0.9)
     halves = [0.5 * p for p in probabilities[:2]]
     assert [again.confidence, again.alternatives[0].probability] == pytest.approx(halves)
     assert again.probability_none == pytest.approx(1.0 - sum(halves))
     assert again.status == "not_localized"
-    refused = judging.decide(replace(JUDGED, is_ruled_out=True), np.array(probabilities), 0.9)
+    refused = decide(replace(JUDGED, is_ruled_out=True), np.array(probabilities), 0.9)
     assert (refused.status, refused.confidence, refused.probability_none) == ("not_localized", 0.0, 1.0)
-    assert judging.reconsider(refused, 100.0, 0.9).confidence == 0.0
+    assert reconsider(refused, 100.0, 0.9).confidence == 0.0
 
 
 @pytest.mark.parametrize(
@@ -66,15 +64,15 @@ def test_what_lies_mirrored_or_contradicts_its_focal_length_is_ruled_out(
     monkeypatch, probability, doubt, conflict, is_mirrored, status, warns, num_asked
 ):
     asked = []
-    monkeypatch.setattr(judging, "is_mirrored", lambda _, best: asked.append(best) or is_mirrored)
-    monkeypatch.setattr(judging, "explain_doubts", lambda *_: ())
-    query, focal = rooms.ask(rooms.scene(1)[1], rooms.scan_map(1)), FocalLength(300.0, 3.0, 300.0, 3.0)
-    fit = SimpleNamespace(doubt=doubt, conflict=conflict, focal_length=lambda given: focal)
-    found = Selection(Hypothesis(HERE, 0.5), ())
-    measured = judging.Measured(HERE, UNKNOWN_ERRORS, 0.05, None)
-    standings = [Standing(1.0, 0.5, 60, "drawn scan")]
+    mirrored = make_candidate(0.0, 0.9 if is_mirrored else 0.4, 80)
+    monkeypatch.setattr(judging, "find_mirrored", lambda _, best, *how: asked.append(best) or mirrored)
+    geometry = Geometry((), doubt, conflict, 0.0, FocalLength(300.0, 3.0, 300.0, 3.0), "log_focal")
+    found = make_selection(make_candidate(0.0, 0.5, 60))
+    measured = Measured(HERE, UNKNOWN_ERRORS, 0.05, None, ())
+    case = Case(found, (Standing(1.0, 0.5, 60, "drawn scan"),), measured, geometry)
     p = np.array([probability, 1.0 - probability])
-    result = judging.conclude(query, found, fit, measured, standings, p)
+    problem = replace(PROBLEM, scan_map=rooms.scan_map(1))
+    result = judging.decide_case(problem, case, p, rooms.means(), 0.9)
     assert (result.status, MIRRORED in result.warnings, len(asked)) == (status, warns, num_asked)
     assert result.is_ruled_out == (warns or conflict > 0.0)
     assert result.confidence == pytest.approx(0.0 if result.is_ruled_out else (1.0 - doubt) * probability)

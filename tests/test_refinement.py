@@ -79,8 +79,8 @@ def test_narrow_ranks_poses_first():
 def test_the_beam_narrows_from_stage_to_stage():
     """From 500 starts to 400, 48 and 8 poses, of which two are perturbed for as long as that helps.
 
-    In a grey photo no pose is better than another. The first descents of a photo of a part of the sphere are as
-    long as the second.
+    In a grey photo no pose is better than another. The first descents of a photo of a part of the sphere are
+    as long as the second.
     """
     gray = rooms.as_panorama(np.full((256, 512, 3), 128, np.uint8))
     problem = rooms.ask(gray, rooms.scan_map(1))
